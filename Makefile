@@ -1,0 +1,62 @@
+# make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
+# make bench-full  the same with the slow rows on the whole suite
+# make test        install the development tools, then lint, type-check, docs and tests
+# make docs        the HTML documentation (docs/_build/html)
+#
+#   make PYTHON=/path/to/python3.11      another interpreter
+#   make PIP_ARGS="..."                  options for every pip install (a package index with CPU builds of torch, say)
+#   make bench BENCH_ARGS="--limit 8"    options for `unirender bench run`
+#   make test PYTEST_ARGS="-k camera"    options for pytest
+
+PYTHON ?= python3.11
+PIP_ARGS ?=
+BENCH_ARGS ?=
+PYTEST_ARGS ?=
+SUITE ?= tiny
+OUT ?= results
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
+REQUIREMENTS := pyproject.toml constraints.txt
+
+.PHONY: all setup bench bench-full test lint docs format clean
+all: bench
+
+# A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
+$(VENV)/.runtime: $(REQUIREMENTS)
+	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --editable .
+	touch $@
+
+$(VENV)/.dev: $(REQUIREMENTS)
+	$(PYTHON) -m venv $(VENV)
+	$(INSTALL) --editable '.[dev,docs]'
+	touch $(VENV)/.runtime $@
+
+setup: $(VENV)/.dev
+
+bench: $(VENV)/.runtime
+	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) $(BENCH_ARGS)
+
+bench-full: $(VENV)/.runtime
+	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --full $(BENCH_ARGS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright
+
+test: lint docs
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+docs: $(VENV)/.dev
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
+
+format: $(VENV)/.dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) $(OUT) docs/_build docs/_generated dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,62 @@
+"""Colour: linear Rec.709 <-> sRGB display values, and the tone curve that brings HDR maps into [0, 1].
+
+Notation: names end in `_linear` for scene-referred linear Rec.709 and in `_srgb` for display values encoded with the
+sRGB transfer function (IEC 61966-2-1). `colour-science` has the same functions; it takes 2 s to import, so these ten
+lines stand here and a test holds them against it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+LUMINANCE_REC709 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
+
+def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Linear -> display value. Defined on [0, inf); negative input follows the linear toe."""
+    linear = np.asarray(linear, dtype=np.float32)
+    power = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
+
+
+def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Display value -> linear; the inverse of `srgb_encode`."""
+    srgb = np.asarray(srgb, dtype=np.float32)
+    power = np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4)
+    return np.where(srgb <= 0.04045, srgb / 12.92, power).astype(np.float32)
+
+
+def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
+    return srgb_encode(np.clip(image_linear, 0.0, 1.0))
+
+
+def luminance(rgb_linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:
+    """Relative luminance Y of linear Rec.709."""
+    return np.asarray(rgb_linear, dtype=np.float32) @ LUMINANCE_REC709
+
+
+@dataclass(frozen=True)
+class HdrCurve:
+    """The curve through which HDR maps enter the network: `log1p(k x) / log1p(k x_max)`, [0, x_max] -> [0, 1].
+
+    Attributes:
+        k: slope at 0, in 1/radiance; a larger k gives dark radiance more of the range.
+        x_max: radiance that maps to 1. Larger values are not clipped: they map above 1 and `overflow` counts them.
+    """
+
+    k: float = 10.0
+    x_max: float = 100.0
+
+    def encode(self, x: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Radiance (>= 0) -> curve value."""
+        return (np.log1p(self.k * np.asarray(x, dtype=np.float32)) / np.log1p(self.k * self.x_max)).astype(np.float32)
+
+    def decode(self, y: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Curve value -> radiance; the inverse of `encode`."""
+        return (np.expm1(np.asarray(y, dtype=np.float32) * np.log1p(self.k * self.x_max)) / self.k).astype(np.float32)
+
+    def overflow(self, x: Float[np.ndarray, "..."]) -> int:
+        """How many values lie above `x_max`."""
+        return int(np.count_nonzero(np.asarray(x) > self.x_max))

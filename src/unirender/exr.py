@@ -1,0 +1,158 @@
+"""Single-part, multi-channel OpenEXR files of the data contract.
+
+Channel names: `R,G,B[,A]` (the image, premultiplied), `albedo.R/G/B`, `normal.X/Y/Z`, `roughness.Y`, `metallic.Y`,
+`specular.R/G/B`, `diffuse.R/G/B`; the mask is `A`, or `mask.Y` where there is no image. Half precision by default; an
+environment is a file of its own in float32, since the sun overflows half. Provenance stands in string attributes
+`unirender:*`. Equal content gives equal bytes.
+"""
+
+import io
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+
+Channels = dict[str, Float[np.ndarray, "h w"]]
+
+HALF_MAX = 65504.0
+ATTRIBUTE_PREFIX = "unirender:"
+_COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
+
+
+def write_exr(
+    path: str | Path,
+    channels: Mapping[str, np.ndarray],
+    *,
+    half: bool = True,
+    attributes: Mapping[str, str] | None = None,
+) -> None:
+    """Writes a file, moved into place when it is complete.
+
+    Args:
+        path: where; its folder must exist.
+        channels: `[h w]` float arrays by channel name.
+        half: store 16-bit floats; radiance above 65504 is then refused, not clipped.
+        attributes: provenance; keys get the prefix `unirender:`.
+
+    Raises:
+        UnirenderError: shapes differ, a value is not finite, or it does not fit into half precision.
+    """
+    path = Path(path)
+    data = exr_bytes(channels, half=half, attributes=attributes)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def exr_bytes(
+    channels: Mapping[str, np.ndarray], *, half: bool = True, attributes: Mapping[str, str] | None = None
+) -> bytes:
+    """The bytes of an EXR file; arguments and errors as `write_exr`."""
+    shapes = {name: np.shape(value) for name, value in channels.items()}
+    if not channels or len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 2:
+        raise UnirenderError(f"EXR channels: got shapes {shapes}, expected one common [height, width]")
+    stored = {}
+    for name, value in channels.items():
+        value = np.asarray(value, dtype=np.float32)
+        if not np.isfinite(value).all():
+            raise UnirenderError(f"EXR channel {name}: got NaN or infinity, expected finite values")
+        if half and np.abs(value).max(initial=0.0) > HALF_MAX:
+            raise UnirenderError(
+                f"EXR channel {name}: got {np.abs(value).max():.4g}, half precision ends at {HALF_MAX:g}; "
+                "pass half=False"
+            )
+        stored[name] = np.ascontiguousarray(value, dtype=np.float16 if half else np.float32)
+    header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for key, value in (attributes or {}).items():
+        header[key if key.startswith(ATTRIBUTE_PREFIX) else ATTRIBUTE_PREFIX + key] = str(value)
+    stream = io.BytesIO()
+    OpenEXR.File(header, stored, num_threads=0).write(stream)
+    return stream.getvalue()
+
+
+def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
+    """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
+
+    Raises:
+        UnirenderError: the file is missing or is no readable single-part OpenEXR.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected an OpenEXR file") from error
+    return read_exr_bytes(data, name=str(path))
+
+
+def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:
+    """As `read_exr`, from memory; `name` stands in error messages."""
+    try:
+        file = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
+        parts = len(file.parts)
+        channels = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in file.channels().items()}
+        header = file.header()
+    except Exception as error:  # the binding raises several types for broken data
+        raise UnirenderError(f"{name}: not a readable OpenEXR file ({str(error).splitlines()[0]})") from error
+    if parts != 1:
+        raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
+    attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
+    return channels, attributes
+
+
+def image_channels(image_linear: Float[np.ndarray, "h w c"]) -> Channels:
+    """`[h w 3]` or `[h w 4]` premultiplied linear image -> channels R, G, B[, A]."""
+    return {name: image_linear[..., i] for i, name in enumerate("RGBA"[: image_linear.shape[-1]])}
+
+
+def channels_rgb(channels: Channels, prefix: str = "", components: str = "RGB") -> Float[np.ndarray, "h w c"]:
+    """Channels `prefix.R`, ... stacked to `[h w 3]`.
+
+    Raises:
+        UnirenderError: a channel is missing.
+    """
+    names = [f"{prefix}.{c}" if prefix else c for c in components]
+    missing = [name for name in names if name not in channels]
+    if missing:
+        raise UnirenderError(f"EXR channels {', '.join(missing)} missing; the file has {', '.join(sorted(channels))}")
+    return np.stack([channels[name] for name in names], axis=-1)
+
+
+def intrinsics_channels(intrinsics: Intrinsics) -> Channels:
+    """The image-aligned maps that are present, as channels; the mask as `mask.Y`."""
+    channels: Channels = {}
+    for name in IMAGE_MAPS:
+        value = getattr(intrinsics, name)
+        if value is not None:
+            for i, component in enumerate(_COMPONENTS.get(name, "Y")):
+                channels[f"{name}.{component}"] = value[..., i]
+    return channels
+
+
+def intrinsics_from_channels(
+    channels: Channels,
+    environment: Float[np.ndarray, "eh ew 3"] | None = None,
+    camera: Camera | None = None,
+) -> Intrinsics:
+    """The inverse of `intrinsics_channels`; maps without channels are None, the mask is `mask.Y` or else `A`."""
+    maps: dict[str, np.ndarray] = {}
+    for name in IMAGE_MAPS:
+        components = _COMPONENTS.get(name, "Y")
+        if f"{name}.{components[0]}" in channels:
+            maps[name] = channels_rgb(channels, name, components)
+    if "mask" not in maps and "A" in channels:
+        maps["mask"] = channels["A"][..., None]
+    return Intrinsics(**maps, environment=environment, camera=camera or Camera())

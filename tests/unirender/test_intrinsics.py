@@ -1,0 +1,112 @@
+"""The data contract refuses what would silently be wrong, and its files keep what it holds."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender.exr import (
+    exr_bytes,
+    intrinsics_channels,
+    intrinsics_from_channels,
+    read_exr,
+    read_exr_bytes,
+    write_exr,
+)
+from unirender.intrinsics import MAPS, Intrinsics
+
+
+def random_intrinsics(height: int = 6, width: int = 5) -> Intrinsics:
+    rng = np.random.default_rng(1)
+    maps = {name: rng.random((height, width, channels), dtype=np.float32) for name, channels in MAPS.items()}
+    maps["normal"] = maps["normal"] - 0.5
+    maps["normal"] /= np.linalg.norm(maps["normal"], axis=-1, keepdims=True)
+    maps["specular"] *= 40
+    maps["environment"] = rng.random((4, 8, 3), dtype=np.float32) * 1e5
+    return Intrinsics(**maps, camera=Camera(fov_deg=45))
+
+
+def test_size_presence_and_replace() -> None:
+    full = random_intrinsics()
+    assert (full.height, full.width) == (6, 5)
+    assert full.present == tuple(MAPS)
+    partial = full.replace(specular=None)
+    assert "specular" not in partial.present
+    assert partial.camera == full.camera
+    with pytest.raises(UnirenderError, match="specular missing"):
+        partial.require("specular")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("albedo", np.ones((4, 4)), "expected .*3"),
+        ("roughness", np.ones((4, 4)), "keep their last axis"),
+        ("albedo", np.full((4, 4, 3), 1.5), r"expected \[0, 1\]"),
+        ("albedo", np.full((4, 4, 3), np.nan), "NaN"),
+        ("normal", np.full((4, 4, 3), 1.0), "unit vectors"),
+        ("specular", np.full((4, 4, 3), -1.0), "radiance >= 0"),
+        ("environment", np.full((4, 4, 3), np.inf), "infinite"),
+        ("mask", np.zeros((0, 4, 1)), "empty"),
+    ],
+)
+def test_bad_maps_are_refused(name: str, value: np.ndarray, message: str) -> None:
+    with pytest.raises(UnirenderError, match=message):
+        Intrinsics(**{name: value})
+
+
+def test_sizes_must_agree_except_for_the_environment() -> None:
+    with pytest.raises(UnirenderError, match="like the other maps"):
+        Intrinsics(albedo=np.zeros((4, 4, 3)), mask=np.zeros((5, 4, 1)))
+    Intrinsics(albedo=np.zeros((4, 4, 3)), environment=np.zeros((16, 32, 3)))
+
+
+def test_exr_round_trip_keeps_every_map(tmp_path: Path) -> None:
+    full = random_intrinsics()
+    path = tmp_path / "a.exr"
+    write_exr(path, intrinsics_channels(full), half=False, attributes={"spp": "64"})
+    channels, attributes = read_exr(path)
+    back = intrinsics_from_channels(channels, full.environment, full.camera)
+    assert attributes["spp"] == "64"
+    for name in MAPS:
+        np.testing.assert_array_equal(getattr(back, name), getattr(full, name))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_exr_channel_names_are_the_contracts() -> None:
+    names = set(intrinsics_channels(random_intrinsics()))
+    assert {"albedo.R", "normal.X", "roughness.Y", "metallic.Y", "specular.B", "diffuse.G", "mask.Y"} <= names
+
+
+def test_exr_bytes_are_a_pure_function_and_single_part() -> None:
+    channels = intrinsics_channels(random_intrinsics())
+    data = exr_bytes(channels)
+    assert data == exr_bytes(channels)
+    channels, _ = read_exr_bytes(data)
+    assert len(channels) == 15
+
+
+def test_half_precision_refuses_what_it_cannot_hold() -> None:
+    with pytest.raises(UnirenderError, match="half precision"):
+        exr_bytes({"R": np.full((2, 2), 1e5)})
+    exr_bytes({"R": np.full((2, 2), 1e5)}, half=False)
+    with pytest.raises(UnirenderError, match="NaN"):
+        exr_bytes({"R": np.full((2, 2), np.nan)})
+
+
+def test_broken_and_multipart_files_give_one_line(tmp_path: Path) -> None:
+    (tmp_path / "text.exr").write_text("not an image")
+    with pytest.raises(UnirenderError, match="not a readable OpenEXR"):
+        read_exr(tmp_path / "text.exr")
+    with pytest.raises(UnirenderError, match="cannot be read"):
+        read_exr(tmp_path / "missing.exr")
+    data = exr_bytes({"R": np.zeros((64, 64))})
+    with pytest.raises(UnirenderError, match="not a readable OpenEXR"):
+        read_exr_bytes(data[: len(data) // 2])
+    parts = [OpenEXR.Part({}, {"Z": np.zeros((4, 4), "f")}, "a"), OpenEXR.Part({}, {"Z": np.zeros((4, 4), "f")}, "b")]
+    OpenEXR.File(parts).write(str(tmp_path / "two.exr"))
+    with pytest.raises(UnirenderError, match="2 parts"):
+        read_exr(tmp_path / "two.exr")

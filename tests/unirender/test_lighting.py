@@ -1,0 +1,179 @@
+"""Environment maps: closed forms, invariants and Monte Carlo for the light that a surface receives."""
+
+import numpy as np
+import pytest
+
+from unirender.camera import Camera
+from unirender.color import image_srgb
+from unirender.errors import UnirenderError
+from unirender.lighting import (
+    diffuse_light,
+    environment_directions,
+    mean_radiance,
+    mirror_environment,
+    resample_environment,
+    rotate_environment,
+    sample_environment,
+    specular_light,
+    texel_solid_angles,
+)
+
+RNG = np.random.default_rng(3)
+
+
+def sphere_normals(size: int = 24) -> np.ndarray:
+    y, x = np.mgrid[:size, :size]
+    x, y = (x - size / 2 + 0.5) / (size * 0.46), -(y - size / 2 + 0.5) / (size * 0.46)
+    inside = x**2 + y**2 < 0.95
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
+    return np.where(inside[..., None], normal, 0).astype(np.float32)
+
+
+def smooth_environment(height: int = 32, width: int = 64) -> np.ndarray:
+    d = environment_directions(height, width)
+    lobes = [np.exp(4 * (d @ axis - 1)) for axis in np.eye(3, dtype=np.float32)]
+    return (0.2 + np.stack(lobes, axis=-1)).astype(np.float32)
+
+
+def random_directions(count: int) -> np.ndarray:
+    d = RNG.normal(size=(count, 3))
+    return (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def test_solid_angles_sum_to_the_sphere() -> None:
+    assert texel_solid_angles(16, 32).sum() == pytest.approx(4 * np.pi, rel=1e-6)
+
+
+def test_named_directions() -> None:
+    d = environment_directions(17, 32)
+    np.testing.assert_allclose(d[0], np.broadcast_to([0, 1, 0], (32, 3)), rtol=0, atol=1e-6)  # first row: up
+    np.testing.assert_allclose(d[8, 15] + d[8, 16], [0, 0, 2], rtol=0, atol=1e-2)  # the middle: behind the camera
+    assert d[8, 8, 0] > 0.99  # a quarter: right
+
+
+def test_texels_are_read_back_at_their_directions() -> None:
+    environment = RNG.random((9, 12, 3), dtype=np.float32)
+    inner = sample_environment(environment, environment_directions(9, 12))[1:-1]
+    np.testing.assert_allclose(inner, environment[1:-1], rtol=0, atol=1e-5)
+
+
+def test_mean_radiance_is_the_integral_of_the_interpolant() -> None:
+    environment = RNG.random((6, 8, 3), dtype=np.float32)
+    samples = sample_environment(environment, random_directions(400_000))
+    np.testing.assert_allclose(mean_radiance(environment), samples.mean(axis=0), rtol=0, atol=3e-3)
+
+
+@pytest.mark.parametrize("shape", [(16, 32), (9, 40), (4, 8), (64, 16)])
+def test_shrinking_keeps_the_energy(shape: tuple[int, int]) -> None:
+    environment = RNG.random((64, 128, 3), dtype=np.float32) ** 8
+    small = resample_environment(environment, shape)
+    assert small.shape == (*shape, 3)
+    np.testing.assert_allclose(mean_radiance(small), mean_radiance(environment), rtol=2e-3)
+
+
+def test_shrinking_twin_plain_pooling_does_not_keep_it() -> None:
+    environment = np.zeros((64, 128, 3), dtype=np.float32)
+    environment[3, 5] = 100.0
+    pooled = environment.reshape(16, 4, 32, 4, 3).mean(axis=(1, 3))
+    assert not np.allclose(mean_radiance(pooled), mean_radiance(environment), rtol=0.1)
+
+
+def test_growing_reads_the_same_radiance() -> None:
+    environment = smooth_environment(9, 16)
+    grown = resample_environment(environment, (33, 64))
+    d = random_directions(2000)
+    error = sample_environment(grown, d) - sample_environment(environment, d)
+    assert np.abs(error).max() < 0.04  # the knots of the two interpolants do not coincide
+    assert np.abs(error).mean() < 0.003
+
+
+def test_quarter_turns_about_each_axis_and_back() -> None:
+    environment = smooth_environment()
+    rotation = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=np.float32)  # +x -> +y
+    turned = rotate_environment(environment, rotation)
+    d = random_directions(500)
+    error = sample_environment(turned, d @ rotation.T) - sample_environment(environment, d)
+    assert np.abs(error).max() < 0.02
+    wrong = sample_environment(turned, d @ rotation) - sample_environment(environment, d)
+    assert np.abs(wrong).max() > 0.3  # the inverse turn is told apart
+
+
+def test_mirror_flips_x() -> None:
+    environment = RNG.random((8, 16, 3), dtype=np.float32)
+    d = random_directions(500)
+    flipped = d * np.array([-1, 1, 1], dtype=np.float32)
+    np.testing.assert_allclose(
+        sample_environment(mirror_environment(environment), flipped), sample_environment(environment, d), atol=1e-4
+    )
+
+
+def test_diffuse_light_of_a_constant_and_of_a_gradient() -> None:
+    normal = sphere_normals()
+    inside = normal.any(axis=-1)
+    d = diffuse_light(normal, np.full((16, 32, 3), 2.0, dtype=np.float32))
+    np.testing.assert_allclose(d[inside], 2.0, rtol=5e-3)
+    assert (d[~inside] == 0).all()
+    # radiance 1 + a.l gives irradiance / pi = 1 + 2/3 a.n (second Lambertian coefficient)
+    axis = np.array([0.3, 0.5, -0.2], dtype=np.float32)
+    environment = np.repeat((1 + environment_directions(64, 128) @ axis)[..., None], 3, axis=-1)
+    expected = 1 + 2 / 3 * (normal @ axis)
+    np.testing.assert_allclose(diffuse_light(normal, environment)[inside][:, 0], expected[inside], rtol=0, atol=0.01)
+
+
+def test_mirror_limit_reads_the_reflected_radiance() -> None:
+    normal, environment = sphere_normals(), smooth_environment()
+    inside = normal.any(axis=-1)
+    view = Camera().view_directions(*normal.shape[:2])
+    reflected = 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
+    s = specular_light(normal, 0.03, environment)
+    expected = sample_environment(environment, reflected)
+    central = inside & (np.sum(normal * view, axis=-1) > 0.5)
+    np.testing.assert_allclose(s[central], expected[central], rtol=0.03)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.34, 0.4, 0.6, 1.0])
+def test_specular_light_against_monte_carlo(roughness: float) -> None:
+    """Uniform directions on the sphere, the GGX formula written out again."""
+    normal = np.zeros((2, 2, 3), dtype=np.float32)
+    normal[..., :] = np.array([0.5, 0.3, 0.812404])
+    normal[0, 1] = [0.0, 0.0, 1.0]
+    normal[1, 0] = [-0.6, 0.0, 0.8]
+    environment, view = smooth_environment(), Camera().view_directions(2, 2)
+    alpha = roughness**2
+    light = random_directions(500_000)
+    radiance = sample_environment(environment, light)
+    s = specular_light(normal, roughness, environment)
+    for i, j in np.ndindex(2, 2):
+        n, v = normal[i, j], view[i, j]
+        h = v + light
+        h /= np.linalg.norm(h, axis=-1, keepdims=True)
+        cos_l, cos_v = light @ n, v @ n
+        d = alpha**2 / (np.pi * ((h @ n) ** 2 * (alpha**2 - 1) + 1) ** 2)
+        g = [2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2)) for c in (np.maximum(cos_l, 1e-6), cos_v)]
+        f_cos = np.where(cos_l > 0, d * g[0] * g[1] / (4 * cos_v), 0)
+        samples = 4 * np.pi * f_cos[:, None] * radiance
+        error = samples.std(axis=0) / np.sqrt(len(light))
+        np.testing.assert_array_less(np.abs(s[i, j] - samples.mean(axis=0)), 0.015 * s[i, j] + 4 * error)
+
+
+def test_specular_light_twin_a_rougher_lobe_is_told_apart() -> None:
+    normal, environment = sphere_normals(), smooth_environment()
+    inside = normal.any(axis=-1)
+    a, b = (specular_light(normal, r, environment)[inside] for r in (0.5, 0.56))
+    assert np.median(np.abs(a - b) / a) > 0.015
+
+
+def test_sharp_and_wide_lobes_meet() -> None:
+    normal, environment = sphere_normals(48), smooth_environment()
+    inside = normal[..., 2] > 0.4
+    a, b = (image_srgb(0.5 * specular_light(normal, r, environment))[inside] for r in (0.3499, 0.3501))
+    assert -10 * np.log10(np.mean((a - b) ** 2)) > 35
+
+
+def test_light_is_linear_and_needs_a_map() -> None:
+    normal = sphere_normals()
+    a, b = smooth_environment(), RNG.random((32, 64, 3), dtype=np.float32)
+    for f in (diffuse_light, lambda n, e: specular_light(n, 0.6, e), lambda n, e: specular_light(n, 0.1, e)):
+        np.testing.assert_allclose(f(normal, 2 * a + b), 2 * f(normal, a) + f(normal, b), rtol=1e-3, atol=1e-4)
+    with pytest.raises(UnirenderError, match="at least 2 x 2"):
+        diffuse_light(normal, np.ones((1, 8, 3), dtype=np.float32))
