@@ -1,0 +1,186 @@
+"""The command line end to end, with the shipped checkpoint: results, or one clear line; never a partial folder."""
+
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from PIL import Image
+
+from unirender.cli import main
+from unirender.exr import image_channels, read_exr, write_exr
+from unirender.files import read_result
+
+DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
+    f"{name}.png"
+    for name in ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
+}
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A photograph-like PNG with alpha: a shaded ball with a highlight, 150 x 100 pixels."""
+    y, x = np.mgrid[:100, :150]
+    x, y = (x - 74.5) / 42, -(y - 49.5) / 42
+    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    shade = np.clip(0.3 * x + 0.5 * y + 0.8 * z, 0, 1)
+    highlight = np.exp(40 * (np.clip(0.25 * x + 0.35 * y + 0.9 * z, 0, 1) - 1))
+    rgb = np.clip(shade[..., None] * np.array([0.7, 0.35, 0.2]) + 0.6 * highlight[..., None], 0, 1)
+    pixels = np.concatenate([rgb, (x**2 + y**2 < 1)[..., None]], axis=-1)
+    path = tmp_path_factory.mktemp("picture") / "ball.png"
+    Image.fromarray(np.round(pixels * 255).astype(np.uint8)).save(path)
+    return path
+
+
+def run(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(argument) for argument in arguments])
+    return int(stop.value.code or 0)
+
+
+def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
+    assert run("decompose", ball, "--output", tmp_path / "out") == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == DECOMPOSED
+    intrinsics = read_result(tmp_path / "out")
+    assert (intrinsics.height, intrinsics.width) == (100, 150)
+    assert intrinsics.environment is not None
+    assert intrinsics.environment.shape == (16, 32, 3)
+    assert intrinsics.normal is not None
+    inside = np.array(Image.open(ball))[..., 3] == 255
+    length = np.linalg.norm(intrinsics.normal, axis=-1)
+    np.testing.assert_allclose(length[inside], 1, rtol=0, atol=5e-3)
+    assert (length[~inside] == 0).all()
+    assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 36
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_render_takes_what_decompose_wrote(ball: Path, tmp_path: Path) -> None:
+    assert run("decompose", ball, "--output", tmp_path / "maps", "--fov", "30") == 0
+    assert run("render", tmp_path / "maps", "--output", tmp_path / "out") == 0
+    channels, _ = read_exr(tmp_path / "out" / "image.exr")
+    rendered = np.array(Image.open(tmp_path / "out" / "image.png"), dtype=np.float32) / 255
+    original = np.array(Image.open(ball), dtype=np.float32) / 255
+    assert set(channels) == set("RGBA")
+    inside = original[..., 3] == 1
+    error = np.mean((rendered[inside, :3] - original[inside, :3]) ** 2)
+    constant = np.mean((original[inside, :3].mean(axis=0) - original[inside, :3]) ** 2)
+    assert error < constant  # the cycle explains the picture better than its mean colour
+    assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 30
+
+
+def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:
+    assert run("edit", ball, "--output", tmp_path / "same", "--no-anchored", "--roughness", "0.5") == 0
+    assert run("edit", ball, "--output", tmp_path / "rough", "--roughness", "0.9", "--metallic", "1") == 0
+    light = np.full((8, 16, 3), 0.1, dtype=np.float32)
+    light[2, 4] = 40.0
+    write_exr(tmp_path / "light.exr", image_channels(light), half=False)
+    assert run("relight", ball, "--environment", tmp_path / "light.exr", "--output", tmp_path / "relit") == 0
+    pictures = [np.array(Image.open(tmp_path / name / "image.png")) for name in ("same", "rough", "relit")]
+    assert all(picture.shape == (100, 150, 4) for picture in pictures)
+    assert all(np.abs(a.astype(int) - b).mean() > 1 for a, b in itertools.pairwise(pictures))
+
+
+def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    small = Image.fromarray(rng.integers(0, 255, (20, 30, 3), dtype=np.uint8))
+    small.resize((3000, 2000), Image.Resampling.BICUBIC).save(tmp_path / "large.jpg", quality=90)
+    arguments = ("--samples", "2", "--steps", "2", "--output", tmp_path / "out")
+    assert run("decompose", tmp_path / "large.jpg", *arguments) == 0
+    assert "whole frame" in capsys.readouterr().err
+    assert Image.open(tmp_path / "out" / "albedo.png").size == (3000, 2000)
+    assert (tmp_path / "out" / "albedo.std.png").exists()
+
+
+def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], str]]:
+    """Arguments after `decompose`, and what the line must say."""
+    (folder / "text.png").write_text("no picture")
+    (folder / "cut.png").write_bytes(ball.read_bytes()[:400])
+    values = np.ones((8, 8, 3), dtype=np.float32)
+
+    values[3, 3] = np.nan
+    OpenEXR.File({}, {"RGB": values}).write(str(folder / "nan.exr"))
+    Image.new("L", (8, 8), 255).save(folder / "mask.png")
+    Image.new("L", (150, 100), 0).save(folder / "black.png")
+    Image.new("RGBA", (8, 8), (9, 9, 9, 0)).save(folder / "clear.png")
+    return {
+        "text": ([folder / "text.png"], "not a readable picture"),
+        "cut": ([folder / "cut.png"], "not a readable picture"),
+        "nan": ([folder / "nan.exr"], "NaN"),
+        "missing": ([folder / "missing.png"], "no such file"),
+        "folder": ([folder], "is a folder"),
+        "mask size": ([ball, "--mask", folder / "mask.png"], "expected 150 x 100"),
+        "empty mask": ([ball, "--mask", folder / "black.png"], "empty"),
+        "clear": ([folder / "clear.png"], "empty"),
+        "fov": ([ball, "--fov", "190"], "field of view"),
+        "samples": ([ball, "--samples", "0"], "at least 1"),
+        "checkpoint": ([ball, "--checkpoint", folder / "nowhere"], "nowhere"),
+    }
+
+
+@pytest.mark.parametrize(
+    "case",
+    ["text", "cut", "nan", "missing", "folder", "mask-size", "empty-mask", "clear", "fov", "samples", "checkpoint"],
+)
+def test_bad_input_gives_one_line_and_no_output(
+    case: str, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    arguments, message = bad_pictures(folder, ball)[case.replace("-", " ")]
+    assert run("decompose", *arguments, "--output", tmp_path / "out") == 1
+    error = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(error) == 1
+    assert message in error[0]
+    assert "internal" not in error[0]
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]  # neither the folder nor a temporary one
+
+
+def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "precious").write_text("1")
+    assert run("decompose", ball, "--output", tmp_path / "out") == 1
+    assert "--overwrite" in capsys.readouterr().err
+    assert run("decompose", ball, "--output", tmp_path / "out", "--overwrite") == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == DECOMPOSED
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_edit_needs_something_to_change(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("edit", ball, "--output", tmp_path / "out") == 1
+    assert run("edit", ball, "--output", tmp_path / "out", "--roughness", "1.5") == 1
+    lines = capsys.readouterr().err
+    assert "nothing to change" in lines
+    assert "[0, 1]" in lines
+
+
+def test_wrong_usage_exits_with_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("decompose") == 2
+    assert run("no-such-command") == 2
+    capsys.readouterr()
+
+
+def test_render_refuses_a_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("render", tmp_path, "--output", tmp_path / "out") == 1
+    assert "intrinsics.exr" in capsys.readouterr().err
+
+
+def test_doctor_finds_a_working_backend(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("doctor") == 0
+    text = capsys.readouterr().out
+    assert "LLVM" in text
+    assert "shipped" in text
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, unirender.cli\n"
+        "try: unirender.cli.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = [m for m in ('torch', 'diffusers', 'mitsuba', 'colour', 'scipy') if m in sys.modules]\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
