@@ -1,0 +1,208 @@
+"""Exact augmentations: each turns one scene's buffers into those of another scene that could be rendered.
+
+`Maps` is a dict of arrays `[..., H, W, C]`: the maps of `Intrinsics` and `image`, the premultiplied linear picture.
+Light is additive (`mix_lights`), radiance is a quadratic in metallic at depth 4 (`interpolate_metallic`), and the
+renderer treats the colour channels alike (`permute_channels`), mirror images (`mirror`) and turns about the view axis
+(`quarter_turn`). tests/physics/test_augmentation.py holds each against a Mitsuba render of the augmented scene.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender.exposure import draw_target
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import mirror_environment, rotate_environment
+
+Maps = dict[str, np.ndarray]
+
+LIGHT_MAPS = ("image", "specular", "diffuse", "environment")  # linear in the light
+COLOUR_MAPS = ("image", "albedo", "specular", "diffuse", "environment")
+METALLIC_NODES = (0.0, 0.5, 1.0)
+
+
+def to_maps(image_linear: Float[np.ndarray, "*batch h w 3"], intrinsics: Intrinsics) -> Maps:
+    """The picture and the known maps of `intrinsics` in one dict (no copies)."""
+    return {"image": image_linear} | {name: getattr(intrinsics, name) for name in intrinsics.present}
+
+
+def from_maps(maps: Maps) -> tuple[Float[np.ndarray, "*batch h w 3"], Intrinsics]:
+    """The inverse of `to_maps`, with the contract's camera."""
+    return maps["image"], Intrinsics().replace(**{name: value for name, value in maps.items() if name != "image"})
+
+
+def mix_lights(maps: Maps, weights: Float[np.ndarray, "l 3"]) -> Maps:
+    """Adds lights up: `sum_l weights[l] * map[l]` for the maps that are linear in the light.
+
+    Args:
+        maps: the `LIGHT_MAPS` present have a leading axis over the same L lights; all others pass through.
+        weights: non-negative, per light and colour channel.
+    """
+    if weights.ndim != 2 or weights.shape[1] != 3 or (weights < 0).any() or not np.isfinite(weights).all():
+        raise UnirenderError(
+            f"light weights: got {weights!r}, expected non-negative finite values of shape (lights, 3)"
+        )
+    mixed = dict(maps)
+    for name in LIGHT_MAPS:
+        if name in maps:
+            stack = maps[name]
+            if len(stack) != len(weights):
+                raise UnirenderError(
+                    f"{name}: got {len(stack)} lights, expected {len(weights)}, one per row of weights"
+                )
+            total = stack[0] * weights[0]
+            for light in range(1, len(weights)):
+                total += stack[light] * weights[light]
+            mixed[name] = total
+    return mixed
+
+
+def interpolate_metallic(
+    nodes: Float[np.ndarray, "3 *batch h w c"], metallic: float
+) -> Float[np.ndarray, "*batch h w c"]:
+    """The picture at any metallic in [0, 1] from those at 0, 0.5 and 1 (Lagrange; exact for a quadratic).
+
+    Monte Carlo noise can make a value slightly negative; it is not clipped, which would bias the mean.
+    """
+    if len(nodes) != len(METALLIC_NODES) or not 0.0 <= metallic <= 1.0:
+        raise UnirenderError(
+            f"metallic: got {len(nodes)} pictures and the value {metallic}, expected {METALLIC_NODES} and [0, 1]"
+        )
+    m = metallic
+    low, middle, high = (2 * m - 1) * (m - 1), 4 * m * (1 - m), m * (2 * m - 1)
+    return nodes[0] * np.float32(low) + nodes[1] * np.float32(middle) + nodes[2] * np.float32(high)
+
+
+def scale_light(maps: Maps, factor: float) -> Maps:
+    """Multiplies the light, and all that is linear in it, by `factor`: how the gauge is applied."""
+    return {name: value * np.float32(factor) if name in LIGHT_MAPS else value for name, value in maps.items()}
+
+
+def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
+    """Channel c of the result is channel `order[c]` of every colour map."""
+    if sorted(order) != [0, 1, 2]:
+        raise UnirenderError(f"channel order: got {order}, expected a permutation of (0, 1, 2)")
+    if tuple(order) == (0, 1, 2):
+        return dict(maps)
+    return {name: value[..., list(order)] if name in COLOUR_MAPS else value for name, value in maps.items()}
+
+
+def mirror(maps: Maps) -> Maps:
+    """The scene reflected in x -> -x: left and right change places."""
+    flipped: Maps = {}
+    for name, value in maps.items():
+        if name == "environment":
+            flipped[name] = mirror_environment(value)
+        else:
+            flipped[name] = value[..., ::-1, :]
+    if "normal" in maps:
+        flipped["normal"] = flipped["normal"] * np.array([-1, 1, 1], dtype=np.float32)
+    return flipped
+
+
+def quarter_turn(maps: Maps, turns: int) -> Maps:
+    """The scene turned counter-clockwise about the view axis by `turns` * 90 degrees, as the viewer sees it.
+
+    Frames are square. The environment is resampled (`turn_environment`); everything else is exact to the bit.
+    """
+    turns %= 4
+    if turns == 0:
+        return dict(maps)
+    turned: Maps = {}
+    for name, value in maps.items():
+        if name == "environment":
+            turned[name] = turn_environment(value, turns)
+            continue
+        if value.shape[-3] != value.shape[-2]:
+            raise UnirenderError(f"{name}: got {value.shape[-3]}x{value.shape[-2]}, expected a square frame to turn")
+        turned[name] = np.rot90(value, turns, axes=(-3, -2))
+    if "normal" in turned:
+        normal = turned["normal"]
+        cosine, sine = _COSINE[turns], _COSINE[turns - 1]
+        x, y = normal[..., 0], normal[..., 1]
+        turned["normal"] = np.stack([cosine * x - sine * y, sine * x + cosine * y, normal[..., 2]], axis=-1)
+    return turned
+
+
+_COSINE = (
+    np.float32(1),
+    np.float32(0),
+    np.float32(-1),
+    np.float32(0),
+)  # of 0, 90, 180, 270 degrees; sin(a) = cos(a - 90)
+
+
+def turn_rotation(turns: int) -> Float[np.ndarray, "3 3"]:
+    """The rotation about +z (towards the viewer) by `turns` * 90 degrees: +x goes to +y."""
+    cosine, sine = _COSINE[turns % 4], _COSINE[turns % 4 - 1]
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], dtype=np.float32)
+
+
+def turn_environment(environment: Float[np.ndarray, "h w 3"], turns: int) -> Float[np.ndarray, "h w 3"]:
+    """The environment under `quarter_turn`, at its own resolution."""
+    return environment if turns % 4 == 0 else rotate_environment(environment, turn_rotation(turns))
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """How often each augmentation is drawn, and how strongly."""
+
+    mix: float = 0.5  # probability that more than one light of a basis group is on
+    max_lights: int = 3  # most lights in a mixture
+    tint: float = 0.25  # largest standard deviation of the logarithm of a light's tint per channel; 0: none
+    metallic: bool = True  # continuous metallic in basis groups; False: the stored nodes only
+    permute: float = 0.3  # probability of a channel permutation other than the identity: lights have natural colours
+    mirror: float = 0.5  # probability of a mirror flip
+    turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
+    expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
+
+
+DEFAULT_AUGMENTATION = Augmentation()
+NO_AUGMENTATION = Augmentation(mix=0.0, tint=0.0, metallic=False, permute=0.0, mirror=0.0, turn=0.0, expose=False)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One sample's augmentation, fully resolved."""
+
+    lights: tuple[int, ...]  # which of the group's lights are on
+    weights: Float[np.ndarray, "l 3"]  # their weights and tints
+    roughness_index: int  # which of the group's stored roughness values
+    metallic: float
+    order: tuple[int, int, int] = (0, 1, 2)
+    turns: int = 0
+    mirror: bool = False
+    exposure_target: float | None = None  # None: the stored exposure
+
+
+def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesses: int) -> Draw:
+    """Draws an augmentation for a group of `lights` lights and `roughnesses` stored roughness values."""
+    on = 1
+    if rng.random() < config.mix and min(lights, config.max_lights) > 1:
+        on = int(rng.integers(2, min(lights, config.max_lights) + 1))
+    chosen = tuple(int(light) for light in rng.permutation(lights)[:on])
+    share = rng.dirichlet(np.ones(on))[:, None]
+    tint = np.exp(rng.normal(size=(on, 3)) * rng.uniform(0, config.tint)) if config.tint > 0 else np.ones((on, 3))
+    # 5 % beyond each end, clipped: fully dielectric and fully metallic objects are as common as they are in use
+    metallic = float(np.clip(rng.uniform(-0.05, 1.05), 0, 1)) if config.metallic else float(rng.choice(METALLIC_NODES))
+    order = (0, 1, 2)
+    if rng.random() < config.permute:
+        order = _PERMUTATIONS[rng.integers(len(_PERMUTATIONS))]
+    turns = int(rng.integers(1, 4)) if rng.random() < config.turn else 0
+    flip = bool(rng.random() < config.mirror)
+    target = draw_target(rng) if config.expose else None
+    return Draw(
+        lights=chosen,
+        weights=(share * tint).astype(np.float32),
+        roughness_index=int(rng.integers(roughnesses)),
+        metallic=metallic,
+        order=order,
+        turns=turns,
+        mirror=flip,
+        exposure_target=target,
+    )
+
+
+_PERMUTATIONS = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))

@@ -1,0 +1,285 @@
+"""Training samples and batches from the group shards of a data folder.
+
+Sample i of an endless stream is a pure function of (folder, seed, i): epoch and place follow from i, each epoch is a
+permutation of the folder's items, and the augmentation is drawn from (seed, i). An exact resume therefore starts at
+`start_sample`, reading nothing before it. An item is a whole *basis* group, out of which one new sample is mixed each
+time, or one pair of any other group.
+"""
+
+import functools
+import hashlib
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Int
+from torch import Tensor
+
+from unirender.errors import UnirenderError
+from unirender.exposure import exposure_factor
+from unirender.intrinsics import Intrinsics
+from unirender.training.augment import (
+    DEFAULT_AUGMENTATION,
+    METALLIC_NODES,
+    NO_AUGMENTATION,
+    Augmentation,
+    Draw,
+    Maps,
+    draw,
+    from_maps,
+    interpolate_metallic,
+    mirror,
+    mix_lights,
+    permute_channels,
+    quarter_turn,
+    scale_light,
+)
+from unirender.training.groups import Group, Pair, Shard, list_shards, open_packed
+
+BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
+
+Batch = dict[str, Float[Tensor, "b c h w"]]
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """Rows of a basis group, by light, roughness and metallic node."""
+
+    roughness: tuple[float, ...]
+    image: Int[np.ndarray, "l r 3"]
+    specular: Int[np.ndarray, "l r"]
+    diffuse: Int[np.ndarray, " l"]
+    environment: Int[np.ndarray, " l"]
+
+
+class GroupDataset:
+    """The groups of a data folder, packed and mapped into memory.
+
+    Attributes:
+        keys: the groups' keys, in order of shard and place.
+        fingerprint: sha256 over the shards' hashes; equal fingerprints give equal sample streams.
+        resolution: height and width of the pictures.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        shards: tuple[str, ...] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Opens a folder; shards not used before are decoded once.
+
+        Args:
+            folder: as written by `unirender dataset`; it may still be growing.
+            shards: names of the shards to use; None: all that are complete. A resumed training passes `shard_names` of
+                the interrupted one, so that a folder that grew in between gives the same stream.
+            progress: called with (shards opened, shards in all).
+        """
+        self.folder = Path(folder)
+        available = list_shards(self.folder)
+        if shards is not None:
+            missing = sorted(set(shards) - {path.name for path in available})
+            if missing:
+                raise UnirenderError(
+                    f"{folder}: shards {', '.join(missing)} are missing, expected all of {', '.join(shards)}"
+                )
+            available = {path: sha256 for path, sha256 in available.items() if path.name in shards}
+        self.shards: list[Shard] = []
+        for path, sha256 in available.items():
+            self.shards.append(open_packed(path, sha256))
+            if progress is not None:
+                progress(len(self.shards), len(available))
+        sizes = {shard.shared.shape[-2:] for shard in self.shards}
+        if len(sizes) != 1:
+            raise UnirenderError(
+                f"{folder}: pictures have sizes {sorted(sizes)}, expected one; make one folder per size"
+            )
+        self.resolution: tuple[int, int] = sizes.pop()
+        self._groups = [(shard, group) for shard in self.shards for group in shard.groups]
+        self.keys = tuple(group.key for _, group in self._groups)
+        if len(set(self.keys)) != len(self.keys):
+            twice = sorted({key for key in self.keys if self.keys.count(key) > 1})
+            raise UnirenderError(
+                f"{folder}: groups {', '.join(twice[:5])} occur in several shards, expected each key once"
+            )
+        self._basis = {i: _basis(group) for i, (_, group) in enumerate(self._groups) if group.vary == "basis"}
+        self._items: list[tuple[int, Pair | None]] = []
+        for i, (_, group) in enumerate(self._groups):
+            self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
+        self.fingerprint = hashlib.sha256(" ".join(shard.sha256 for shard in self.shards).encode()).hexdigest()
+
+    @property
+    def shard_names(self) -> tuple[str, ...]:
+        return tuple(shard.name for shard in self.shards)
+
+    @property
+    def num_pairs(self) -> int:
+        """Stored pictures."""
+        return sum(len(group.pairs) for _, group in self._groups)
+
+    def __len__(self) -> int:
+        """Items, the samples of an epoch: basis groups count once, other groups by their pairs."""
+        return len(self._items)
+
+    def pairs(self, group: int) -> tuple[Pair, ...]:
+        """The stored pictures of group number `group`."""
+        return self._groups[group][1].pairs
+
+    def stored(self, group: int, pair: Pair) -> tuple[Float[np.ndarray, "h w 3"], Intrinsics]:
+        """A stored pair as it is: premultiplied linear image and intrinsics (environment at the model's size)."""
+        shard, entry = self._groups[group]
+        maps = _constant_maps(_shared_maps(shard, entry), pair.metallic, pair.roughness)
+        rows = {"image": pair.image, "specular": pair.specular, "diffuse": pair.diffuse}
+        maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
+        return from_maps(maps | {"environment": _trailing(shard.environment[pair.light, 0])})
+
+    def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
+        """Sample number `index` of the stream: `[h w c]` float32 maps by the names of `BATCH_MAPS`."""
+        epoch, place = divmod(index, len(self))
+        group, pair = self._items[self._order(seed, epoch)[place]]
+        rng = np.random.default_rng([seed, 1, index])
+        if pair is None:
+            basis = self._basis[group]
+            return self.augmented(group, None, draw(rng, augmentation, len(basis.diffuse), len(basis.roughness)))
+        return self.augmented(group, pair, draw(rng, augmentation, 1, 1))
+
+    def augmented(self, group: int, pair: Pair | None, drawn: Draw) -> Maps:
+        """A basis group (`pair` None) or a pair of another group under the augmentation `drawn`.
+
+        For a pair, the draw's lights, roughness and metallic do not apply; its weights tint the light.
+        """
+        shard, entry = self._groups[group]
+        maps = _shared_maps(shard, entry)
+        if pair is None:
+            basis, lights, r = self._basis[group], list(drawn.lights), drawn.roughness_index
+            metallic, roughness = drawn.metallic, basis.roughness[r]
+            nodes = [_trailing(shard.pixels[basis.image[lights, r, node]]) for node in range(len(METALLIC_NODES))]
+            maps["image"] = interpolate_metallic(np.stack(nodes), metallic)
+            rows = {"specular": basis.specular[lights, r], "diffuse": basis.diffuse[lights]}
+            environment = shard.environment[basis.environment[lights], drawn.turns]
+        else:
+            metallic, roughness = pair.metallic, pair.roughness
+            rows = {"image": [pair.image], "specular": [pair.specular], "diffuse": [pair.diffuse]}
+            environment = shard.environment[pair.light, drawn.turns][None]
+        maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
+        maps = mix_lights(_constant_maps(maps, metallic, roughness), drawn.weights)
+        maps = quarter_turn(maps, drawn.turns)
+        maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)  # stored under each quarter turn
+        maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
+        if drawn.exposure_target is not None:
+            maps = scale_light(maps, exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target))
+        return maps
+
+    @functools.lru_cache(maxsize=4)  # noqa: B019 - a dataset lives as long as the training that reads it
+    def _order(self, seed: int, epoch: int) -> Int[np.ndarray, " items"]:
+        return np.random.default_rng([seed, 0, epoch]).permutation(len(self))
+
+
+def make_batch(dataset: GroupDataset, first: int, size: int, seed: int, augmentation: Augmentation) -> Batch:
+    """Samples `first` to `first + size` of the stream as float32 tensors."""
+    samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)]
+    batch: Batch = {}
+    for name in BATCH_MAPS:
+        height, width, channels = samples[0][name].shape
+        stacked = np.empty((size, channels, height, width), dtype=np.float32)
+        for i, sample in enumerate(samples):
+            stacked[i] = np.moveaxis(sample[name], -1, 0)
+        batch[name] = torch.from_numpy(stacked)
+    return batch
+
+
+def iterate_batches(
+    folder: str | Path | GroupDataset,
+    batch_size: int,
+    seed: int,
+    start_sample: int = 0,
+    workers: int = 1,
+    augmentation: Augmentation = DEFAULT_AUGMENTATION,
+) -> Iterator[Batch]:
+    """Endless batches; the k-th holds samples `start_sample + k * batch_size` onwards.
+
+    Args:
+        folder: a data folder, or an opened one.
+        batch_size: samples per batch; batches run across the end of an epoch.
+        seed: of the order and of the augmentations.
+        start_sample: samples consumed before; an interrupted run continues exactly where it was.
+        workers: background threads that prepare batches ahead, one each; 0: prepare when asked. It changes no value.
+        augmentation: what is drawn; `NO_AUGMENTATION` for pictures as they are stored.
+
+    Yields:
+        image (linear, premultiplied), albedo, normal, specular, diffuse `[b 3 h w]` (linear, not premultiplied),
+        roughness, metallic, mask `[b 1 h w]`, environment `[b 3 16 32]`; float32.
+    """
+    if batch_size < 1 or start_sample < 0 or workers < 0:
+        raise UnirenderError(
+            f"batches: got batch_size {batch_size}, start_sample {start_sample}, workers {workers}; "
+            "expected at least 1, 0 and 0"
+        )
+    dataset = folder if isinstance(folder, GroupDataset) else GroupDataset(folder)
+    return _batches(dataset, batch_size, seed, start_sample, workers, augmentation)
+
+
+def _batches(
+    dataset: GroupDataset, size: int, seed: int, first: int, workers: int, augmentation: Augmentation
+) -> Iterator[Batch]:
+    if workers == 0:
+        while True:
+            yield make_batch(dataset, first, size, seed, augmentation)
+            first += size
+    executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="unirender-data")
+    pending: deque[Future[Batch]] = deque()
+    try:
+        while True:
+            while len(pending) <= workers:  # one ready beside each in the making
+                pending.append(executor.submit(make_batch, dataset, first, size, seed, augmentation))
+                first += size
+            yield pending.popleft().result()
+    finally:
+        executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _basis(group: Group) -> _Basis:
+    """Sorts a basis group's pairs into its grid.
+
+    Raises:
+        UnirenderError: the grid is not complete.
+    """
+    lights = sorted({pair.light for pair in group.pairs})
+    roughness = sorted({pair.roughness for pair in group.pairs})
+    by_node = {(pair.light, pair.roughness, pair.metallic): pair for pair in group.pairs}
+    try:
+        grid = [[[by_node[light, r, m] for m in METALLIC_NODES] for r in roughness] for light in lights]
+    except KeyError as error:
+        raise UnirenderError(
+            f"group {group.key}: no picture for (light, roughness, metallic) {error}, expected a full basis grid"
+        ) from error
+    if len(by_node) != len(lights) * len(roughness) * len(METALLIC_NODES):
+        raise UnirenderError(f"group {group.key}: got metallic values other than {METALLIC_NODES} in a basis group")
+    return _Basis(
+        roughness=tuple(roughness),
+        image=np.array([[[pair.image for pair in nodes] for nodes in row] for row in grid]),
+        specular=np.array([[nodes[0].specular for nodes in row] for row in grid]),
+        diffuse=np.array([row[0][0].diffuse for row in grid]),
+        environment=np.array(lights),
+    )
+
+
+def _trailing(stored: Float16[np.ndarray, "*l c h w"] | Float[np.ndarray, "*l c h w"]) -> Float[np.ndarray, "*l h w c"]:
+    return np.moveaxis(stored.astype(np.float32, copy=False), -3, -1)
+
+
+def _shared_maps(shard: Shard, group: Group) -> Maps:
+    shared = _trailing(shard.shared[group.shared])
+    return {"albedo": shared[..., :3], "normal": shared[..., 3:6], "mask": shared[..., 6:]}
+
+
+def _constant_maps(maps: Maps, metallic: float, roughness: float) -> Maps:
+    inside = (maps["mask"] > 0).astype(np.float32)
+    return maps | {"metallic": inside * np.float32(metallic), "roughness": inside * np.float32(roughness)}
+
+
+__all__ = ["NO_AUGMENTATION", "Augmentation", "Batch", "GroupDataset", "iterate_batches", "make_batch"]

@@ -1,0 +1,260 @@
+"""From WebDataset shards to packed groups: decode each EXR once, then index memory.
+
+A shard is a tar whose samples are *groups*: an object under a few lights with its materials. Members of group KEY:
+`KEY.shared.exr` (albedo, normal, mask), `KEY.l0.environment.exr`, `KEY.l0.diffuse.exr`, `KEY.l0.r030.specular.exr`,
+`KEY.l0.m050_r030.exr` (the image; metallic and roughness in percent) and `KEY.json` (with `vary`).
+
+Decoding the fifty EXRs of a group takes longer than a training step, so `open_packed` decodes a shard once into three
+memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
+
+    pixels.npy       float16 [n, 3, h, w]          images, s and d
+    shared.npy       float16 [groups, 7, h, w]     albedo, normal, mask
+    environment.npy  float32 [lights, 4, 3, 16, 32]  the light at the model's size under 0 to 3 quarter turns
+    index.json       which row is what
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tarfile
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float16
+
+from unirender.errors import UnirenderError
+from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
+from unirender.paths import cache_dir
+from unirender.training.environments import turned_environments
+
+PACK_VERSION = 1  # part of the cache's path: raise it when the packed layout changes
+ENVIRONMENT_SIZE = (16, 32)  # the environment that the model predicts
+
+_LIGHT = re.compile(r"l(\d+)\.(?:(environment)|(diffuse)|r(\d+)\.(specular)|m(\d+)_r(\d+))\.exr")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One picture of a group and the rows of its buffers in `Shard.pixels` (`light`: row of `Shard.environment`)."""
+
+    light: int
+    metallic: float
+    roughness: float
+    image: int
+    specular: int
+    diffuse: int
+
+
+@dataclass(frozen=True)
+class Group:
+    """An object under its lights; `shared` is a row of `Shard.shared`, `light_index[i]` names the light of pairs[i]."""
+
+    key: str
+    vary: str
+    shared: int
+    pairs: tuple[Pair, ...]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A packed shard: arrays are read-only memory maps."""
+
+    name: str
+    sha256: str
+    pixels: Float16[np.ndarray, "n 3 h w"]
+    shared: Float16[np.ndarray, "g 7 h w"]
+    environment: Float[np.ndarray, "l 4 3 16 32"]
+    groups: tuple[Group, ...]
+
+
+def list_shards(folder: str | Path) -> dict[Path, str | None]:
+    """The complete shards of a data folder in order of name, each with the sha256 the manifest gives, if it lists it.
+
+    Works while shards are still being written: a shard gets its `.tar` name when it is complete.
+
+    Raises:
+        UnirenderError: there is none, or one that the manifest lists is missing.
+    """
+    folder = Path(folder)
+    listed: dict[str, str] = {}
+    manifest = folder / "manifest.json"
+    if manifest.exists():
+        try:
+            entries = json.loads(manifest.read_text())["shards"]
+            listed = {entry["name"]: entry["sha256"] for entry in entries}
+        except (ValueError, KeyError, TypeError) as error:
+            raise UnirenderError(f"{manifest}: not a readable manifest ({error!r}); remake the dataset") from error
+    present = {path.name: path for path in sorted(folder.glob("*.tar"))}
+    missing = sorted(set(listed) - set(present))
+    if missing:
+        raise UnirenderError(f"{folder}: shards {', '.join(missing)} of the manifest are missing; remake the dataset")
+    if not present:
+        raise UnirenderError(f"{folder}: no .tar shard found, expected a folder written by `unirender dataset`")
+    return {path: listed.get(name) for name, path in present.items()}
+
+
+def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
+    """Yields (key, members by name without the key) of a tar shard, in its order.
+
+    Raises:
+        UnirenderError: not a readable tar, or a member occurs twice (two groups would merge).
+    """
+    key, members, seen = "", {}, set()
+    try:
+        with tarfile.open(path, "r:") as tar:
+            for info in tar:
+                if not info.isfile():
+                    continue
+                name, _, rest = Path(info.name).name.partition(".")
+                if name != key:
+                    if members:
+                        yield key, members
+                    if name in seen:
+                        raise UnirenderError(f"{path}: group {name} occurs twice, expected each key once")
+                    key, members = name, {}
+                    seen.add(name)
+                if rest in members:
+                    raise UnirenderError(f"{path}: member {info.name} occurs twice, expected each member once")
+                stream = tar.extractfile(info)
+                members[rest] = stream.read() if stream else b""
+    except (tarfile.TarError, OSError) as error:
+        raise UnirenderError(f"{path}: not a readable tar shard ({error})") from error
+    if members:
+        yield key, members
+
+
+def file_sha256(path: str | Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def open_packed(path: str | Path, sha256: str | None = None) -> Shard:
+    """Opens a shard for training, packing it first if that has not been done.
+
+    Args:
+        path: the tar.
+        sha256: its hash as the manifest gives it: verified when the shard is packed, trusted afterwards.
+    """
+    path = Path(path)
+    known = sha256 or file_sha256(path)
+    folder = cache_dir() / "packed" / f"{known}-v{PACK_VERSION}"
+    if not folder.exists():
+        if sha256 is not None and (actual := file_sha256(path)) != sha256:
+            raise UnirenderError(
+                f"{path}: sha256 is {actual}, the manifest says {sha256}; delete the shard and remake the dataset"
+            )
+        _pack(path, folder)
+    arrays = {}
+    for name in ("pixels", "shared", "environment"):
+        arrays[name] = np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r"))  # a plain view of the memory map
+    groups = tuple(
+        Group(**{**group, "pairs": tuple(Pair(**pair) for pair in group["pairs"])})
+        for group in json.loads((folder / "index.json").read_text())
+    )
+    return Shard(name=path.name, sha256=known, groups=groups, **arrays)
+
+
+def _pack(path: Path, folder: Path) -> None:
+    """Decodes a shard into `folder`, which appears when it is complete."""
+    packer = _Packer(str(path))
+    groups = [packer.add(key, members) for key, members in read_groups(path)]
+    if not groups:
+        raise UnirenderError(f"{path}: the shard has no groups; delete it and remake the dataset")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=".packing-", dir=folder.parent))
+    except OSError as error:
+        raise UnirenderError(f"{folder.parent}: cannot be made ({error.strerror}); set UNIRENDER_CACHE") from error
+    try:
+        np.save(temporary / "pixels.npy", packer.stack(packer.pixels))
+        np.save(temporary / "shared.npy", packer.stack(packer.shared))
+        np.save(temporary / "environment.npy", np.stack(packer.environment))
+        (temporary / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
+        try:
+            os.rename(temporary, folder)
+        except OSError:
+            if not folder.exists():  # else another process packed the same bytes
+                raise
+    except OSError as error:
+        raise UnirenderError(
+            f"{folder}: cannot be written ({error.strerror}); free some space or set UNIRENDER_CACHE"
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+class _Packer:
+    """Collects the rows of a shard's arrays."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.pixels: list[Float16[np.ndarray, "3 h w"]] = []
+        self.shared: list[Float16[np.ndarray, "7 h w"]] = []
+        self.environment: list[Float[np.ndarray, "4 3 16 32"]] = []
+
+    def add(self, key: str, members: dict[str, bytes]) -> Group:
+        where = f"{self.path}: group {key}"
+        rows: dict[tuple, int] = {}
+        images: list[tuple[int, int, int]] = []  # light, metallic, roughness in percent
+        lights: dict[int, int] = {}
+        for name in sorted(members):
+            if name in ("json", "shared.exr"):
+                continue
+            match = _LIGHT.fullmatch(name)
+            if match is None:
+                raise UnirenderError(f"{where}: unknown member {name!r}; was it written by another version?")
+            light = int(match[1])
+            channels, _ = read_exr_bytes(members[name], name=f"{where}.{name}")
+            if match[2]:
+                turned = turned_environments(channels_rgb(channels), ENVIRONMENT_SIZE)
+                lights[light] = len(self.environment)
+                self.environment.append(np.ascontiguousarray(np.moveaxis(turned, -1, 1)))
+            elif match[3]:
+                rows[light, "diffuse"] = self._row(channels, name, "diffuse")
+            elif match[5]:
+                rows[light, "specular", int(match[4])] = self._row(channels, name, "specular")
+            else:
+                image = (light, int(match[6]), int(match[7]))
+                rows[image] = self._row(channels, name, "")
+                images.append(image)
+        try:
+            vary = json.loads(members["json"])["vary"]
+            shared, _ = read_exr_bytes(members["shared.exr"], name=f"{where}.shared.exr")
+            pairs = tuple(
+                Pair(
+                    light=lights[light],
+                    metallic=metallic / 100,
+                    roughness=roughness / 100,
+                    image=rows[light, metallic, roughness],
+                    specular=rows[light, "specular", roughness],
+                    diffuse=rows[light, "diffuse"],
+                )
+                for light, metallic, roughness in sorted(images)
+            )
+        except KeyError as error:
+            raise UnirenderError(f"{where}: member or entry {error} is missing; remake the dataset") from error
+        maps = [
+            channels_rgb(shared, "albedo"),
+            channels_rgb(shared, "normal", "XYZ"),
+            channels_rgb(shared, "mask", "Y"),
+        ]
+        self.shared.append(np.moveaxis(np.concatenate(maps, axis=-1), -1, 0).astype(np.float16))
+        return Group(key=key, vary=vary, shared=len(self.shared) - 1, pairs=pairs)
+
+    def _row(self, channels: Channels, name: str, prefix: str) -> int:
+        rgb = channels_rgb(channels, prefix if f"{prefix}.R" in channels else "")
+        if not np.isfinite(rgb).all() or np.abs(rgb).max() > HALF_MAX:
+            raise UnirenderError(f"{self.path}: {name}: values are not finite or overflow half precision")
+        self.pixels.append(np.moveaxis(rgb, -1, 0).astype(np.float16))
+        return len(self.pixels) - 1
+
+    def stack(self, rows: list[np.ndarray]) -> np.ndarray:
+        sizes = {row.shape for row in rows}
+        if len(sizes) != 1:
+            raise UnirenderError(f"{self.path}: pictures have sizes {sorted(sizes)}, expected one size")
+        return np.stack(rows)

@@ -1,0 +1,281 @@
+"""The reader: order and resume, nothing merged or lost, shapes and ranges, packing and its errors."""
+
+import itertools
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic_shards import group_members, write_dataset, write_shard
+from webdataset.compat import WebDataset
+
+from unirender.composite import composite_image
+from unirender.errors import UnirenderError
+from unirender.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
+from unirender.lighting import diffuse_light, mean_radiance, resample_environment, rotate_environment
+from unirender.paths import cache_dir
+from unirender.training.augment import (
+    DEFAULT_AUGMENTATION,
+    NO_AUGMENTATION,
+    Augmentation,
+    Draw,
+    draw,
+    turn_rotation,
+)
+from unirender.training.data import BATCH_MAPS, GroupDataset, iterate_batches
+from unirender.training.environments import turned_environments
+from unirender.training.groups import list_shards, read_groups
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("basis"))
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> GroupDataset:
+    return GroupDataset(folder)
+
+
+def samples(dataset: GroupDataset, count: int, start: int = 0, size: int = 3, **options) -> list[torch.Tensor]:
+    """`count` images and albedos of a stream."""
+    batches = iterate_batches(dataset, size, seed=5, start_sample=start, **options)
+    flat = itertools.chain.from_iterable(torch.cat([b["image"], b["albedo"], b["metallic"]], dim=1) for b in batches)
+    return list(itertools.islice(flat, count))
+
+
+def test_sample_depends_on_seed_and_index_only(dataset: GroupDataset) -> None:
+    whole = samples(dataset, 12, workers=0)
+    for resumed in (
+        samples(dataset, 5, start=7, workers=0),
+        samples(dataset, 5, start=7, size=2, workers=2),
+        samples(GroupDataset(dataset.folder), 5, start=7, workers=1),
+    ):
+        assert all(torch.equal(a, b) for a, b in zip(whole[7:], resumed, strict=True))
+    assert not torch.equal(whole[0], samples(dataset, 1, start=1, workers=0)[0])
+
+
+def test_another_seed_gives_another_stream(dataset: GroupDataset) -> None:
+    one, other = (next(iterate_batches(dataset, 4, seed=seed, workers=0)) for seed in (0, 1))
+    assert not torch.equal(one["image"], other["image"])
+
+
+def test_each_epoch_is_a_permutation_of_the_items(dataset: GroupDataset) -> None:
+    orders = [dataset._order(0, epoch) for epoch in range(8)]
+    assert all(sorted(order) == list(range(len(dataset))) for order in orders)
+    assert len({tuple(order) for order in orders}) > 1
+    albedo = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))["albedo"]
+    assert len({a.numpy().tobytes() for a in albedo}) == len(dataset)  # every group once
+
+
+def test_every_group_and_member_is_read_as_webdataset_reads_it(folder: Path, dataset: GroupDataset) -> None:
+    urls = [str(path) for path in list_shards(folder)]
+    theirs = {s["__key__"]: set(s) for s in WebDataset(urls, shardshuffle=False)}  # pyright: ignore[reportArgumentType] - its stub says str
+    ours = {key: set(members) for path in list_shards(folder) for key, members in read_groups(path)}
+    assert list(ours) == list(dataset.keys)
+    assert {key: names | {"__key__", "__url__", "__local_path__"} for key, names in ours.items()} == {
+        key: names | {"__local_path__"} for key, names in theirs.items()
+    }
+    assert dataset.num_pairs == 4 * 2 * 2 * 3
+
+
+def test_a_stored_pair_is_what_was_written(dataset: GroupDataset) -> None:
+    for group in range(len(dataset)):
+        for pair in dataset.pairs(group):
+            image, intrinsics = dataset.stored(group, pair)
+            assert set(intrinsics.present) == set(BATCH_MAPS) - {"image"}
+            np.testing.assert_allclose(image, composite_image(intrinsics), atol=4e-3)  # half precision
+            roughness, mask = intrinsics.require("roughness", "mask").values()
+            assert np.unique(roughness[mask > 0]) == np.float32(pair.roughness)
+
+
+def test_batch_shapes_and_ranges(dataset: GroupDataset) -> None:
+    batch = next(iterate_batches(dataset, 8, seed=0))
+    assert tuple(batch) == BATCH_MAPS
+    for name, tensor in batch.items():
+        channels = 1 if name in ("roughness", "metallic", "mask") else 3
+        size = (16, 32) if name == "environment" else (16, 16)
+        assert tensor.shape == (8, channels, *size)
+        assert tensor.dtype == torch.float32
+        assert tensor.isfinite().all()
+    for name in ("albedo", "roughness", "metallic", "mask"):
+        assert batch[name].min() >= 0
+        assert batch[name].max() <= 1
+    for name in ("specular", "diffuse", "environment"):
+        assert batch[name].min() >= 0
+    outside = batch["mask"] == 0
+    for name in ("image", "albedo", "normal", "roughness", "metallic", "diffuse"):
+        assert (batch[name] * outside).abs().max() == 0
+    length = batch["normal"].norm(dim=1, keepdim=True)[~outside]
+    assert (length - 1).abs().max() < 2e-3
+
+
+def test_gauge_is_applied_to_every_mixture(dataset: GroupDataset) -> None:
+    for index in range(12):
+        maps = dataset.sample(index, 0, DEFAULT_AUGMENTATION)
+        level = exposure_factor(maps["diffuse"], maps["mask"], 1.0)
+        assert 1 / TARGET_RANGE[1] * 0.999 <= level <= 1 / TARGET_RANGE[0] * 1.001, PERCENTILE
+    unexposed = Augmentation(expose=False, tint=1.0)
+    levels = [
+        exposure_factor(maps["diffuse"], maps["mask"], 1.0)
+        for maps in (dataset.sample(index, 0, unexposed) for index in range(12))
+    ]
+    assert max(levels) > 1 / TARGET_RANGE[0] or min(levels) < 1 / TARGET_RANGE[1]  # the check above can fail
+
+
+def test_mixtures_stay_consistent_with_their_maps(dataset: GroupDataset) -> None:
+    """The synthetic pictures are composites, which every augmentation must keep."""
+    for index in range(40):
+        maps = dataset.sample(index, 3, DEFAULT_AUGMENTATION)
+        metallic, albedo = maps["metallic"], maps["albedo"]
+        expected = (1 - metallic) * albedo * maps["diffuse"]
+        expected = expected + (0.04 * (1 - metallic) + albedo * metallic) * maps["specular"]
+        np.testing.assert_allclose(maps["image"], expected * maps["mask"], atol=6e-3)
+
+
+def test_environment_rides_along_with_the_maps(dataset: GroupDataset) -> None:
+    """d derived from the sample's normals and environment is the sample's d, whatever its augmentation."""
+    wrong = []
+    for index in range(24):
+        maps = dataset.sample(index, 4, DEFAULT_AUGMENTATION)
+        inside = maps["mask"] > 0
+        np.testing.assert_allclose(
+            diffuse_light(maps["normal"], maps["environment"]) * inside, maps["diffuse"], atol=0.03
+        )
+        wrong.append(diffuse_light(maps["normal"], maps["environment"][::-1]) * inside - maps["diffuse"])
+    assert np.abs(wrong).max(axis=(1, 2, 3)).mean() > 3 * 0.03
+
+
+def test_metallic_of_a_mixture_needs_its_own_nodes(dataset: GroupDataset) -> None:
+    """The twin of the test above: a picture of another metallic is rejected by the same tolerance."""
+    drawn = Draw(lights=(0,), weights=np.ones((1, 3), np.float32), roughness_index=0, metallic=0.3)
+    right = dataset.augmented(0, None, drawn)["image"]
+    wrong = dataset.augmented(0, None, Draw(**{**vars(drawn), "metallic": 0.5}))["image"]
+    assert np.abs(right - wrong).max() > 5 * 6e-3
+
+
+@pytest.mark.parametrize("vary", ["independent", "one-at-a-time", "paper"])
+def test_other_groups_are_flattened_to_pairs(tmp_path: Path, vary: str) -> None:
+    folder = write_dataset(tmp_path, vary=vary, shards=1, lights=2, roughness=(40, 70), metallic=(0, 30))
+    dataset = GroupDataset(folder)
+    assert len(dataset) == dataset.num_pairs == 2 * 2 * 2 * 2
+    batch = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
+    assert {round(float(m.max()), 2) for m in batch["metallic"]} == {0.0, 0.3}
+    assert len({image.numpy().tobytes() for image in batch["image"]}) == len(dataset)
+
+
+def test_no_augmentation_gives_stored_pictures(tmp_path: Path) -> None:
+    dataset = GroupDataset(write_dataset(tmp_path, vary="paper", shards=1))
+    stored = {dataset.stored(g, pair)[0].tobytes() for g in range(len(dataset.keys)) for pair in dataset.pairs(g)}
+    batch = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
+    assert {image.permute(1, 2, 0).contiguous().numpy().tobytes() for image in batch["image"]} == stored
+
+
+def test_a_growing_folder(folder: Path, dataset: GroupDataset, tmp_path: Path) -> None:
+    grown = shutil.copytree(folder, tmp_path / "grown")
+    (grown / "manifest.json").unlink()
+    extra = {"train-000099_g0": group_members("basis", 16, 2, (40, 70), (0, 50, 100), 99)}
+    write_shard(grown / "shard-000009.tar", extra)
+    (grown / ".shard-000010.tar.tmp").write_bytes(b"in flight")
+    larger = GroupDataset(grown)
+    assert len(larger) == len(dataset) + 1
+    assert larger.fingerprint != dataset.fingerprint
+    same = GroupDataset(grown, shards=dataset.shard_names)
+    assert same.fingerprint == dataset.fingerprint
+    assert torch.equal(samples(same, 1, start=3)[0], samples(dataset, 1, start=3)[0])
+
+
+def test_packing_happens_once(folder: Path, dataset: GroupDataset) -> None:
+    packed = sorted((cache_dir() / "packed").iterdir())
+    stamps = [path.stat().st_mtime_ns for path in packed]
+    GroupDataset(folder)
+    assert sorted((cache_dir() / "packed").iterdir()) == packed
+    assert [path.stat().st_mtime_ns for path in packed] == stamps
+
+
+def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match=r"no \.tar shard"):
+        GroupDataset(tmp_path)
+    altered = shutil.copytree(folder, tmp_path / "altered")
+    first = next(iter(list_shards(altered)))
+    first.write_bytes(first.read_bytes() + bytes(512))
+    entry = {"name": first.name, "sha256": "0" * 64}
+    (altered / "manifest.json").write_text(json.dumps({"shards": [entry]}))
+    with pytest.raises(UnirenderError, match="sha256"):
+        GroupDataset(altered)
+    first.unlink()
+    with pytest.raises(UnirenderError, match="missing"):
+        GroupDataset(altered)
+
+
+def _broken(tmp_path: Path, change) -> Path:
+    members = group_members("basis", 16, 1, (40,), (0, 50, 100), 7)
+    change(members)
+    write_shard(tmp_path / "shard-000000.tar", {"a_g0": members})
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.pop("shared.exr"), "shared.exr"),
+        (lambda m: m.pop("l0.diffuse.exr"), "diffuse"),
+        (lambda m: m.pop("l0.m050_r040.exr"), "full basis grid"),
+        (lambda m: m.update({"l0.m050_r040.exr": b"no exr"}), "not a readable OpenEXR"),
+        (lambda m: m.update({"l0.mystery.exr": b""}), "unknown member"),
+    ],
+)
+def test_broken_groups_are_refused(tmp_path: Path, change, message: str) -> None:
+    with pytest.raises(UnirenderError, match=message):
+        GroupDataset(_broken(tmp_path, change))
+
+
+def test_merged_keys_are_refused(tmp_path: Path) -> None:
+    """A dot in a key is where WebDataset cuts it: a_0.1 and a_0.2 would become one group."""
+    members = group_members("basis", 16, 1, (40,), (0, 50, 100), 7)
+    write_shard(tmp_path / "shard-000000.tar", {"a_0.1": members, "b_g0": members, "a_0.2": members})
+    with pytest.raises(UnirenderError, match=r"occurs twice|unknown member"):
+        GroupDataset(tmp_path)
+
+
+def test_draws_cover_what_the_config_allows() -> None:
+    rng = np.random.default_rng(0)
+    drawn = [draw(rng, DEFAULT_AUGMENTATION, lights=4, roughnesses=3) for _ in range(600)]
+    assert {len(d.lights) for d in drawn} == {1, 2, 3}
+    assert {light for d in drawn for light in d.lights} == {0, 1, 2, 3}
+    assert {d.roughness_index for d in drawn} == {0, 1, 2}
+    assert {d.turns for d in drawn} == {0, 1, 2, 3}
+    assert len({d.order for d in drawn}) == 6
+    assert {d.mirror for d in drawn} == {False, True}
+    metallic = np.array([d.metallic for d in drawn])
+    assert 0 < np.mean(metallic == 0) < 0.1
+    assert abs(metallic.mean() - 0.5) < 4 * 0.3 / np.sqrt(len(metallic))
+    plain = draw(rng, NO_AUGMENTATION, lights=4, roughnesses=3)
+    assert len(plain.lights) == 1
+    assert (plain.weights == 1).all()
+    assert (plain.order, plain.turns, plain.mirror, plain.exposure_target) == ((0, 1, 2), 0, False, None)
+
+
+def test_turned_environments_agree_with_the_rotation() -> None:
+    smooth = np.random.default_rng(0).random((6, 12, 3)).astype(np.float32)
+    smooth[0], smooth[-1] = smooth[0].mean(axis=0), smooth[-1].mean(axis=0)  # one radiance at a pole
+    environment = resample_environment(smooth, (64, 128))
+    turned = turned_environments(environment, (16, 32))
+    errors = [
+        np.abs(turned[k] - resample_environment(rotate_environment(environment, turn_rotation(k)), (16, 32))).max()
+        for k in range(4)
+    ]
+    assert max(errors) < 0.02, errors
+    wrong = resample_environment(rotate_environment(environment, turn_rotation(-1)), (16, 32))
+    assert np.abs(turned[1] - wrong).max() > 5 * 0.02
+
+
+def test_turned_environments_keep_the_energy_of_a_small_sun() -> None:
+    rng = np.random.default_rng(1)
+    for row, column in zip(rng.integers(3, 61, 6), rng.integers(0, 128, 6), strict=True):
+        sun = np.zeros((64, 128, 3), dtype=np.float32)
+        sun[row, column] = 1000
+        for environment in turned_environments(sun, (16, 32)):
+            np.testing.assert_allclose(mean_radiance(environment), mean_radiance(sun), rtol=5e-3)
