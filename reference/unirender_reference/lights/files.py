@@ -1,0 +1,135 @@
+"""Lights from files: lat-long HDR or EXR maps, and photographs by a stated rule.
+
+**Photographs.** A photograph is neither high dynamic range nor a whole sphere. The rule (used for LDR files):
+
+1. *Range.* Display values are decoded to linear and expanded above `KNEE`: with m the largest linear channel,
+   `rgb * (1 + (PEAK - 1) * t^2)`, t = clip((m - KNEE) / (1 - KNEE), 0, 1). White becomes PEAK; all below KNEE stays.
+2. *Sphere.* The picture fills azimuths of 180 degrees about +z (behind the camera, where a frontal object sees it) and,
+   cropped if need be, elevations -45 to +45 degrees; its mirror image fills the other half, so that both borders meet.
+   Above and below, its edge row runs on and fades over 30 degrees to that row's mean colour; below, the light is
+   multiplied by `FLOOR` as it fades (a floor is darker than what stands on it).
+
+A lat-long LDR panorama (`photograph=False`) gets step 1 only.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, read_exr
+from unirender_reference.backend import mitsuba
+from unirender_reference.lights.light import Light, area_resampled, normalized
+
+KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
+WINDOW_DEG, FADE_DEG = 45.0, 30.0
+HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
+PHOTOGRAPH_SHAPE = (128, 256)
+
+
+def load_light(path: str | Path, photograph: bool | None = None, shape: tuple[int, int] | None = None) -> Light:
+    """Loads a light from a file.
+
+    Args:
+        path: a lat-long HDR/EXR/PFM map, or an LDR picture.
+        photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
+            None: by suffix (HDR formats are lat-long, others are photographs).
+        shape: rows and columns of the result; None: the file's own for lat-long maps, 128 x 256 for photographs.
+
+    Returns:
+        The light; negative values of resampled HDR files (ringing of their makers' filters) are set to 0 *after*
+        resampling, and their share of the total is in the provenance.
+
+    Raises:
+        UnirenderError: missing, unreadable, not finite, black, or no lat-long map.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
+    hdr = path.suffix.lower() in HDR_SUFFIXES
+    pixels = _read_hdr(path) if hdr else expand_range(srgb_decode(_read_ldr(path)))
+    if not np.isfinite(pixels).all():
+        raise UnirenderError(
+            f"light {path}: {(~np.isfinite(pixels)).sum()} values are NaN or infinite; repair the file"
+        )
+    as_photograph = photograph if photograph is not None else not hdr
+    provenance = {"source": "file", "file": path.name, "rule": "lat-long"}
+    if as_photograph:
+        provenance["rule"] = f"photograph: knee {KNEE:g}, peak {PEAK:g}, window {WINDOW_DEG:g} deg, floor {FLOOR:g}"
+        environment = photograph_environment(pixels, shape or PHOTOGRAPH_SHAPE)
+    else:
+        h, w = pixels.shape[:2]
+        if h < 2 or abs(w / h - 2) > 0.02:
+            raise UnirenderError(
+                f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; "
+                "pass photograph=True for an ordinary picture"
+            )
+        environment = area_resampled(pixels, shape or (h, w))
+    negative = float(-np.minimum(environment, 0).sum() / max(np.abs(environment).sum(), 1e-30))
+    if negative > 0:
+        provenance["negative_share"] = f"{negative:.2e}"
+    environment = normalized(np.maximum(environment, 0), f"light {path}")
+    name = path.stem.replace(".", "-").replace("/", "-") or "light"
+    return Light(name, environment, provenance)
+
+
+def expand_range(linear: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Step 1 of the photograph rule: linear [0, 1] -> [0, PEAK], colour kept."""
+    t = np.clip((linear.max(-1, keepdims=True) - KNEE) / (1 - KNEE), 0, 1)
+    return (linear * (1 + (PEAK - 1) * t * t)).astype(np.float32)
+
+
+def photograph_environment(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -> Float[np.ndarray, "h2 w2 3"]:
+    """Step 2 of the photograph rule: a linear picture on the sphere."""
+    rows, half = 2 * shape[0], shape[1]  # drawn at twice the size, then averaged on to the grid
+    window = round(rows * 2 * WINDOW_DEG / 180)
+    h, w = pixels.shape[:2]
+    wanted = min(h, max(1, round(w * window / half)))  # equal angles per pixel both ways; the middle is kept
+    crop = pixels[(h - wanted) // 2 : (h - wanted) // 2 + wanted]
+    image = _box_resize(crop, (window, half))
+    image = np.concatenate([image[:, : half // 2][:, ::-1], image, image[:, half // 2 :][:, ::-1]], axis=1)
+    top = (rows - window) // 2
+    bottom = rows - window - top
+    fade = rows * FADE_DEG / 180
+    up = np.clip((np.arange(top)[::-1] + 0.5) / fade, 0, 1)[:, None, None]
+    down = np.clip((np.arange(bottom) + 0.5) / fade, 0, 1)[:, None, None]
+    sky = image[:1] * (1 - up) + image[0].mean(0) * up
+    floor = (image[-1:] * (1 - down) + image[-1].mean(0) * down) * (1 - (1 - FLOOR) * down)
+    return area_resampled(np.concatenate([sky, image, floor]), shape)
+
+
+def _box_resize(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    size = (shape[1], shape[0])
+    channels = [
+        np.asarray(Image.fromarray(np.ascontiguousarray(pixels[..., k], np.float32)).resize(size, Image.Resampling.BOX))
+        for k in range(3)
+    ]
+    return np.stack(channels, -1)
+
+
+def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"), np.float32) / 255
+    except (UnidentifiedImageError, OSError) as error:
+        raise UnirenderError(
+            f"light {path}: not a readable picture ({error}); expected PNG, JPG, HDR or EXR"
+        ) from error
+
+
+def _read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
+    if path.suffix.lower() == ".exr":
+        channels, _ = read_exr(path)
+        if "R" not in channels and "Y" in channels:
+            channels = dict.fromkeys("RGB", channels["Y"])
+        return channels_rgb(channels)
+    mi = mitsuba()
+    try:
+        bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
+    return np.array(bitmap)

@@ -1,0 +1,78 @@
+"""`Light`: a distant light as a lat-long map, and the two things every light goes through.
+
+Maps are linear Rec.709 radiance in camera axes, +y up, on the grid of `unirender.lighting` (rows at theta =
+pi i / (H - 1), columns at centres; the middle of the map is +z, behind the camera). A light has no exposure of its own:
+its luminance, averaged over the sphere by solid angle, is 1.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.color import luminance
+from unirender.errors import UnirenderError
+from unirender.lighting import mean_radiance
+
+SHAPE = (64, 128)
+
+
+@dataclass(frozen=True)
+class Light:
+    """A distant light.
+
+    Attributes:
+        name: without dots.
+        environment: (h, w, 3) float32, >= 0, mean luminance 1.
+        provenance: how it was made, as text.
+    """
+
+    name: str
+    environment: Float[np.ndarray, "h w 3"]
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        e = self.environment
+        if e.ndim != 3 or e.shape[2] != 3 or e.dtype != np.float32 or not np.isfinite(e).all() or e.min() < 0:
+            raise UnirenderError(
+                f"light {self.name}: environment must be finite float32 (h, w, 3) >= 0, got {e.dtype} {e.shape}"
+            )
+        if "." in self.name or "/" in self.name:
+            raise UnirenderError(f"light name: got {self.name!r}, expected no '.' and no '/'; rename the light")
+
+
+def normalized(environment: Float[np.ndarray, "h w 3"], name: str = "light") -> Float[np.ndarray, "h w 3"]:
+    """The map scaled to mean luminance 1.
+
+    Raises:
+        UnirenderError: the map is black.
+    """
+    mean = float(luminance(mean_radiance(environment)[None])[0])
+    if not mean > 1e-12:
+        raise UnirenderError(f"{name}: mean luminance is {mean:g}, expected more than 0; give a map that is not black")
+    return (environment / mean).astype(np.float32)
+
+
+def turned(environment: Float[np.ndarray, "h w 3"], rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
+    """A random yaw by whole columns and a random mirroring: both exact, so that nothing blurs."""
+    environment = np.roll(environment, int(rng.integers(environment.shape[1])), axis=1)
+    return environment[:, ::-1].copy() if rng.random() < 0.5 else environment
+
+
+def area_resampled(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -> Float[np.ndarray, "h2 w2 3"]:
+    """A lat-long picture (pixels are areas: rows end at the poles) on the grid of `Light`, energy kept.
+
+    Each texel is the mean of the picture under the texel's bilinear weight, so the total over the sphere stays.
+    """
+    (h, w), (h2, w2) = pixels.shape[:2], shape
+    fine = max(1, -(-4 * h2 // h))
+    theta = (np.arange(h * fine) + 0.5) * np.pi / (h * fine)
+    rows = np.maximum(1 - np.abs(theta[None] * (h2 - 1) / np.pi - np.arange(h2)[:, None]), 0) * np.sin(theta)
+    rows = (rows / rows.sum(1, keepdims=True)).reshape(h2, h, fine).sum(2)
+    fine = max(1, -(-4 * w2 // w))
+    phi = (np.arange(w * fine) + 0.5) / (w * fine) * w2 - 0.5
+    away = np.abs((phi[None] - np.arange(w2)[:, None] + w2 / 2) % w2 - w2 / 2)
+    columns = np.maximum(1 - away, 0)
+    columns = (columns / columns.sum(1, keepdims=True)).reshape(w2, w, fine).sum(2)
+    return np.einsum("ih,jw,hwc->ijc", rows, columns, pixels.astype(np.float64), optimize=True).astype(np.float32)

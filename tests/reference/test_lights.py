@@ -1,0 +1,257 @@
+"""Lights: normalisation, orientation, splits, the photograph rule, files."""
+
+import struct
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unirender.color import luminance
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, write_exr
+from unirender.lighting import environment_directions, mean_radiance, sample_environment, texel_solid_angles
+from unirender_reference import lights
+from unirender_reference.lights import files
+from unirender_reference.lights.convert import PACKAGES, convert
+from unirender_reference.lights.light import area_resampled
+
+KINDS = {
+    "constant": lambda seed: lights.light_constant((0.2, 0.5, 1.0)),
+    "gradient": lights.light_gradient,
+    "softboxes": lights.light_softboxes,
+    "sunsky": lights.light_sunsky,
+}
+
+
+def mean_luminance(environment: np.ndarray) -> float:
+    return float(luminance(mean_radiance(environment)[None])[0])
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_synthetic_lights_repeat_and_are_normalised(kind):
+    first = KINDS[kind](3)
+    assert first.environment.shape == (64, 128, 3)
+    assert mean_luminance(first.environment) == pytest.approx(1, rel=1e-4)
+    np.testing.assert_array_equal(first.environment, KINDS[kind](3).environment)
+    if kind != "constant":
+        assert not np.array_equal(first.environment, KINDS[kind](4).environment)
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_make_light_repeats_and_is_normalised(split):
+    for seed in range(25):
+        light = lights.make_light(seed, split)
+        assert light.environment.shape == (64, 128, 3)
+        assert mean_luminance(light.environment) == pytest.approx(1, rel=1e-4)
+        assert light.name.startswith(f"{split}-{seed:06d}-")
+        np.testing.assert_array_equal(light.environment, lights.make_light(seed, split).environment)
+
+
+def test_shares_of_kinds_and_disjoint_pools():
+    drawn = {split: [lights.make_light(seed, split) for seed in range(80)] for split in ("train", "test")}
+    maps = {}
+    for split, made in drawn.items():
+        kinds = [light.provenance["kind"] for light in made]
+        assert 0.35 < kinds.count("bundled") / 80 < 0.65
+        assert 0.10 < kinds.count("softboxes") / 80 < 0.40
+        assert 0.04 < kinds.count("sunsky") / 80 < 0.30
+        maps[split] = {light.name.split("-", 2)[2] for light in made if light.provenance["kind"] == "bundled"}
+        assert maps[split] <= {light.name for light in lights.bundled_lights(split)}
+    assert not maps["train"] & maps["test"]
+    # bundled maps may meet again at the same turn, constants at the same colour; procedural lights never
+    procedural = [
+        light.environment.tobytes()
+        for made in drawn.values()
+        for light in made
+        if light.provenance["kind"] in ("softboxes", "gradient", "sunsky")
+    ]
+    assert len(set(procedural)) == len(procedural)
+
+
+def test_catalogue_names_26_maps_and_keeps_twins_together():
+    rows = lights.catalogue()
+    assert len(rows) == 26
+    assert len(lights.bundled_lights("test")) == 8
+    assert len(lights.bundled_lights("train")) == 18
+    assert len(lights.bundled_lights()) == 26
+    for twin in ("city", "forest", "night", "studio", "sunrise", "sunset"):
+        assert rows[f"pmndrs-{twin}"]["split"] == rows[f"blender-{twin}"]["split"]
+    for row in rows.values():
+        assert row["license"] == "CC0-1.0"
+        assert len(row["source_sha256"]) == 64
+    for light in lights.bundled_lights():
+        assert light.environment.shape == (64, 128, 3)
+        assert mean_luminance(light.environment) == pytest.approx(1, rel=1e-4)
+    with pytest.raises(UnirenderError, match="expected one of"):
+        lights.bundled_light("nowhere")
+
+
+def test_sky_is_above_and_the_sun_is_where_it_says():
+    directions = environment_directions(64, 128)
+    for seed in range(8):
+        light = lights.light_sunsky(seed)
+        energy = luminance(light.environment)
+        brightest = directions.reshape(-1, 3)[energy.argmax()]
+        if float(light.provenance["sun_scale"]) == 1.0:
+            elevation = np.degrees(np.arcsin(brightest[1]))
+            assert elevation == pytest.approx(float(light.provenance["elevation_deg"]), abs=6)
+        ground = light.environment[34:]
+        assert np.ptp(ground.reshape(-1, 3), axis=0).max() < 1e-4 * ground.max() + 1e-6  # one Lambertian plane
+        irradiance = (energy * np.maximum(directions[..., 1], 0) * texel_solid_angles(64, 128)).sum()
+        albedo = luminance(ground[10, :1])[0] * np.pi / irradiance
+        assert 0.02 < albedo < 0.7
+
+
+def test_area_resampling_keeps_energy_and_directions():
+    rng = np.random.default_rng(0)
+    picture = rng.uniform(0, 1, (128, 256, 3)).astype(np.float32)
+    theta = (np.arange(128) + 0.5) * np.pi / 128
+    exact = np.cos(theta - np.pi / 256) - np.cos(theta + np.pi / 256)
+    mean = (picture * (exact / exact.sum() / 256)[:, None, None]).sum((0, 1))
+    assert mean_radiance(area_resampled(picture, (32, 64))) == pytest.approx(mean, rel=2e-4)
+    # a smooth function of direction is found again in that direction, at the same size and smaller
+    phi = (np.arange(256) + 0.5) / 256 * 2 * np.pi
+    x = np.sin(theta)[:, None] * np.sin(phi)[None]
+    smooth = np.stack([1 + 0.5 * x, 1 + 0.5 * np.broadcast_to(np.cos(theta)[:, None], x.shape), np.ones_like(x)], -1)
+    for shape in ((128, 256), (32, 64)):
+        found = sample_environment(area_resampled(smooth.astype(np.float32), shape), np.eye(3, dtype=np.float32)[:2])
+        assert found[:, :2] == pytest.approx(np.array([[1.5, 1.0], [1.0, 1.5]]), abs=0.01)
+
+
+def test_exr_and_rgbe_maps_agree(tmp_path):
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0.1, 4, (16, 32, 3)).astype(np.float32)
+    write_exr(tmp_path / "map.exr", image_channels(pixels), half=False)
+    # flat RGBE: mantissas of 8 bits under a common exponent
+    exponent = np.floor(np.log2(pixels.max(-1))) + 1
+    mantissa = np.floor(pixels / 2.0 ** (exponent[..., None] - 8)).astype(np.uint8)
+    rgbe = np.concatenate([mantissa, (exponent[..., None] + 128).astype(np.uint8)], -1)
+    (tmp_path / "map.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n" + rgbe.tobytes())
+    exr, hdr = lights.load_light(tmp_path / "map.exr"), lights.load_light(tmp_path / "map.hdr")
+    assert exr.environment.shape == (16, 32, 3)
+    assert exr.provenance["rule"] == "lat-long"
+    assert hdr.environment == pytest.approx(exr.environment, abs=0.03)
+    assert lights.load_light(tmp_path / "map.exr", shape=(8, 16)).environment.shape == (8, 16, 3)
+
+
+def test_negative_lobes_are_counted(tmp_path):
+    pixels = np.ones((16, 32, 3), np.float32)
+    pixels[8, 10] = -3
+    write_exr(tmp_path / "map.exr", image_channels(pixels))
+    light = lights.load_light(tmp_path / "map.exr")
+    assert light.environment.min() == 0
+    assert float(light.provenance["negative_share"]) > 0
+
+
+def test_photograph_range_rule():
+    ramp = np.linspace(0, 1, 101)[None, :, None].repeat(3, -1).astype(np.float32)
+    expanded = files.expand_range(ramp)[0, :, 0]
+    below = ramp[0, :, 0] <= files.KNEE
+    np.testing.assert_allclose(expanded[below], ramp[0, below, 0], rtol=1e-6)
+    assert expanded[-1] == pytest.approx(files.PEAK)
+    assert (np.diff(expanded) > 0).all()
+    colored = files.expand_range(np.array([[[1.0, 0.5, 0.25]]], np.float32))[0, 0]
+    assert colored / colored[0] == pytest.approx([1, 0.5, 0.25])
+
+
+def test_photograph_on_the_sphere(tmp_path):
+    picture = np.full((90, 180, 3), 96, np.uint8)
+    picture[:, :60, 0] = 200  # left third red
+    picture[:10, :, 2] = 220  # top edge blue
+    picture[-10:, :, 1] = 20
+    Image.fromarray(picture).save(tmp_path / "photo.png")
+    light = lights.load_light(tmp_path / "photo.png")
+    assert light.environment.shape == (128, 256, 3)
+    assert "photograph" in light.provenance["rule"]
+    e = light.environment
+    np.testing.assert_allclose(e, e[:, ::-1][:, (np.arange(256) + 128) % 256], atol=0.05 * e.max())  # mirror at +-x
+
+    def seen(direction):
+        return sample_environment(e, np.array([direction], np.float32))[0]
+
+    front = seen([0, 0, 1])
+    assert front[0] == pytest.approx(front[1], rel=1e-3)  # grey middle behind the camera
+    red_side = seen([-0.7, 0, 0.7]), seen([0.7, 0, 0.7])
+    assert (red_side[0][0] > 1.5 * red_side[0][1]) != (red_side[1][0] > 1.5 * red_side[1][1])
+    up = seen([0, 1, 0])
+    assert up[2] > 2 * up[1]  # the sky goes on with the top edge
+    panorama = lights.load_light(tmp_path / "photo.png", photograph=False)
+    assert panorama.environment.shape == (90, 180, 3)
+    assert panorama.provenance["rule"] == "lat-long"
+
+
+def test_a_grey_photograph_has_an_even_sky_and_a_darker_floor(tmp_path):
+    Image.fromarray(np.full((90, 180, 3), 128, np.uint8)).save(tmp_path / "grey.png")
+    e = lights.load_light(tmp_path / "grey.png").environment
+    assert np.ptp(e[:90]) < 1e-3 * e.max()
+    assert e[-1] / e[0] == pytest.approx(files.FLOOR, rel=1e-3)
+
+
+def test_a_picture_seen_in_the_window_stands_upright_and_unmirrored(tmp_path):
+    picture = np.zeros((90, 180, 3), np.uint8) + 10
+    picture[20:30, 40:50] = 250  # up and left in the picture
+    Image.fromarray(picture).save(tmp_path / "photo.png")
+    e = lights.load_light(tmp_path / "photo.png").environment
+    directions = environment_directions(*e.shape[:2])
+    window = directions[..., 2] > 0.05
+    brightest = directions[window][e.sum(-1)[window].argmax()]
+    assert brightest[1] > 0.1
+    # seen from inside, looking along +z with +y up, left is +x
+    assert brightest[0] > 0.3
+
+
+def bad_file(tmp_path, name: str, data: bytes):
+    (tmp_path / name).write_bytes(data)
+    return tmp_path / name
+
+
+def test_errors_say_what_to_do(tmp_path):
+    with pytest.raises(UnirenderError, match="no such file"):
+        lights.load_light(tmp_path / "absent.hdr")
+    with pytest.raises(UnirenderError, match="not a readable picture"):
+        lights.load_light(bad_file(tmp_path, "text.png", b"hello"))
+    with pytest.raises(UnirenderError, match="not a readable"):
+        lights.load_light(bad_file(tmp_path, "text.hdr", b"hello"))
+    with pytest.raises(UnirenderError, match="not a readable"):
+        lights.load_light(bad_file(tmp_path, "text.exr", b"hello"))
+    write_exr(tmp_path / "square.exr", image_channels(np.ones((16, 16, 3), np.float32)))
+    with pytest.raises(UnirenderError, match="photograph=True"):
+        lights.load_light(tmp_path / "square.exr")
+    assert lights.load_light(tmp_path / "square.exr", photograph=True).environment.shape == (128, 256, 3)
+    write_exr(tmp_path / "black.exr", image_channels(np.zeros((8, 16, 3), np.float32)))
+    with pytest.raises(UnirenderError, match="not black"):
+        lights.load_light(tmp_path / "black.exr")
+    pixels = np.ones((2, 4, 3), ">f4")
+    pixels[0, 0, 0] = np.nan
+    header = b"PF\n4 2\n1.0\n"
+    assert struct.calcsize(">24f") == len(pixels.tobytes())
+    with pytest.raises(UnirenderError, match="NaN"):
+        lights.load_light(bad_file(tmp_path, "nan.pfm", header + pixels.tobytes()))
+    with pytest.raises(UnirenderError, match="expected seed >= 0"):
+        lights.make_light(-1, "train")
+    with pytest.raises(UnirenderError, match="three finite numbers"):
+        lights.light_constant((1.0, -1.0, 0.0))
+
+
+def test_bundled_maps_are_the_callers_own():
+    first = lights.bundled_light("pmndrs-city")
+    first.environment[:] = 0  # Mitsuba refuses read-only arrays; writing must not reach the next caller
+    assert mean_luminance(lights.bundled_light("pmndrs-city").environment) == pytest.approx(1, rel=1e-4)
+
+
+def test_conversion_repeats_and_refuses_other_sources(tmp_path):
+    rng = np.random.default_rng(0)
+    for package in PACKAGES:
+        (tmp_path / "source" / package).mkdir(parents=True)
+        pixels = rng.uniform(0, 2, (32, 64, 3)).astype(np.float32)
+        write_exr(tmp_path / "source" / package / "city.exr", image_channels(pixels))
+    (tmp_path / "target").mkdir()
+    convert(tmp_path / "source", tmp_path / "target")
+    first = {path.name: path.read_bytes() for path in (tmp_path / "target").iterdir()}
+    assert set(first) == {"pmndrs-city.exr", "blender-city.exr", "lights.toml"}
+    convert(tmp_path / "source", tmp_path / "target")
+    assert first == {path.name: path.read_bytes() for path in (tmp_path / "target").iterdir()}
+    write_exr(tmp_path / "source" / "blender" / "city.exr", image_channels(np.ones((32, 64, 3), np.float32)))
+    with pytest.raises(UnirenderError, match="sha256"):
+        convert(tmp_path / "source", tmp_path / "target")
+    assert first == {path.name: path.read_bytes() for path in (tmp_path / "target").iterdir()}  # nothing half done

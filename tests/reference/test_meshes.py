@@ -1,0 +1,227 @@
+"""Users' meshes: what is read, in which colour space, and what is refused.
+
+Every file is written here, most of them byte by byte: the loader must not be tested with its own library alone.
+"""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender_reference.meshes import load_mesh
+from unirender_reference.shapes import MeshObject
+from unirender_reference.shapes.surface import face_normals
+
+QUAD = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint16)
+CORNERS = {
+    "top-left": (255, 0, 0),
+    "top-right": (0, 255, 0),
+    "bottom-left": (0, 0, 255),
+    "bottom-right": (188, 188, 188),
+}
+
+
+def four_colors(size: int = 8) -> Image.Image:
+    """Red, green / blue, grey quarters, seen with the first row on top."""
+    picture = np.zeros((size, size, 3), np.uint8)
+    half = size // 2
+    picture[:half, :half], picture[:half, half:] = CORNERS["top-left"], CORNERS["top-right"]
+    picture[half:, :half], picture[half:, half:] = CORNERS["bottom-left"], CORNERS["bottom-right"]
+    return Image.fromarray(picture)
+
+
+def write_glb(path, uv, image_bytes=None, factor=None, colors=None):
+    """A quad as binary glTF 2.0, from the specification."""
+    blobs = [QUAD.tobytes(), QUAD_FACES.tobytes(), np.asarray(uv, np.float32).tobytes()]
+    accessors = [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [-1, -1, 0], "max": [1, 1, 0]},
+        {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+        {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
+    ]
+    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
+    material: dict = {"metallicFactor": 0.0}
+    header: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    if factor is not None:
+        material["baseColorFactor"] = [*factor, 1.0]
+    if image_bytes is not None:
+        material["baseColorTexture"] = {"index": 0}
+        header |= {"textures": [{"source": 0}], "images": [{"bufferView": len(blobs), "mimeType": "image/png"}]}
+        blobs.append(image_bytes)
+    if colors is not None:
+        attributes["COLOR_0"] = len(accessors)
+        accessors.append({"bufferView": len(blobs), "componentType": 5126, "count": 4, "type": "VEC4"})
+        blobs.append(np.asarray(colors, np.float32).tobytes())
+    body, views = b"", []
+    for blob in blobs:
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(blob)})
+        body += blob + b"\0" * (-len(blob) % 4)
+    primitive = {"attributes": attributes, "indices": 1, "material": 0}
+    header |= {
+        "materials": [{"pbrMetallicRoughness": material}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+def png_bytes(tmp_path, image: Image.Image) -> bytes:
+    image.save(tmp_path / "texture.png")
+    return (tmp_path / "texture.png").read_bytes()
+
+
+def lookup(obj: MeshObject, x: float, y: float) -> np.ndarray:
+    """The albedo at a point of the (scaled) quad, through uv and nearest texel, as a renderer would find it."""
+    assert obj.uv is not None
+    scale = 1 / np.sqrt(2)
+    for face in obj.faces:
+        a, b, c = obj.vertices[face][:, :2]
+        weights = np.linalg.solve(np.stack([b - a, c - a], 1), np.array([x, y]) * scale - a)
+        if weights.min() >= 0 and weights.sum() <= 1:
+            uv = np.array([1 - weights.sum(), *weights]) @ obj.uv[face]
+            h, w, _ = obj.albedo.shape
+            return obj.albedo[int(uv[1] * h), int(uv[0] * w)]
+    raise AssertionError("outside the quad")
+
+
+def assert_four_colors(obj: MeshObject, factor=(1.0, 1.0, 1.0)):
+    for name, (x, y) in {
+        "top-left": (-0.5, 0.6),
+        "top-right": (0.5, 0.6),
+        "bottom-left": (-0.5, -0.6),
+        "bottom-right": (0.5, -0.6),
+    }.items():
+        linear = srgb_decode(np.array(CORNERS[name], np.float32) / 255) * np.array(factor)
+        assert lookup(obj, x, y) == pytest.approx(linear, abs=5e-3), name
+
+
+GLTF_UV = [[0, 1], [1, 1], [1, 0], [0, 0]]  # glTF: v = 0 is the first row
+
+
+def test_glb_with_texture_and_factor(tmp_path):
+    path = write_glb(tmp_path / "quad.v2.glb", GLTF_UV, png_bytes(tmp_path, four_colors()), factor=(0.5, 1.0, 0.25))
+    obj = load_mesh(path)
+    assert obj.name == "quad-v2"
+    assert obj.family == "mesh"
+    assert obj.normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
+    assert np.linalg.norm(obj.vertices, axis=1) == pytest.approx(1, abs=1e-5)
+    assert_four_colors(obj, factor=(0.5, 1.0, 0.25))
+
+
+def test_glb_factor_is_linear(tmp_path):
+    obj = load_mesh(write_glb(tmp_path / "quad.glb", GLTF_UV, factor=(0.5, 0.2, 0.8)))
+    assert obj.uv is None
+    assert obj.albedo == pytest.approx([0.5, 0.2, 0.8], abs=1 / 255)
+
+
+def test_glb_vertex_colors_interpolate(tmp_path):
+    colors = [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0.5, 0.5, 0.5, 1]]
+    obj = load_mesh(write_glb(tmp_path / "quad.glb", GLTF_UV, colors=colors))
+    assert obj.uv is not None
+    # bilinear lookup at each corner gives back that corner's colour
+    h, w, _ = obj.albedo.shape
+    for vertex, uv in zip(obj.vertices, obj.uv, strict=True):
+        corner = int(np.argmin(np.linalg.norm(QUAD / np.sqrt(2) - vertex, axis=1)))
+        texel = obj.albedo[int(uv[1] * h), int(uv[0] * w)]
+        assert texel == pytest.approx(colors[corner][:3], abs=1 / 128)
+
+
+def write_obj(tmp_path, uv, material: str) -> None:
+    lines = ["mtllib quad.mtl", *[f"v {x} {y} {z}" for x, y, z in QUAD], *[f"vt {u} {v}" for u, v in uv]]
+    (tmp_path / "quad.obj").write_text("\n".join([*lines, "usemtl m", "f 1/1 2/2 3/3", "f 1/1 3/3 4/4", ""]))
+    (tmp_path / "quad.mtl").write_text(f"newmtl m\n{material}\n")
+
+
+def test_obj_with_texture_counts_v_from_below_and_ignores_kd(tmp_path):
+    png_bytes(tmp_path, four_colors())
+    write_obj(tmp_path, [[0, 0], [1, 0], [1, 1], [0, 1]], "Kd 0.2 0.2 0.2\nmap_Kd texture.png")
+    assert_four_colors(load_mesh(tmp_path / "quad.obj"))
+
+
+def test_obj_kd_is_srgb(tmp_path):
+    write_obj(tmp_path, [[0, 0]] * 4, "Kd 0.5 1.0 0.0")
+    assert load_mesh(tmp_path / "quad.obj").albedo == pytest.approx([0.214, 1.0, 0.0], abs=3e-3)
+
+
+def test_repeating_texture_is_unrolled(tmp_path):
+    uv = np.array(GLTF_UV) * 3 - 1  # nine copies, from -1 to 2
+    obj = load_mesh(write_glb(tmp_path / "quad.glb", uv, png_bytes(tmp_path, four_colors())))
+    for x in (-1, 0, 1):
+        for y in (-1, 0, 1):
+            point = np.array([x, y]) * 2 / 3 + np.array([-1, 1]) / 6  # the red quarter of each copy
+            assert lookup(obj, *point) == pytest.approx([1, 0, 0], abs=5e-3)
+    far = load_mesh(write_glb(tmp_path / "far.glb", np.array(GLTF_UV) * 50, png_bytes(tmp_path, four_colors())))
+    assert far.provenance["textures_averaged"] == "1"
+    assert far.albedo == pytest.approx(load_linear_mean(), abs=5e-3)
+
+
+def load_linear_mean() -> np.ndarray:
+    return srgb_decode(np.asarray(four_colors(), np.float32) / 255).mean((0, 1))
+
+
+def test_ply_round_trip_with_vertex_colors(tmp_path):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    grey = np.full((len(ball.vertices), 4), 188, np.uint8)
+    trimesh.Trimesh(ball.vertices * 7 + 3, ball.faces, vertex_colors=grey, process=False).export(tmp_path / "ball.ply")
+    obj = load_mesh(tmp_path / "ball.ply")
+    assert obj.albedo == pytest.approx(np.full(3, 0.503), abs=2e-3)
+    assert obj.signed_volume == pytest.approx(ball.volume, rel=0.03)
+    assert (obj.normals * obj.vertices).sum(1).min() > 0.98
+
+
+def test_scene_graph_is_flattened_and_materials_stay_apart(tmp_path):
+    scene = trimesh.Scene()
+    for shift, color in ((-1.5, (255, 0, 0)), (1.5, (0, 0, 255))):  # the right one is mirrored by its node
+        material = PBRMaterial(baseColorFactor=[*color, 255])
+        box = trimesh.creation.box()
+        box.visual = TextureVisuals(uv=np.zeros((len(box.vertices), 2)), material=material)
+        transform = np.diag([1.0, 1.0, -np.sign(shift), 1.0])
+        transform[0, 3] = shift
+        scene.add_geometry(box, transform=transform)
+    scene.export(tmp_path / "two.glb")
+    obj = load_mesh(tmp_path / "two.glb")
+    assert obj.provenance["meshes"] == "2"
+    assert obj.uv is not None
+    h, w, _ = obj.albedo.shape
+    color = obj.albedo[(obj.uv[:, 1] * h).astype(int), (obj.uv[:, 0] * w).astype(int)]
+    left = obj.vertices[:, 0] < 0
+    assert color[left] == pytest.approx(np.tile([1, 0, 0], (left.sum(), 1)), abs=1e-6)
+    assert color[~left] == pytest.approx(np.tile([0, 0, 1], ((~left).sum(), 1)), abs=1e-6)
+    assert obj.signed_volume > 0
+    # boxes keep their edges: shading normals are the faces'
+    flat = face_normals(obj.vertices, obj.faces)
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    assert np.einsum("ij,ikj->ik", flat, obj.normals[obj.faces]).min() > 0.999
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("absent.obj", None, "no such file"),
+        ("mesh.xyz", "1 2 3", "expected one of"),
+        ("text.glb", "this is no mesh", "cannot be read"),
+        ("points.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+         "end_header\n0 0 0\n", "no faces"),
+        ("empty.obj", "# nothing\n", "no faces|cannot be read"),
+        ("nan.obj", "v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
+        ("point.obj", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero extent"),
+    ],
+)  # fmt: skip
+def test_errors(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(UnirenderError, match=message):
+        load_mesh(tmp_path / name)

@@ -1,0 +1,182 @@
+"""Procedural objects: determinism, disjoint splits, closed outward meshes, charts, textures."""
+
+import numpy as np
+import pytest
+
+from unirender.errors import UnirenderError
+from unirender_reference.shapes import HELD_OUT_FAMILIES, TRAIN_FAMILIES, MeshObject, Split, make_object, unit_sphere
+from unirender_reference.shapes.generator import FAMILIES, draw_family
+from unirender_reference.shapes.implicit import mesh_field
+from unirender_reference.shapes.mesh_object import signed_volume
+from unirender_reference.shapes.parametric import rounded_box_part
+from unirender_reference.shapes.surface import Part, corner_normals, grid_part
+from unirender_reference.textures import random_color, random_palette, random_texture
+
+
+def parts_of(family: str, seed: int) -> list[Part]:
+    made = FAMILIES[family](np.random.default_rng(seed))
+    return made if isinstance(made, list) else [made]
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_object_repeats_and_meets_the_contract(split: Split):
+    for seed in range(6):
+        obj, again = make_object(seed, split), make_object(seed, split)
+        assert obj.name == f"{split}-{seed:06d}"
+        for name in ("vertices", "faces", "normals", "uv", "albedo"):
+            np.testing.assert_array_equal(getattr(obj, name), getattr(again, name))
+        assert np.linalg.norm(obj.vertices, axis=1).max() == pytest.approx(1, abs=1e-3)
+        assert obj.signed_volume > 0
+        assert len(obj.faces) < 45_000
+        assert obj.provenance["family"] == obj.family
+        if obj.uv is not None:
+            assert obj.uv.min() >= 0
+            assert obj.uv.max() <= 1
+
+
+def test_splits_draw_other_objects_and_train_has_no_held_out_family():
+    train = [draw_family(seed, "train") for seed in range(300)]
+    test = [draw_family(seed, "test") for seed in range(300)]
+    assert {name for name, _ in train} == set(TRAIN_FAMILIES)
+    assert {name for name, _ in test[::2]} == set(HELD_OUT_FAMILIES)
+    assert {name for name, _ in test[1::2]} <= set(TRAIN_FAMILIES)
+    assert not set(TRAIN_FAMILIES) & set(HELD_OUT_FAMILIES)
+    assert len({rng.random() for _, rng in train + test}) == 600  # no stream is shared
+    assert make_object(0, "train").family == train[0][0]
+    assert [make_object(seed, "test").family for seed in (4, 5)] == [test[4][0], test[5][0]]
+
+
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_every_family_is_closed_and_outward(family):
+    for seed in range(3):
+        for part in parts_of(family, seed):
+            edges = np.sort(part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+            _, uses = np.unique(edges, axis=0, return_counts=True)
+            assert (uses % 2 == 0).all(), "an open edge"
+            directed = part.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+            forward = np.unique(directed[directed[:, 0] < directed[:, 1]], axis=0, return_counts=True)[1].sum()
+            assert 2 * forward == len(directed), "neighbours of opposite orientation"
+            assert signed_volume(part.vertices, part.faces) > 0
+            assert np.isfinite(part.corner_uv).all()
+            assert part.corner_uv.min() >= 0
+            assert part.corner_uv.max() <= 1
+
+
+@pytest.mark.parametrize("family", sorted(set(FAMILIES) - {"assembly"}))  # it moves its parts after baking
+def test_position_map_lies_on_the_surface_it_textures(family):
+    for part in parts_of(family, 11):
+        h, w, _ = part.position_map.shape
+        center_uv = part.corner_uv.mean(1)
+        column, row = np.floor(center_uv * [w, h]).astype(int).T
+        found = part.position_map[row, column]
+        truth = part.vertices[part.faces].mean(1)
+        edges = np.linalg.norm(np.diff(part.vertices[part.faces], axis=1), axis=2).max(1)
+        extent = np.ptp(part.vertices, axis=0).max()
+        # half a texel of parameter away, at most; pinched superquadrics stretch a texel over several percent
+        distance = np.linalg.norm(found - truth, axis=1) / (extent + edges)
+        assert np.median(distance) < 0.02
+        assert np.quantile(distance, 0.95) < 0.08
+
+
+def test_signed_volume_of_a_box_and_its_twin_that_must_fail():
+    part = rounded_box_part(np.array([0.5, 1.0, 1.5]), 0.0)
+    assert signed_volume(part.vertices, part.faces) == pytest.approx(8 * 0.75, rel=1e-5)
+    assert signed_volume(part.vertices, part.faces[:, ::-1]) == pytest.approx(-8 * 0.75, rel=1e-5)
+    assert signed_volume(part.vertices, part.faces[1:]) != pytest.approx(8 * 0.75, rel=1e-5)
+
+
+def test_creases_keep_a_box_flat_and_a_sphere_smooth():
+    box = rounded_box_part(np.array([1.0, 1.0, 1.0]), 0.0)
+    normals = corner_normals(box.vertices, box.faces, 30)
+    assert np.abs(normals).max(-1) == pytest.approx(1, abs=1e-6)  # every corner normal is an axis
+    smooth = corner_normals(box.vertices, box.faces, 180)
+    assert np.abs(smooth).max(-1).min() < 0.8  # the twin: without creases the corners are rounded
+
+    theta, phi = np.linspace(0, np.pi, 41)[:, None], np.linspace(0, 2 * np.pi, 81)[None]
+    ball = np.stack(np.broadcast_arrays(np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)), -1)
+    part = grid_part(ball)
+    normals = corner_normals(part.vertices, part.faces, 40)
+    cosine = (normals * part.vertices[part.faces]).sum(-1)
+    assert cosine.min() > 0.999
+
+
+def test_marching_cubes_of_a_ball_has_its_volume():
+    part = mesh_field(lambda p: np.linalg.norm(p, axis=-1) - 0.8)
+    assert signed_volume(part.vertices, part.faces) == pytest.approx(4 / 3 * np.pi * 0.8**3, rel=5e-3)
+    normals = corner_normals(part.vertices, part.faces, 180)
+    assert ((normals * part.vertices[part.faces]).sum(-1) / 0.8).min() > 0.99
+
+
+def test_unit_sphere_of_a_regular_tetrahedron_is_its_circumsphere():
+    points = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float) * 3 + [5, 6, 7]
+    found = unit_sphere(points)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(1, abs=2e-2)
+    with pytest.raises(UnirenderError, match="zero extent"):
+        unit_sphere(np.ones((4, 3)))
+
+
+def test_colors_are_varied_and_physical():
+    rng = np.random.default_rng(0)
+    colors = np.stack([random_color(rng) for _ in range(2000)])
+    assert colors.min() >= 0.015
+    assert colors.max() <= 0.95
+    value, saturation = colors.max(1), 1 - colors.min(1) / colors.max(1)
+    assert np.mean(value < 0.1) > 0.05
+    assert np.mean((value > 0.75) & (saturation < 0.15)) > 0.02
+    assert np.mean((value > 0.05) & (value < 0.7) & (saturation < 0.15)) > 0.05
+    assert np.mean(saturation > 0.8) > 0.25
+    assert np.bincount(colors.argmax(1), minlength=3).min() > 300
+    assert 2 <= len(random_palette(rng)) <= 4
+
+
+def test_textures_are_solid_functions_of_position():
+    points = np.random.default_rng(1).uniform(-1, 1, (8, 16, 3)).astype(np.float32)
+    kinds = set()
+    for seed in range(60):
+        kind, texture = random_texture(np.random.default_rng(seed))
+        kinds.add(kind)
+        color = texture(points)
+        assert color.shape == (8, 16, 3)
+        assert color.dtype == np.float32
+        assert color.min() >= 0.0149
+        assert color.max() <= 0.9501
+        np.testing.assert_array_equal(texture(points[::-1]), color[::-1])
+    assert len(kinds) == 10
+
+
+def test_share_of_textured_objects():
+    textured = [make_object(seed, "train").albedo.ndim == 3 for seed in range(30)]
+    assert 0.5 < np.mean(textured) < 0.85
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"name": "a.b"}, "rename"),
+        ({"faces": np.array([[0, 1, 9]], np.int32)}, "outside the 4 vertices"),
+        ({"normals": np.zeros((4, 3), np.float32)}, "unit vectors"),
+        ({"albedo": np.full(3, 1.5, np.float32)}, r"within \[0, 1\]"),
+        ({"albedo": np.full((4, 4, 3), 0.5, np.float32)}, "uv absent"),
+        ({"vertices": np.full((4, 3), np.nan, np.float32)}, "finite"),
+        ({"vertices": np.full((4, 3), 0.1, np.float32)}, "radius 1"),
+    ],
+)
+def test_broken_objects_are_refused(change, message):
+    vertices = unit_sphere(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float))
+    good = {
+        "name": "a",
+        "family": "mesh",
+        "vertices": vertices,
+        "faces": np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32),
+        "normals": np.tile(np.array([[0, 0, 1]], np.float32), (4, 1)),
+        "uv": None,
+        "albedo": np.full(3, 0.5, np.float32),
+    }
+    MeshObject(**good)
+    with pytest.raises(UnirenderError, match=message):
+        MeshObject(**{**good, **change})
+
+
+def test_negative_seeds_are_refused():
+    with pytest.raises(UnirenderError, match="expected seed >= 0"):
+        make_object(-1, "train")
