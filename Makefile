@@ -8,7 +8,7 @@
 #   make bench BENCH_ARGS="--limit 8"    options for `unirender bench run`
 #   make test PYTEST_ARGS="-k camera"    options for pytest
 
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || echo python3)
 PIP_ARGS ?=
 BENCH_ARGS ?=
 PYTEST_ARGS ?=
@@ -40,7 +40,7 @@ bench: $(VENV)/.runtime
 	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) $(BENCH_ARGS)
 
 bench-full: $(VENV)/.runtime
-	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --full $(BENCH_ARGS)
+	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --sample-scenes 1000000 $(BENCH_ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

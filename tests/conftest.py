@@ -5,9 +5,8 @@ annotation in a signature is checked by beartype at each call. A wrong shape in 
 """
 
 import os
-import tempfile
-
 import sys
+import tempfile
 import types
 
 from beartype import BeartypeConf, beartype

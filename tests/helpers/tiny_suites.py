@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
+
 from unirender.camera import Camera
 from unirender.composite import composite
 from unirender.exr import exr_bytes
@@ -79,7 +80,9 @@ def make_suite(folder: Path, **options: int) -> Suite:
 def _add(members: dict[str, bytes], quality: dict[str, dict], name: str, value: np.ndarray) -> None:
     value = value.astype(np.float16).astype(np.float32)
     relative = NOISE * np.abs(value) / np.maximum(np.abs(value), STD_FLOOR)
-    channels = {c: value[..., i] for i, c in enumerate("RGB")} | {f"std.{c}": relative[..., i] for i, c in enumerate("RGB")}
+    channels = {c: value[..., i] for i, c in enumerate("RGB")} | {
+        f"std.{c}": relative[..., i] for i, c in enumerate("RGB")
+    }
     members[name] = exr_bytes(channels)
     quality[name] = {"spp": 8, "ceiling_db": 50.0}
 

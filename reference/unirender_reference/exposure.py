@@ -1,0 +1,47 @@
+"""The gauge applied to a scene: `unirender.exposure` with the target drawn by seed and a d buffer of its own.
+
+The rule itself (a percentile of the white-diffuse luminance is mapped to a target) is shared with the training data's
+augmentation and stands in `unirender.exposure`. It sees the light and the object, never the material.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender import exposure as gauge
+
+PASS_SPP = 16
+PASS_SEED = 0
+
+
+@runtime_checkable
+class _Renderer(Protocol):
+    def exposure_mask(self) -> Any: ...
+
+    def diffuse(self, environment: Any, spp: int, seed: int, batches: int) -> Any: ...
+
+
+def exposure_factor(diffuse: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], seed: int) -> float:
+    """The factor for a scene whose white-diffuse buffer under the unexposed light is `diffuse`.
+
+    Args:
+        diffuse: d at any scale, linear, not premultiplied.
+        mask: coverage, [0, 1].
+        seed: draws the target brightness.
+
+    Raises:
+        UnirenderError: the mask is empty, or no light reaches the object.
+    """
+    return gauge.exposure_factor(diffuse, mask, gauge.draw_target(np.random.default_rng(seed)))
+
+
+def scene_exposure(renderer: _Renderer, environment: Float[np.ndarray, "h w 3"], seed: int) -> float:
+    """The factor of a light on a renderer's object, from a d pass of its own.
+
+    That pass and the mask have a fixed seed and sample count: two truths of one scene (other seeds) share their
+    exposure.
+    """
+    mask = renderer.exposure_mask()
+    diffuse = renderer.diffuse(environment, spp=PASS_SPP, seed=PASS_SEED, batches=1).mean
+    return exposure_factor(diffuse, mask, seed)

@@ -1,0 +1,136 @@
+"""Monte Carlo passes: seeds, batches, the repair of NaN pixels, means and their variance.
+
+A *pass* is one `mi.render` with its own seed. An estimate is the mean over its passes; the variance *of that mean*
+comes from the spread between passes (Mitsuba's `moment` integrator gives XYZ, not RGB).
+"""
+
+import hashlib
+import math
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender_reference.backend import mitsuba
+
+TRUTH_BATCHES = 8
+SAMPLES_PER_PASS = 1 << 23  # wavefront size: memory grows with it
+NAN_ATTEMPTS = 8
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A Monte Carlo estimate.
+
+    Attributes:
+        mean: (h, w, c) linear radiance.
+        variance: (h, w, c) variance of `mean`, or None when one pass was asked for.
+        nan_pixels: pixels that came out NaN or infinite in some pass and were rendered again with another seed.
+    """
+
+    mean: Float[np.ndarray, "h w c"]
+    variance: Float[np.ndarray, "h w c"] | None
+    nan_pixels: int = 0
+
+
+@dataclass
+class Counters:
+    """What a renderer has done so far: `mi.render` seconds (array read back included), calls, repaired pixels."""
+
+    render_seconds: float = 0.0
+    renders: int = 0
+    nan_pixels: int = 0
+
+
+def render_passes(
+    scene: Any, depth: int, spp: int, seed: int, batches: int, counters: Counters
+) -> tuple[Float[np.ndarray, "n h w 4"], int]:
+    """Premultiplied RGBA passes of path tracing at `depth`, the environment hidden; at least `batches` of them.
+
+    A pixel that comes out NaN or infinite is taken from a render with another seed; how many is the second result.
+
+    Raises:
+        UnirenderError: `spp` cannot be divided, or a pixel stays NaN.
+    """
+    mi = mitsuba()
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+    width, height = scene.sensors()[0].film().crop_size()
+    count = pass_count(spp, batches, SAMPLES_PER_PASS // int(width * height))
+    passes, nan_pixels = [], 0
+    for index in range(count):
+        picture = _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, 0), counters)
+        bad = ~np.isfinite(picture).all(axis=-1)
+        nan_pixels += int(bad.sum())
+        for attempt in range(1, NAN_ATTEMPTS + 1):
+            if not bad.any():
+                break
+            again = _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
+            picture[bad] = again[bad]
+            bad = ~np.isfinite(picture).all(axis=-1)
+        if bad.any():
+            raise UnirenderError(
+                f"render: {int(bad.sum())} pixels stay NaN after {NAN_ATTEMPTS} seeds, expected finite radiance; "
+                "check the mesh's normals and the light"
+            )
+        passes.append(picture)
+    counters.nan_pixels += nan_pixels
+    return np.stack(passes), nan_pixels
+
+
+def mean_estimate(passes: Float[np.ndarray, "n h w c"], nan_pixels: int, batches: int) -> Estimate:
+    """Mean over passes and its variance (None for one batch)."""
+    variance = passes.var(axis=0, ddof=1, dtype=np.float64) / len(passes) if batches > 1 else None
+    return Estimate(_float32(passes.mean(axis=0, dtype=np.float64)), _float32(variance), nan_pixels)
+
+
+def ratio_estimate(passes: Float[np.ndarray, "n h w 4"], nan_pixels: int, batches: int) -> Estimate:
+    """Sum of radiance over sum of coverage, 0 where nothing is covered; variance of the ratio by the delta method."""
+    radiance, coverage = passes[..., :3].astype(np.float64), passes[..., 3:].astype(np.float64)
+    total = coverage.mean(axis=0)
+    covered = total > 0
+    mean = np.divide(radiance.mean(axis=0), total, out=np.zeros(radiance.shape[1:]), where=covered)
+    if batches == 1:
+        return Estimate(_float32(mean), None, nan_pixels)
+    residual = radiance - mean * coverage
+    spread = np.square(residual).sum(axis=0) / (len(passes) - 1) / len(passes)
+    variance = np.divide(spread, np.square(total), out=np.zeros_like(spread), where=covered)
+    return Estimate(_float32(mean), _float32(variance), nan_pixels)
+
+
+def pass_count(spp: int, batches: int, most: int) -> int:
+    """The fewest passes (at least `batches`) that divide `spp` into equal pass sizes, each a full multi-jittered grid.
+
+    Mitsuba's multi-jittered sampler rounds other sizes up, with a warning.
+
+    Args:
+        spp: samples per pixel in all.
+        batches: least number of passes.
+        most: largest number of samples per pixel in one pass.
+    """
+    if spp < 1 or batches < 1 or batches > spp:
+        raise UnirenderError(f"spp: got {spp} in {batches} batches, expected at least one sample in each")
+    for count in range(batches, spp + 1):
+        size = spp // count
+        if spp % count == 0 and size <= max(most, 1) and size % math.isqrt(size) == 0:
+            return count
+    raise UnirenderError(f"spp: got {spp} in {batches} batches, expected one that can be divided; use a power of 2")
+
+
+def derive_seed(*parts: int | str) -> int:
+    """A 32-bit seed that depends on all parts, the same in every process and version of Python."""
+    return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:4], "little")
+
+
+def _render(scene: Any, integrator: Any, spp: int, seed: int, counters: Counters) -> Float[np.ndarray, "h w 4"]:
+    start = time.perf_counter()
+    picture = np.array(mitsuba().render(scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
+    counters.render_seconds += time.perf_counter() - start
+    counters.renders += 1
+    return picture
+
+
+def _float32(array: Any) -> Any:
+    return None if array is None else array.astype(np.float32)

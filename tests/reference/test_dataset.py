@@ -1,0 +1,241 @@
+"""The data set: its plan, its shards, what a killed run leaves, and what WebDataset reads back."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import webdataset
+
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr_bytes
+from unirender_reference.dataset import generate
+from unirender_reference.plan import GRID, DatasetConfig, basis_shape, plan_groups
+from unirender_reference.shards import shard_name, write_shard
+
+SIZE = 8
+SPP = 16
+
+
+def config(out: Path, objects: int = 2, pairs: int = 3, vary: str = "basis", **changes: object) -> DatasetConfig:
+    return DatasetConfig(objects, pairs, SIZE, vary, out, spp=SPP, workers=1, **changes)  # type: ignore[arg-type] - from tests
+
+
+def read_back(folder: Path) -> list[dict[str, bytes]]:
+    """Every sample as the WebDataset library delivers it."""
+    urls = [str(path) for path in sorted(folder.glob("*.tar"))]
+    return list(webdataset.WebDataset(urls, shardshuffle=False))  # type: ignore[attr-defined] - exported lazily
+
+
+@pytest.mark.parametrize(
+    ("pairs", "shape"),
+    [(3, (1, 1)), (6, (2, 1)), (12, (2, 2)), (18, (3, 2)), (27, (3, 3)), (36, (4, 3)), (108, (6, 6))],
+)
+def test_basis_is_nearly_square(pairs: int, shape: tuple[int, int]) -> None:
+    assert basis_shape(pairs) == shape
+
+
+@pytest.mark.parametrize("pairs", [1, 4, 33, 3 * 81])
+def test_basis_refuses_other_numbers_of_pairs(pairs: int) -> None:
+    with pytest.raises(UnirenderError, match=f"got {pairs} with --vary basis, expected 3 x lights"):
+        basis_shape(pairs)
+
+
+@pytest.mark.parametrize(("vary", "pairs"), [("basis", 27), ("independent", 20), ("one-at-a-time", 20), ("paper", 121)])
+def test_plan_has_the_pairs_asked_for(vary: str, pairs: int, tmp_path: Path) -> None:
+    groups = plan_groups(config(tmp_path, 3, pairs, vary))
+    counts = Counter(group.object_seed for group in groups)
+    for seed in counts:
+        own = [group for group in groups if group.object_seed == seed]
+        assert sum(group.samples for group in own) == pairs
+        assert [group.number for group in own] == list(range(len(own)))
+        for group in own:
+            assert 1 <= len(group.lights) <= 8
+            assert all(len(set(light.pairs)) == len(light.pairs) for light in group.lights)
+    assert [group.index for group in groups] == list(range(len(groups)))
+    assert groups == plan_groups(config(tmp_path, 3, pairs, vary))
+    assert groups[: len(plan_groups(config(tmp_path, 2, pairs, vary)))] == plan_groups(config(tmp_path, 2, pairs, vary))
+
+
+def test_basis_covers_low_and_high_roughness_evenly(tmp_path: Path) -> None:
+    groups = plan_groups(config(tmp_path, 400, 27))
+    roughness = np.array([sorted({r for r, _ in group.lights[0].pairs}) for group in groups])
+    assert roughness.shape == (400, 3)
+    assert all(light.pairs == group.lights[0].pairs for group in groups for light in group.lights)
+    assert roughness.min() == 0
+    assert roughness.max() == 100
+    histogram = np.histogram(roughness, bins=10, range=(0, 100.5))[0] / roughness.size
+    assert np.abs(histogram - 0.1).max() < 0.03
+    assert ((roughness[:, 0] <= 33) & (roughness[:, 2] >= 67)).all()
+
+
+def test_paper_sweeps_the_grid_under_a_light_each(tmp_path: Path) -> None:
+    groups = plan_groups(config(tmp_path, 1, 121, "paper"))
+    lights = [light for group in groups for light in group.lights]
+    assert sorted(pair for light in lights for pair in light.pairs) == [(r, m) for r in GRID for m in GRID]
+    assert len({light.seed for light in lights}) == 121
+
+
+def test_one_at_a_time_shares_all_but_one(tmp_path: Path) -> None:
+    by_kind: dict[str, list] = {}
+    for group in plan_groups(config(tmp_path, 4, 12, "one-at-a-time")):
+        by_kind.setdefault(group.shares, []).append(group)
+    assert set(by_kind) == {"object material", "object light", "light material"}
+    for group in by_kind["object material"]:
+        assert len({light.seed for light in group.lights}) == 4
+        assert len({light.pairs for light in group.lights}) == 1
+    for group in by_kind["object light"]:
+        assert len(group.lights) == 1
+        assert len(group.lights[0].pairs) == 4
+    others = by_kind["light material"]  # the same lights and materials on every object of the block
+    assert len({group.lights for group in others}) == 1
+    assert len({group.object_seed for group in others}) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"objects": 0}, "objects: got 0"),
+        ({"pairs": 4}, "pairs: got 4"),
+        ({"vary": "paper"}, "expected 121"),
+        ({"vary": "one-at-a-time", "pairs": 2}, "at least 3"),
+        ({"seed": -1}, "seed: got -1"),
+    ],
+)
+def test_bad_configurations_are_refused(changes: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match=message):
+        config(tmp_path, **changes)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted data set of two objects under two lights."""
+    out = tmp_path_factory.mktemp("whole")
+    seen: list[tuple[int, int]] = []
+    report = generate(config(out, pairs=6), lambda done, total: seen.append((done, total)))
+    assert seen == [(0, 2), (1, 2), (2, 2)]
+    assert (report.groups, report.samples, report.skipped_shards) == (2, 12, 0)
+    assert report.overhead >= 1.0
+    assert 0 < report.render_seconds <= report.seconds
+    return out
+
+
+def test_every_sample_is_read_back_through_webdataset(whole: Path) -> None:
+    samples = read_back(whole)
+    manifest = json.loads((whole / "manifest.json").read_text())
+    assert len(samples) == manifest["groups"] == 2
+    assert len({sample["__key__"] for sample in samples}) == 2
+    pictures = 0
+    for sample in samples:
+        assert str(sample["__key__"]).endswith("_g0")
+        record = json.loads(sample["json"])
+        assert record["vary"] == "basis"
+        assert len(record["lights"]) == 2
+        shared = intrinsics_from_channels(read_exr_bytes(sample["shared.exr"])[0])
+        assert {"albedo", "normal", "mask"} <= set(shared.present)
+        assert shared.height == SIZE
+        for index, light in enumerate(record["lights"]):
+            environment, attributes = read_exr_bytes(sample[f"l{index}.environment.exr"])
+            assert float(attributes["exposure_factor"]) == light["exposure_factor"]
+            assert channels_rgb(environment).shape[-1] == 3
+            assert channels_rgb(read_exr_bytes(sample[f"l{index}.diffuse.exr"])[0], "diffuse").max() > 0
+            for roughness, metallic in light["pairs"]:
+                specular = read_exr_bytes(sample[f"l{index}.r{roughness:03d}.specular.exr"])[0]
+                image = read_exr_bytes(sample[f"l{index}.m{metallic:03d}_r{roughness:03d}.exr"])[0]
+                assert set(image) == set("RGBA")
+                assert np.isfinite(channels_rgb(specular, "specular")).all()
+                pictures += 1
+    assert pictures == manifest["samples"] == 12
+    assert manifest["complete"]
+
+
+def test_exposure_maps_the_bright_end_of_d_into_the_stated_range(whole: Path) -> None:
+    from unirender.color import luminance
+    from unirender.exposure import TARGET_RANGE
+
+    for sample in read_back(whole):
+        mask = read_exr_bytes(sample["shared.exr"])[0]["mask.Y"]
+        for index in range(2):
+            diffuse = channels_rgb(read_exr_bytes(sample[f"l{index}.diffuse.exr"])[0], "diffuse")
+            level = np.percentile(luminance(diffuse[mask > 0.5]), 90)
+            assert TARGET_RANGE[0] * 0.85 < level < TARGET_RANGE[1] * 1.15
+
+
+def test_same_command_again_renders_nothing(whole: Path) -> None:
+    before = (whole / "manifest.json").read_bytes()
+    report = generate(config(whole, pairs=6))
+    assert (report.groups, report.skipped_shards) == (0, 1)
+    assert (whole / "manifest.json").read_bytes() == before
+
+
+def test_a_damaged_shard_is_made_again(whole: Path) -> None:
+    shard = whole / shard_name(0)
+    good = shard.read_bytes()
+    shard.write_bytes(good[:-1000])
+    assert generate(config(whole, pairs=6)).groups == 2
+    assert shard.read_bytes() == good
+
+
+def test_another_configuration_is_refused(whole: Path) -> None:
+    with pytest.raises(UnirenderError, match="holds a data set with other seed"):
+        generate(config(whole, pairs=6, seed=3))
+    with pytest.raises(UnirenderError, match="already holds more objects"):
+        generate(config(whole, objects=1, pairs=6))
+
+
+def test_killed_run_resumes_to_the_same_manifest(whole: Path, tmp_path: Path) -> None:
+    """kill -9 while a shard is in flight; the same command then ends at the bytes of an uninterrupted run."""
+    script = (
+        "import sys\nfrom pathlib import Path\nfrom unirender_reference.dataset import generate\n"
+        "from unirender_reference.plan import DatasetConfig\n"
+        "if __name__ == '__main__':\n"
+        f"    config = DatasetConfig(2, 6, {SIZE}, 'basis', Path(sys.argv[1]), spp={SPP}, workers=1)\n"
+        "    generate(config, lambda done, total: print(done, flush=True))\n"
+    )
+    (tmp_path / "run.py").write_text(script)
+    out = tmp_path / "data"
+    process = subprocess.Popen([sys.executable, str(tmp_path / "run.py"), str(out)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "1":
+            break
+    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    deadline = time.time() + 30  # orphaned workers end by themselves
+    for pid in children.stdout.split():
+        while Path(f"/proc/{pid}/cmdline").exists() and time.time() < deadline:
+            time.sleep(0.1)
+        assert not Path(f"/proc/{pid}/cmdline").exists() or not Path(f"/proc/{pid}/cmdline").read_text()
+    assert not list(out.glob("*.tar"))
+    (out / ".shard-000000.tar.x.part").write_bytes(b"what a kill during the write leaves")
+    assert generate(config(out, pairs=6)).groups == 2
+    assert (out / "manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
+    assert sorted(path.name for path in out.iterdir()) == ["manifest.json", "shard-000000.tar"]
+
+
+def test_keys_with_dots_or_twice_are_refused(tmp_path: Path) -> None:
+    for groups in ([("a.b", {"json": b"{}"})], [("a", {"json": b"{}"}), ("a", {"json": b"{}"})]):
+        with pytest.raises(UnirenderError, match="expected a new key without dots"):
+            write_shard(tmp_path / "shard.tar", groups)
+    assert not list(tmp_path.iterdir())
+
+
+def test_shard_bytes_depend_on_content_only(tmp_path: Path) -> None:
+    groups = [("a_g0", {"json": b"{}", "l0.m050_r030.exr": b"x" * 3000})]
+    first = write_shard(tmp_path / "one.tar", groups)
+    time.sleep(1.1)
+    assert write_shard(tmp_path / "two.tar", groups) == first
+    with tarfile.open(fileobj=io.BytesIO((tmp_path / "one.tar").read_bytes())) as tar:
+        assert [(info.name, info.mtime, info.uid, info.uname) for info in tar] == [
+            ("a_g0.json", 0, 0, ""),
+            ("a_g0.l0.m050_r030.exr", 0, 0, ""),
+        ]

@@ -1,0 +1,231 @@
+"""The renderer: framing, buffers, seeds, variance, repair of NaN pixels."""
+
+import numpy as np
+import pytest
+import reference_scenes as scenes
+from scipy.stats import chi2
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender_reference import backend, passes
+from unirender_reference.render import Renderer, SceneSpec, render_sample, scene_hash
+from unirender_reference.scene import envmap_data
+
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(scenes.sphere(), resolution=SIZE)
+
+
+def test_sphere_fills_the_stated_part_of_the_frame() -> None:
+    mask = Renderer(scenes.sphere(), resolution=64).geometry(64).mask
+    assert mask is not None
+    diameter = 2 * np.sqrt(mask.sum() / np.pi)
+    assert abs(diameter - 0.9 * 64) < 0.15
+    rows, columns = np.nonzero(mask[..., 0] > 0.5)
+    assert abs(rows.mean() - 31.5) < 0.05
+    assert abs(columns.mean() - 31.5) < 0.05
+
+
+def test_principal_point_moves_the_object_as_the_camera_says() -> None:
+    mask = Renderer(scenes.sphere(), Camera(principal=(0.6, 0.55)), SIZE).geometry(64).mask
+    assert mask is not None
+    weights = mask[..., 0] / mask.sum()
+    centre = (weights.sum(0) @ (np.arange(SIZE) + 0.5), weights.sum(1) @ (np.arange(SIZE) + 0.5))
+    # A sphere off the axis is seen as an ellipse whose centre lies slightly further out than its own.
+    np.testing.assert_allclose(centre, (0.6 * SIZE, 0.55 * SIZE), atol=0.02 * SIZE)
+
+
+def test_normals_of_a_sphere_are_the_closed_form(renderer: Renderer) -> None:
+    geometry = renderer.geometry(64)
+    assert geometry.normal is not None
+    assert geometry.mask is not None
+    assert geometry.albedo is not None
+    rays = renderer.camera.rays(SIZE, SIZE).astype(np.float64)
+    origin = np.array([0, 0, renderer.camera.distance()])
+    half = rays @ origin
+    reach = np.sqrt(np.maximum(half**2 - (origin @ origin - 1), 0))
+    point = origin + (-half - reach)[..., None] * rays
+    inner = geometry.normal[..., 2] > 0.5
+    assert np.abs((geometry.normal * point).sum(-1)[inner] - 1).max() < 2e-3
+    np.testing.assert_allclose(
+        geometry.albedo[geometry.mask[..., 0] > 0.5],
+        [[0.7, 0.4, 0.2]] * int((geometry.mask[..., 0] > 0.5).sum()),
+        atol=1e-5,
+    )
+    outside = geometry.mask[..., 0] == 0
+    assert not geometry.normal[outside].any()
+    assert not geometry.albedo[outside].any()
+
+
+def test_texture_rows_follow_uv() -> None:
+    """uv counts from the first row of the texture: a quad's v = 0 corner shows row 0."""
+    obj = scenes.sphere()
+    uv = np.stack([np.full(len(obj.vertices), 0.5), 0.5 - 0.45 * obj.vertices[:, 1]], axis=-1).astype(np.float32)
+    ramp = np.repeat(np.linspace(1, 0, 64, dtype=np.float32)[:, None, None], 3, axis=2).repeat(2, axis=1)
+    textured = type(obj)("ramp", "sphere", obj.vertices, obj.faces, obj.normals, uv, np.ascontiguousarray(ramp))
+    albedo = Renderer(textured, resolution=SIZE).geometry(64).albedo
+    assert albedo is not None
+    assert albedo[5, SIZE // 2, 0] > 0.75
+    assert albedo[-6, SIZE // 2, 0] < 0.25
+
+
+def test_image_is_premultiplied_and_hides_the_light(renderer: Renderer) -> None:
+    image = renderer.image(scenes.environment(), 0.4, 0.5, 16, batches=1).mean
+    mask = renderer.geometry(64).mask
+    assert mask is not None
+    assert not image[image[..., 3] == 0].any()  # no light behind the object
+    assert np.abs(image[..., 3:] - mask).max() < 0.3
+    assert image[..., 3].max() <= 1 + 1e-5
+
+
+def test_equal_seeds_are_bit_identical_and_others_differ(renderer: Renderer) -> None:
+    light = scenes.environment()
+    first = renderer.image(light, 0.3, 0.2, 16, seed=5, batches=1).mean
+    renderer.image(scenes.environment(1), 0.9, 1.0, 16, seed=6, batches=1)
+    assert np.array_equal(first, renderer.image(light, 0.3, 0.2, 16, seed=5, batches=1).mean)
+    assert not np.array_equal(first, renderer.image(light, 0.3, 0.2, 16, seed=7, batches=1).mean)
+
+
+def test_updated_scene_equals_a_loaded_one(renderer: Renderer) -> None:
+    """Parameters and lights of other sizes leave nothing behind."""
+    for shape in ((8, 16), (20, 40)):
+        light = scenes.environment(3, shape)
+        fresh = Renderer(scenes.sphere(), resolution=SIZE)
+        for render in (
+            lambda r, light=light: r.image(light, 0.0, 1.0, 16, batches=1),
+            lambda r, light=light: r.specular(light, 0.7, 16, batches=1),
+            lambda r, light=light: r.diffuse(light, 16, batches=1),
+        ):
+            assert np.array_equal(render(renderer).mean, render(fresh).mean)
+
+
+def test_envmap_parameter_is_what_mitsuba_makes_of_a_bitmap() -> None:
+    mi = backend.mitsuba()
+    light = scenes.environment(2)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(light)})
+    np.testing.assert_array_equal(np.array(mi.traverse(emitter)["data"]), envmap_data(light))
+
+
+@pytest.mark.parametrize("buffer", ["image", "diffuse", "specular"])
+def test_stated_variance_is_the_variance_between_seeds(buffer: str) -> None:
+    """Chi-square of the spread of 24 estimates against the variance that they state."""
+    renderer = Renderer(scenes.sphere(), resolution=12)
+    light = scenes.environment(peaks=0)
+    estimates = [
+        {
+            "image": lambda s=seed: renderer.image(light, 0.5, 0.5, 128, s),
+            "diffuse": lambda s=seed: renderer.diffuse(light, 128, s),
+            "specular": lambda s=seed: renderer.specular(light, 0.5, 128, s),
+        }[buffer]()
+        for seed in range(24)
+    ]
+    means = np.stack([estimate.mean[..., :3] for estimate in estimates]).astype(np.float64)
+    stated = np.mean([estimate.variance[..., :3] for estimate in estimates if estimate.variance is not None], axis=0)
+    full = renderer.geometry(256).mask[..., 0] > 0.999  # type: ignore[index] - geometry always has a mask
+    ratio = (means.var(axis=0, ddof=1) / np.maximum(stated, 1e-20))[full]
+    # Mean over independent pixels (channels are correlated: count pixels only); 24 - 1 degrees of freedom each.
+    freedom = 23 * len(ratio)
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], freedom) / freedom
+    assert low * 0.9 < ratio.mean() < high * 1.1
+    assert not low * 0.9 < 2 * ratio.mean() < high * 1.1  # the twin: twice the variance is noticed
+
+
+def test_one_batch_states_no_variance(renderer: Renderer) -> None:
+    assert renderer.diffuse(scenes.environment(), 16, batches=1).variance is None
+
+
+def test_nan_pixels_are_rendered_again_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Mitsuba that returns NaN in one pixel of its first render, as it does about once in 500 renders."""
+    mi = backend.mitsuba()
+    genuine, calls = mi.render, []
+
+    def render(*args: object, **options: object) -> object:
+        picture = np.array(genuine(*args, **options))
+        calls.append(options["seed"])
+        if len(calls) == 1:
+            picture[10, 11, 1] = np.nan
+        return picture
+
+    renderer = Renderer(scenes.sphere(), resolution=SIZE)
+    clean = renderer.image(scenes.environment(), 0.5, 0.5, 16, batches=1)
+    monkeypatch.setattr(mi, "render", render)
+    repaired = renderer.image(scenes.environment(), 0.5, 0.5, 16, batches=1)
+    assert (clean.nan_pixels, repaired.nan_pixels, renderer.counters.nan_pixels) == (0, 1, 1)
+    assert len(set(calls)) == 2
+    differs = np.argwhere((clean.mean != repaired.mean).any(axis=-1))
+    assert differs.tolist() == [[10, 11]]
+    assert repaired.mean[10, 11, 1] > 0
+
+
+def test_pixels_that_stay_nan_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    mi = backend.mitsuba()
+    genuine = mi.render
+    monkeypatch.setattr(mi, "render", lambda *args, **options: np.array(genuine(*args, **options)) * np.nan)
+    with pytest.raises(UnirenderError, match="stay NaN after 8 seeds"):
+        Renderer(scenes.sphere(), resolution=8).diffuse(scenes.environment(), 16, batches=1)
+
+
+@pytest.mark.parametrize(
+    ("spp", "batches", "count"),
+    [(64, 1, 1), (36, 1, 1), (1024, 8, 16), (2048, 8, 8), (64, 8, 8), (7, 1, 7), (32, 1, 2)],
+)
+def test_passes_divide_the_samples_into_full_grids(spp: int, batches: int, count: int) -> None:
+    assert passes.pass_count(spp, batches, 1 << 20) == count
+
+
+def test_passes_bound_the_wavefront() -> None:
+    assert passes.pass_count(1 << 14, 1, 1 << 10) == 1 << 4
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda r: r.image(scenes.environment(), 1.2, 0.5, 4, batches=1),
+        lambda r: r.image(scenes.environment(), 0.2, float("nan"), 4, batches=1),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 4),
+        lambda r: r.diffuse(-scenes.environment(), 8),
+        lambda r: r.diffuse(0 * scenes.environment(), 8),
+        lambda r: r.diffuse(np.full((4, 8, 3), np.inf, np.float32), 8),
+        lambda r: Renderer(r.obj, resolution=0),
+    ],
+    ids=["roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"],
+)
+def test_bad_arguments_are_refused(renderer: Renderer, call: object) -> None:
+    with pytest.raises(UnirenderError, match="expected"):
+        call(renderer)  # type: ignore[operator] - a lambda of the list above
+
+
+def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(renderer: Renderer) -> None:
+    spec = SceneSpec(renderer.obj, scenes.light(1), 0.3, 0.6, resolution=SIZE, exposure_seed=4)
+    sample = render_sample(spec, 128, 0, renderer)
+    maps = sample.intrinsics
+    assert set(maps.present) == {
+        "albedo",
+        "normal",
+        "roughness",
+        "metallic",
+        "specular",
+        "diffuse",
+        "environment",
+        "mask",
+    }
+    assert sample.image_linear.shape == (SIZE, SIZE, 3)
+    assert set(sample.variance) == {"image", "diffuse", "specular"}
+    for name in ("roughness", "metallic", "specular", "diffuse"):
+        assert not maps.require(name)[name][maps.require("mask")["mask"][..., 0] == 0].any()
+    edited = SceneSpec(renderer.obj, scenes.light(1), 0.9, 0.0, resolution=SIZE, exposure_seed=4)
+    other = render_sample(edited, 128, 9, renderer)
+    assert np.array_equal(
+        other.intrinsics.require("environment")["environment"], maps.require("environment")["environment"]
+    )
+    assert sample.provenance["exposure_factor"] == other.provenance["exposure_factor"]
+    assert scene_hash(spec) == sample.provenance["scene"] != scene_hash(edited)
+    assert {"mitsuba", "variant", "spp", "seed", "camera", "nan_pixels"} <= set(sample.provenance)
+
+
+def test_a_renderer_of_another_scene_is_refused(renderer: Renderer) -> None:
+    with pytest.raises(UnirenderError, match="leave `renderer` out"):
+        render_sample(SceneSpec(renderer.obj, scenes.light(1), 0.3, 0.6, resolution=SIZE + 1), 16, 0, renderer)

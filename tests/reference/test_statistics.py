@@ -1,0 +1,76 @@
+"""The z-test: right on simulated estimates of equal expectation, and it fails on each kind of error it is made for."""
+
+import numpy as np
+import pytest
+
+from unirender.errors import UnirenderError
+from unirender_reference.statistics import p_values, z_test
+
+SHAPE = (64, 64, 3)
+
+
+def estimate(mean: np.ndarray, sigma: float, seed: int, batches: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    draws = mean + np.random.default_rng(seed).normal(0, sigma, (batches, *mean.shape))
+    return draws.mean(axis=0), draws.var(axis=0, ddof=1) / batches
+
+
+TRUTH = np.random.default_rng(0).uniform(0.1, 1, SHAPE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_equal_expectations_pass(seed: int) -> None:
+    result = z_test(*estimate(TRUTH, 0.1, seed), *estimate(TRUTH, 0.1, seed + 100))
+    assert result.passed, str(result)
+    assert abs(result.pass_share - 0.95) < 0.012
+    assert result.values == TRUTH.size
+
+
+def test_p_values_are_uniform() -> None:
+    """Student's t with Welch's degrees of freedom, not a normal: 5 % lie below 0.05 and 0.1 % below 0.001."""
+    big = np.ones((400, 400, 1))
+    p = p_values(*estimate(big, 0.2, 1), *estimate(big, 0.2, 2))
+    for level in (0.5, 0.05, 0.01, 0.001):
+        assert abs((p < level).mean() / level - 1) < 0.2 + 4 / np.sqrt(level * p.size), level
+
+
+def test_one_wrong_pixel_fails() -> None:
+    mean, variance = estimate(TRUTH, 0.02, 3)
+    mean[10, 10, 0] += 0.5
+    result = z_test(mean, variance, *estimate(TRUTH, 0.02, 4))
+    assert not result.passed
+    assert result.min_p < result.threshold
+    assert result.pass_share > 0.92
+
+
+def test_small_error_everywhere_fails() -> None:
+    result = z_test(*estimate(TRUTH * 1.08, 0.1, 3), *estimate(TRUTH, 0.1, 4))
+    assert not result.passed
+    assert result.min_p > result.threshold
+    assert result.pass_share < 0.92
+
+
+def test_identical_pictures_pass_and_the_mask_restricts() -> None:
+    mean, variance = estimate(TRUTH, 0.1, 3)
+    assert z_test(mean, variance, mean, variance).min_p == 1
+    wrong = mean.copy()
+    wrong[:32] += 10
+    mask = np.zeros((64, 64, 1))
+    mask[32:] = 1
+    assert z_test(mean, variance, wrong, variance, mask).passed
+    assert not z_test(mean, variance, wrong, variance, 1 - mask).passed
+
+
+def test_rounding_is_no_difference() -> None:
+    zero = np.zeros(SHAPE)
+    assert z_test(TRUTH, zero, TRUTH * (1 + 1e-5), zero).passed
+    assert not z_test(TRUTH, zero, TRUTH * (1 + 3e-3), zero).passed
+
+
+def test_an_empty_mask_is_refused() -> None:
+    with pytest.raises(UnirenderError, match="empty mask"):
+        z_test(TRUTH, TRUTH, TRUTH, TRUTH, np.zeros((64, 64, 1)))
+
+
+def test_a_stricter_family_level_lowers_the_threshold() -> None:
+    arguments = (*estimate(TRUTH, 0.1, 1), *estimate(TRUTH, 0.1, 2))
+    assert z_test(*arguments, alpha=1e-3).threshold < z_test(*arguments).threshold / 5
