@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.commands import Bench
 
 if TYPE_CHECKING:
     from unirender.camera import Camera
@@ -50,7 +51,8 @@ class ModelOptions:
         Raises:
             UnirenderError: no such checkpoint, or the device is not there.
         """
-        from unirender.pipelines.unirender_pipeline import UniRenderPipeline, resolve_device, resolve_dtype
+        from unirender.models.precision import resolve_device, resolve_dtype
+        from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
         device = resolve_device(self.device)
         pipeline = UniRenderPipeline.from_pretrained(self.checkpoint, torch_dtype=resolve_dtype(self.dtype, device))
@@ -67,8 +69,8 @@ class ModelOptions:
         sampled = self.samples > 1 or (self.steps or 1) > 1
         return {
             "mode": "sample" if sampled else "mean",
-            "num_samples": self.samples,
-            "num_inference_steps": self.steps or (20 if sampled else 1),
+            "num_samples": self.samples if sampled else None,
+            "num_inference_steps": self.steps if sampled else None,
             "generator": torch.Generator().manual_seed(self.seed),
         }
 
@@ -148,8 +150,9 @@ class Doctor:
         from rich.table import Table
 
         import unirender
+        from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.paths import cache_dir
-        from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT, resolve_device, resolve_dtype
+        from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 
@@ -169,7 +172,7 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Decompose:
-    """Inverse rendering: one picture -> albedo, normal, roughness, metallic, specular and diffuse light, environment."""
+    """Inverse rendering: one picture -> albedo, normal, roughness, metallic, s, d and the environment."""
 
     input: tyro.conf.OmitArgPrefixes[InputOptions]
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
@@ -324,21 +327,36 @@ class Dataset:
     """First seed."""
     spp: int = 64
     """Samples per pixel of an image."""
+    workers: int = 0
+    """Processes; 0: one for each core."""
 
     def run(self) -> int:
-        from unirender_reference.dataset import DatasetConfig, generate
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        generate(
-            DatasetConfig(
-                objects=self.objects,
-                pairs=self.pairs,
-                resolution=self.resolution,
-                vary=self.vary,
-                out=self.out,
-                seed=self.seed,
-                split=self.split,
-                spp=self.spp,
-            )
+        from unirender_reference.dataset import generate
+        from unirender_reference.plan import DatasetConfig
+
+        config = DatasetConfig(
+            objects=self.objects,
+            pairs=self.pairs,
+            resolution=self.resolution,
+            vary=self.vary,
+            out=self.out,
+            seed=self.seed,
+            split=self.split,
+            spp=self.spp,
+            workers=self.workers,
+        )
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=Console(stderr=True)) as bar:
+            task = bar.add_task("groups", total=None)
+            report = generate(config, lambda done, total: bar.update(task, completed=done, total=total))
+        print(
+            f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
+            f"workers, {report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers); "
+            f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
+            f"manifest {report.manifest_sha256[:12]}"
         )
         return 0
 
@@ -389,6 +407,7 @@ Command = (
     | Annotated[Relight, tyro.conf.subcommand("relight")]
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
 
@@ -399,7 +418,7 @@ def main(argv: list[str] | None = None) -> None:
     """
     command = tyro.cli(
         Command, args=argv, prog="unirender", description="A physics-checked renderer and inverse renderer."
-    )  # type: ignore[arg-type]
+    )
     try:
         status = command.run()
     except KeyboardInterrupt:

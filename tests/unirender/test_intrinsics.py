@@ -55,7 +55,7 @@ def test_size_presence_and_replace() -> None:
 )
 def test_bad_maps_are_refused(name: str, value: np.ndarray, message: str) -> None:
     with pytest.raises(UnirenderError, match=message):
-        Intrinsics(**{name: value})
+        Intrinsics().replace(**{name: value})
 
 
 def test_sizes_must_agree_except_for_the_environment() -> None:

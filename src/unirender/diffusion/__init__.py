@@ -1,0 +1,1 @@
+"""Diffusion: the noise schedule, the timesteps of the two streams, and sampling."""

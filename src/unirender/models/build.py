@@ -1,0 +1,45 @@
+"""A `DualStreamModel` from the model part of a preset."""
+
+from torch import nn
+
+from unirender.models.codec import make_codec
+from unirender.models.conditioning import HDR_CURVES, Conditioning
+from unirender.models.dual_stream import DualStreamModel
+from unirender.training.presets import ModelConfig
+
+
+def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[DualStreamModel, Conditioning]:
+    """Returns a fresh network and the conditioning that belongs to it.
+
+    With the physics prior the image stream's last convolution starts at zero: the first render is the composite.
+    """
+    codec = make_codec(config.codec, config.patch, vae)
+    recorded = {
+        "hdr_curves": HDR_CURVES,
+        "environment_size": (16, 32),
+        "physics_prior": config.physics_prior,
+    }
+    conditioning = Conditioning.of(recorded, codec)
+    extra_attributes, extra_image = conditioning.extra_channels
+    model = DualStreamModel(
+        sample_size=config.resolution // codec.factor,
+        attribute_channels=conditioning.attribute_channels,
+        image_channels=codec.channels,
+        attribute_extra_channels=extra_attributes,
+        image_extra_channels=extra_image,
+        block_out_channels=config.block_out_channels,
+        layers_per_block=config.layers_per_block,
+        attention_levels=config.attention_levels,
+        attention_head_dim=config.attention_head_dim,
+        cross_attention_dim=config.cross_attention_dim,
+        prompt_tokens=config.prompt_tokens,
+        norm_num_groups=config.norm_num_groups,
+        codec=config.codec,
+        patch=config.patch,
+        **recorded,
+    )
+    if config.physics_prior:
+        nn.init.zeros_(model.image_unet.conv_out.weight)
+        assert model.image_unet.conv_out.bias is not None
+        nn.init.zeros_(model.image_unet.conv_out.bias)
+    return model, conditioning

@@ -1,0 +1,217 @@
+"""From maps to what the two streams see, and back.
+
+The attributes are six pictures in [-1, 1], the paper's layout with the HDR light as the sixth:
+
+    material [metallic, roughness, mask], albedo, normal, specular, diffuse, environment
+
+Albedo is sRGB-encoded, normals enter as they are, s, d and the light through `log1p(k x) / log1p(k x_max)`, the image
+premultiplied and sRGB-encoded. Whatever else a stream sees (presence flags, mask, rays, composite) enters as *extra*
+channels, beside the latents. The torch twins of `unirender.color` stand here, held against it by a test.
+
+Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from unirender.camera import Camera
+from unirender.color import HdrCurve
+from unirender.composite import composite
+from unirender.errors import UnirenderError
+from unirender.models.codec import Codec
+
+TRIPLETS = ("material", "albedo", "normal", "specular", "diffuse", "environment")
+HDR_CURVES: dict[str, tuple[float, float]] = {
+    "specular": (10.0, 20.0),
+    "diffuse": (10.0, 2.0),
+    "environment": (20.0, 200.0),
+}
+PRIOR_TRIPLETS = ("material", "albedo", "specular", "diffuse")  # what the composite is made of
+RAY_SCALE = 3.0  # brings the default camera's ray slopes to about [-1, 1]
+
+Maps = dict[str, Tensor]
+
+
+def srgb_encode(linear: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Torch twin of `unirender.color.srgb_encode`, finite gradients everywhere."""
+    power = 1.055 * linear.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, power)
+
+
+def srgb_decode(srgb: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Torch twin of `unirender.color.srgb_decode`."""
+    power = ((srgb.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4
+    return torch.where(srgb <= 0.04045, srgb / 12.92, power)
+
+
+def curve_encode(curve: HdrCurve, x: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Torch twin of `HdrCurve.encode`; values above x_max map above 1."""
+    return torch.log1p(curve.k * x) / math.log1p(curve.k * curve.x_max)
+
+
+def curve_decode(curve: HdrCurve, y: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+    """Torch twin of `HdrCurve.decode`."""
+    return torch.expm1(y * math.log1p(curve.k * curve.x_max)) / curve.k
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Maps <-> pictures in [-1, 1].
+
+    Attributes:
+        curves: tone curve of each HDR map.
+        environment_size: rows and columns of the light.
+    """
+
+    curves: dict[str, HdrCurve]
+    environment_size: tuple[int, int] = (16, 32)
+
+    def pack(self, maps: Maps) -> Float[Tensor, "b 18 H W"]:
+        """Maps (linear, not premultiplied, [b c H W]; environment at its own size) -> six pictures, in order."""
+        size = (maps["mask"].shape[-2], maps["mask"].shape[-1])
+        material = torch.cat([maps["metallic"], maps["roughness"], maps["mask"]], dim=1)
+        pictures = [2 * material - 1, 2 * srgb_encode(maps["albedo"]) - 1, maps["normal"]]
+        pictures += [2 * curve_encode(self.curves[name], maps[name]) - 1 for name in ("specular", "diffuse")]
+        light = 2 * curve_encode(self.curves["environment"], maps["environment"]) - 1
+        return torch.cat([*pictures, self.spread(light, size)], dim=1)
+
+    def unpack(self, pictures: Float[Tensor, "b 18 H W"]) -> Maps:
+        """Six pictures -> maps in physical units, brought into their ranges; differentiable inside them."""
+        material, albedo, normal, specular, diffuse, light = pictures.chunk(6, dim=1)
+        metallic, roughness, mask = (0.5 * material + 0.5).clamp(0, 1).chunk(3, dim=1)
+        hdr = {"specular": specular, "diffuse": diffuse, "environment": self.gather(light)}
+        # exp(8) of a stray prediction is no light: twice the curve's range is far above any value it was taught
+        decoded = {name: curve_decode(self.curves[name], (0.5 * x + 0.5).clamp(0, 2)) for name, x in hdr.items()}
+        return {
+            "albedo": srgb_decode((0.5 * albedo + 0.5).clamp(0, 1)),
+            "normal": normal,
+            "roughness": roughness,
+            "metallic": metallic,
+            "mask": mask,
+            **decoded,
+        }
+
+    def spread(self, light: Float[Tensor, "b 3 eh ew"], size: tuple[int, int]) -> Float[Tensor, "b 3 H W"]:
+        """The light on the image's grid by repetition, which `gather` undoes to rounding."""
+        rows, columns = self.environment_size
+        if tuple(light.shape[-2:]) != (rows, columns):
+            raise UnirenderError(
+                f"environment: got {tuple(light.shape[-2:])}, expected {self.environment_size}; resample it first"
+            )
+        if size[0] % rows or size[1] % columns:
+            raise UnirenderError(f"model size: got {tuple(size)}, expected multiples of {self.environment_size}")
+        return light.repeat_interleave(size[0] // rows, dim=2).repeat_interleave(size[1] // columns, dim=3)
+
+    def gather(self, picture: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 eh ew"]:
+        """The mean over the pixels of each texel."""
+        return F.adaptive_avg_pool2d(picture, self.environment_size)
+
+
+def pack_image(image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 H W"]:
+    """Premultiplied linear image -> what the image stream denoises: clipped, sRGB-encoded, [-1, 1]."""
+    return 2 * srgb_encode(image_linear.clamp(0, 1)) - 1
+
+
+def unpack_image(picture: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 H W"]:
+    """Inverse of `pack_image`: premultiplied linear image in [0, 1]."""
+    return srgb_decode((0.5 * picture + 0.5).clamp(0, 1))
+
+
+def composite_picture(maps: Maps, mask: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 3 H W"]:
+    """The closed-form image of the maps, packed like an image."""
+    return pack_image(composite(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"]) * mask)
+
+
+@dataclass(frozen=True)
+class Extras:
+    """Additional inputs of the streams, and the latents to which the image stream's output is added."""
+
+    attributes: Float[Tensor, "b ea h w"]
+    image: Float[Tensor, "b ei h w"]
+    prior: Float[Tensor, "b c h w"] | None
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Everything between maps and a `DualStreamModel`."""
+
+    codec: Codec
+    packing: Packing
+    physics_prior: bool
+
+    @classmethod
+    def of(cls, config: dict, codec: Codec) -> "Conditioning":
+        """The conditioning that a model's config describes."""
+        curves = {name: HdrCurve(*value) for name, value in (config["hdr_curves"] or HDR_CURVES).items()}
+        packing = Packing(curves, tuple(config["environment_size"]))
+        return cls(codec, packing, config["physics_prior"])
+
+    @property
+    def attribute_channels(self) -> int:
+        return len(TRIPLETS) * self.codec.channels
+
+    @property
+    def extra_channels(self) -> tuple[int, int]:
+        """Extra channels of the attribute and of the image stream."""
+        common = len(TRIPLETS) + self.codec.factor**2 + 2
+        return common, common + (self.codec.channels + 1 if self.physics_prior else 0)
+
+    def encode_attributes(self, maps: Maps) -> Float[Tensor, "b nc h w"]:
+        """Maps -> latents of the attribute stream."""
+        pictures = self.packing.pack(maps)
+        latents = self.codec.encode(pictures.reshape(-1, 3, *pictures.shape[-2:]))
+        return latents.reshape(len(pictures), -1, *latents.shape[-2:])
+
+    def decode_attributes(self, latents: Float[Tensor, "b nc h w"]) -> Maps:
+        """Latents of the attribute stream -> maps."""
+        pictures = self.codec.decode(latents.reshape(-1, self.codec.channels, *latents.shape[-2:]))
+        return self.packing.unpack(pictures.reshape(len(latents), -1, *pictures.shape[-2:]))
+
+    def encode_image(self, image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b c h w"]:
+        """Premultiplied linear image -> latents of the image stream."""
+        return self.codec.encode(pack_image(image_linear))
+
+    def decode_image(self, latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3 H W"]:
+        """Latents of the image stream -> premultiplied linear image in [0, 1]."""
+        return unpack_image(self.codec.decode(latents))
+
+    def by_triplet(self, flags: Bool[Tensor, "b 6"]) -> Bool[Tensor, "b nc 1 1"]:
+        """Flags of the six pictures -> flags of their latent channels."""
+        return flags.repeat_interleave(self.codec.channels, dim=1)[..., None, None]
+
+    def extras(
+        self,
+        mask: Float[Tensor, "b 1 H W"],
+        given: Bool[Tensor, "b 6"],
+        maps: Maps | None = None,
+        camera: Camera | None = None,
+    ) -> Extras:
+        """Builds the extra inputs.
+
+        Args:
+            mask: coverage; always known.
+            given: which of the six pictures are given clean as a condition (none in inverse rendering).
+            maps: the given maps, from which the composite is made where `given` has all that it needs.
+            camera: gives the rays; the contract's default if None.
+        """
+        spatial = F.pixel_unshuffle(mask, self.codec.factor)
+        b, _, h, w = spatial.shape
+        rays = torch.from_numpy((camera or Camera()).rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
+        flags = given.to(mask)[..., None, None].expand(-1, -1, h, w)
+        common = torch.cat([flags, spatial, rays.permute(2, 0, 1).expand(b, -1, -1, -1)], dim=1)
+        if not self.physics_prior:
+            return Extras(common, common, None)
+        known = given[:, [TRIPLETS.index(name) for name in PRIOR_TRIPLETS]].all(dim=1)
+        if maps is None:
+            if known.any():
+                raise ValueError("extras: the flags say that the maps of the composite are given, but maps is None")
+            prior = mask.new_zeros(b, self.codec.channels, h, w)
+        else:
+            prior = self.codec.encode(composite_picture(maps, mask)) * known.to(mask)[:, None, None, None]
+        flag = known.to(mask)[:, None, None, None].expand(-1, -1, h, w)
+        return Extras(common, torch.cat([common, prior, flag], dim=1), prior)

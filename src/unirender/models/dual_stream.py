@@ -1,0 +1,219 @@
+"""The dual-stream network: two U-Nets that see each other (paper Sec. 3.2 and supplement, "Dual Stream Diffusion").
+
+One stream denoises the intrinsic attributes, the other the RGB image. Every skip feature and the mid feature of each
+encoder is added, through a zero-initialised 1x1 convolution, to the other stream's decoder; both ways, and exchanged
+before either is fused. Each stream has its own timestep, so that one of them can be the clean condition of the other.
+
+Notation: `a` attribute stream, `i` image stream; a *feature pyramid* is the tuple of skips with the mid feature last.
+The path of this module is recorded by saved checkpoints: it never moves.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from diffusers.configuration_utils import ConfigMixin, register_to_config
+from diffusers.models.modeling_utils import ModelMixin
+from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
+from diffusers.utils.outputs import BaseOutput
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+ALL_ROWS = slice(None)
+
+
+@dataclass
+class DualStreamOutput(BaseOutput):
+    """Predicted clean latents (x0) of both streams; of the rows asked for; None without any."""
+
+    attributes: Tensor | None = None
+    image: Tensor | None = None
+
+
+@dataclass
+class Encoded:
+    """What an encoder hands to the decoders: its feature pyramid (skips, then mid) and its time embedding."""
+
+    features: tuple[Tensor, ...]
+    time: Tensor
+
+    def rows(self, rows: slice) -> "Encoded":
+        """The same for some samples of the batch."""
+        return self if rows == ALL_ROWS else Encoded(tuple(f[rows] for f in self.features), self.time[rows])
+
+
+def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d:
+    """Returns a convolution that starts as the zero map, so that it cannot disturb what stands already."""
+    conv = nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
+    nn.init.zeros_(conv.weight)
+    assert conv.bias is not None
+    nn.init.zeros_(conv.bias)
+    return conv
+
+
+def pyramid_channels(unet: UNet2DConditionModel) -> list[int]:
+    """Channels of the feature pyramid of a U-Net, in the order in which its encoder makes them; the mid is last."""
+    widths, layers = tuple(unet.config["block_out_channels"]), unet.config["layers_per_block"]
+    channels = [widths[0]]
+    for level, width in enumerate(widths):
+        channels += [width] * (layers + (level < len(widths) - 1))
+    return [*channels, widths[-1]]
+
+
+class DualStreamModel(ModelMixin, ConfigMixin):
+    """Two `UNet2DConditionModel`s with zero-convolution cross connections.
+
+    Everything a checkpoint needs to be understood is in its config: also the codec, the packing and the physics prior,
+    which `unirender.models.conditioning` reads from here.
+    """
+
+    _supports_gradient_checkpointing = True
+    _no_split_modules: ClassVar[list[str]] = ["BasicTransformerBlock", "ResnetBlock2D"]
+
+    @register_to_config
+    def __init__(
+        self,
+        sample_size: int = 32,  # latent pixels; only recorded, the network is fully convolutional
+        attribute_channels: int = 72,  # latent channels of the six attribute triplets
+        image_channels: int = 12,  # latent channels of the image
+        attribute_extra_channels: int = 0,  # presence flags, mask, rays: enter by a zero-initialised convolution
+        image_extra_channels: int = 0,  # mask, rays, composite
+        block_out_channels: Sequence[int] = (64, 96, 128),  # widths from the finest level down
+        layers_per_block: int = 1,  # residual blocks per level of each encoder
+        attention_levels: Sequence[int] = (2,),  # levels with attention; the lowest must be among them
+        attention_head_dim: int | Sequence[int] = 32,  # channels of a head; a sequence: number of heads by level
+        cross_attention_dim: int = 16,  # width of the prompt embedding
+        prompt_tokens: int = 1,  # length of the stored empty-prompt embedding
+        norm_num_groups: int = 16,
+        codec: str = "pixel",  # "pixel" (space to depth) or "kl" (an AutoencoderKL beside the network)
+        patch: int = 2,  # image pixels per latent pixel, one way
+        environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
+        hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
+        physics_prior: bool = False,  # the image stream sees the composite and predicts what is missing from it
+    ):
+        super().__init__()
+        if len(block_out_channels) - 1 not in attention_levels:
+            raise ValueError(
+                f"attention_levels {tuple(attention_levels)} leave out the lowest level {len(block_out_channels) - 1}: "
+                "the environment is not pixel-aligned and reaches all pixels only through attention there"
+            )
+        common = _unet_config(block_out_channels, layers_per_block, attention_levels, attention_head_dim)
+        common |= {"cross_attention_dim": cross_attention_dim, "norm_num_groups": norm_num_groups}
+        self.attribute_unet = UNet2DConditionModel(
+            sample_size=sample_size, in_channels=attribute_channels, out_channels=attribute_channels, **common
+        )
+        self.image_unet = UNet2DConditionModel(
+            sample_size=sample_size, in_channels=image_channels, out_channels=image_channels, **common
+        )
+        channels = pyramid_channels(self.attribute_unet)
+        self.attributes_to_image = nn.ModuleList(zero_conv(c, c) for c in channels)
+        self.image_to_attributes = nn.ModuleList(zero_conv(c, c) for c in channels)
+        width = block_out_channels[0]
+        self.attribute_extra = zero_conv(attribute_extra_channels, width, 3) if attribute_extra_channels else None
+        self.image_extra = zero_conv(image_extra_channels, width, 3) if image_extra_channels else None
+        self.register_buffer("prompt_embedding", torch.ones(1, prompt_tokens, cross_attention_dim))
+        self.prompt_embedding: Tensor
+
+    def forward(
+        self,
+        attributes: Float[Tensor, "b ca h w"],
+        image: Float[Tensor, "b ci h w"],
+        attributes_timestep: Int[Tensor, " b"],
+        image_timestep: Int[Tensor, " b"],
+        attribute_extra: Float[Tensor, "b ea h w"] | None = None,
+        image_extra: Float[Tensor, "b ei h w"] | None = None,
+        image_prior: Float[Tensor, "b ci h w"] | None = None,
+        attribute_rows: slice | None = ALL_ROWS,
+        image_rows: slice | None = ALL_ROWS,
+    ) -> DualStreamOutput:
+        """Predicts clean latents. The clean stream's decoder is not needed in a conditional pass: only those rows of a
+        batch are decoded in a stream that are asked for there.
+
+        Args:
+            attributes: Noised attribute latents at `attributes_timestep`.
+            image: Noised image latents at `image_timestep`.
+            attributes_timestep: 0 (clean) .. T (pure noise), per sample.
+            image_timestep: The same for the image.
+            attribute_extra: Additional inputs of the attribute stream.
+            image_extra: Additional inputs of the image stream.
+            image_prior: Latents to which the image stream's output is added (the physics prior).
+            attribute_rows: Rows whose attributes are predicted; None: none.
+            image_rows: Rows whose image is predicted; None: none.
+        """
+        a = self.encode(self.attribute_unet, attributes, attributes_timestep, attribute_extra, self.attribute_extra)
+        i = self.encode(self.image_unet, image, image_timestep, image_extra, self.image_extra)
+        attributes_0 = image_0 = None
+        if attribute_rows is not None:
+            rows = attribute_rows
+            attributes_0 = self.decode(self.attribute_unet, a.rows(rows), i.rows(rows), self.image_to_attributes)
+        if image_rows is not None:
+            rows = image_rows
+            image_0 = self.decode(self.image_unet, i.rows(rows), a.rows(rows), self.attributes_to_image)
+            if image_prior is not None:
+                image_0 = image_0 + image_prior[rows]
+        return DualStreamOutput(attributes=attributes_0, image=image_0)
+
+    def encode(
+        self,
+        unet: UNet2DConditionModel,
+        sample: Tensor,
+        timestep: Tensor,
+        extra: Tensor | None,
+        adapter: nn.Module | None,
+    ) -> Encoded:
+        """Runs one encoder and the mid block: (b, c, h, w) -> feature pyramid."""
+        if (extra is None) != (adapter is None):
+            raise ValueError(
+                f"extra inputs {'missing' if extra is None else 'given'}, but the model was built otherwise"
+            )
+        time = unet.time_embedding(unet.get_time_embed(sample=sample, timestep=timestep))
+        hidden = unet.conv_in(sample)
+        if adapter is not None:
+            hidden = hidden + adapter(extra)
+        prompt = self.prompt_embedding.to(sample.dtype).expand(len(sample), -1, -1)
+        features = (hidden,)
+        for block in unet.down_blocks:
+            context = {"encoder_hidden_states": prompt} if getattr(block, "has_cross_attention", False) else {}
+            hidden, skips = block(hidden_states=hidden, temb=time, **context)
+            features += tuple(skips)
+        assert unet.mid_block is not None
+        hidden = unet.mid_block(hidden, time, encoder_hidden_states=prompt)
+        return Encoded((*features, hidden), time)
+
+    def decode(self, unet: UNet2DConditionModel, own: Encoded, other: Encoded, bridge: nn.ModuleList) -> Tensor:
+        """Runs one decoder on its own features plus the other stream's, brought over by zero convolutions."""
+        fused = [mine + conv(theirs) for mine, theirs, conv in zip(own.features, other.features, bridge, strict=True)]
+        hidden, skips = fused[-1], fused[:-1]
+        prompt = self.prompt_embedding.to(hidden.dtype).expand(len(hidden), -1, -1)
+        for block in unet.up_blocks:
+            resnets = block.resnets
+            assert isinstance(resnets, nn.ModuleList)
+            count = len(resnets)
+            skips, taken = skips[:-count], tuple(skips[-count:])
+            context = {"encoder_hidden_states": prompt} if getattr(block, "has_cross_attention", False) else {}
+            size = skips[-1].shape[-2:] if skips else None
+            hidden = block(
+                hidden_states=hidden, temb=own.time, res_hidden_states_tuple=taken, upsample_size=size, **context
+            )
+        if unet.conv_norm_out is not None and unet.conv_act is not None:
+            hidden = unet.conv_act(unet.conv_norm_out(hidden))
+        return unet.conv_out(hidden)
+
+
+def _unet_config(widths: Sequence[int], layers: int, attention: Sequence[int], head_dim: int | Sequence[int]) -> dict:
+    """The part of a `UNet2DConditionModel` config that both streams share."""
+    levels = range(len(widths))
+    heads = [width // head_dim for width in widths] if isinstance(head_dim, int) else list(head_dim)
+    if isinstance(head_dim, int) and any(width % head_dim for level, width in enumerate(widths) if level in attention):
+        raise ValueError(
+            f"block_out_channels {tuple(widths)}: attention levels must be multiples of head size {head_dim}"
+        )
+    return {
+        "block_out_channels": tuple(widths),
+        "layers_per_block": layers,
+        "down_block_types": tuple("CrossAttnDownBlock2D" if n in attention else "DownBlock2D" for n in levels),
+        "up_block_types": tuple("CrossAttnUpBlock2D" if n in attention else "UpBlock2D" for n in reversed(levels)),
+        # diffusers reads `attention_head_dim` as the number of heads (its own long-standing misnomer)
+        "attention_head_dim": tuple(max(1, count) for count in heads),
+    }

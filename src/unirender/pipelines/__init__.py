@@ -1,0 +1,1 @@
+"""What users call: the diffusers pipeline and the picture operations around it."""

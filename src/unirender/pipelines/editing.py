@@ -1,0 +1,63 @@
+"""The picture operations of an edit: the specular light of a new roughness, and anchoring to the input.
+
+Notation: s specular light, I the input, R_0 and R_1 the renders of the decomposition before and after the edit.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import specular_light
+
+LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
+LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
+ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
+ANCHOR_FLOOR = 0.02  # radiance added to both: where the old render is dark, the change is added as it is
+
+
+def specular_for_roughness(
+    before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]
+) -> tuple[Float[np.ndarray, "h w 3"], float]:
+    """s of a decomposition at a new roughness: the old s times the ratio of the predicted light's lobes.
+
+        s_1 = s_0 * clip(L(environment, r_1) / L(environment, r_0), 1/4, 4)
+
+    Shadowing and what the predicted light misses stay in s_0.
+
+    Returns:
+        s_1, and the share of the covered values where the bound held the ratio.
+    """
+    maps = before.require("normal", "roughness", "specular", "environment", "mask")
+    old = specular_light(maps["normal"], maps["roughness"], maps["environment"], before.camera)
+    new = specular_light(maps["normal"], roughness, maps["environment"], before.camera)
+    ratio = (new + LOBE_FLOOR) / (old + LOBE_FLOOR)
+    bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
+    inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
+    held = float((ratio != bounded)[inside].mean()) if inside.any() else 0.0
+    return (maps["specular"] * bounded).astype(np.float32), held
+
+
+def anchor(
+    image_linear: Float[np.ndarray, "h w 3"],
+    before: Float[np.ndarray, "h w 3"],
+    after: Float[np.ndarray, "h w 3"],
+) -> Float[np.ndarray, "h w 3"]:
+    """Carries over what the decomposition could not explain of the input.
+
+        out = I + g (R_1 - R_0),    g = clip((I + e) / (R_0 + e), 1/2, 2)
+
+    Where g is not bounded and R_0 is well above e = 0.02 this is I R_1 / R_0; where R_0 is dark it is the difference
+    form. Without a change the input comes back as it was. All premultiplied and linear.
+    """
+    gain = np.clip((image_linear + ANCHOR_FLOOR) / (before + ANCHOR_FLOOR), 1 / ANCHOR_GAIN, ANCHOR_GAIN)
+    return np.maximum(image_linear + gain * (after - before), 0).astype(np.float32)
+
+
+def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:
+    """A number or a map as a map, 0 outside the mask."""
+    return (np.broadcast_to(np.asarray(value, dtype=np.float32), mask.shape) * (mask > 0)).astype(np.float32)
+
+
+def masked_mean(value: Float[np.ndarray, "h w 1"], mask: Float[np.ndarray, "h w 1"]) -> float:
+    """Coverage-weighted mean of a map."""
+    return float((value * mask).sum() / mask.sum())

@@ -1,0 +1,122 @@
+"""What a user hands to the pipeline, checked: pictures, masks and intrinsics. Each error says what to do about it."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import diffuse_light, specular_light
+
+RENDER_NEEDS = ("normal", "roughness", "metallic")
+MIN_SIDE = 8  # pixels
+RANGE_TOLERANCE = 1e-3
+
+
+def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
+    """Display values and coverage from arrays or PIL pictures; without a mask the alpha channel, else the whole frame.
+
+    Raises:
+        UnirenderError: wrong type, shape or range, NaN, or an empty mask.
+    """
+    if isinstance(image, Image.Image):
+        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
+        has_alpha = "A" in image.getbands() or "transparency" in image.info
+        picture, alpha = rgba[..., :3], rgba[..., 3:] if has_alpha else None
+    elif isinstance(image, np.ndarray):
+        picture, alpha = image, None
+    else:
+        raise UnirenderError(f"image: got {type(image).__name__}, expected a numpy array [h w 3] or a PIL picture")
+    if picture.ndim != 3 or picture.shape[-1] != 3:
+        raise UnirenderError(f"image: got shape {picture.shape}, expected [height, width, 3]; pass alpha as the mask")
+    if picture.dtype == np.uint8:
+        raise UnirenderError("image: got uint8 values, expected floats in [0, 1]; divide by 255, or pass a PIL picture")
+    if min(picture.shape[:2]) < MIN_SIDE:
+        raise UnirenderError(f"image: got {picture.shape[:2]} pixels, expected at least {MIN_SIDE} along each side")
+    picture = _checked("image", picture, "tone-map it to display values, or clip it")
+    if mask is None:
+        mask = np.ones((*picture.shape[:2], 1), dtype=np.float32) if alpha is None else alpha
+    return picture, as_mask(mask, (picture.shape[0], picture.shape[1]))
+
+
+def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
+    """Coverage of the given size.
+
+    Raises:
+        UnirenderError: wrong type, shape or range, NaN, or nothing covered by at least one half.
+    """
+    if isinstance(mask, Image.Image):
+        mask = np.asarray(mask.convert("L"), dtype=np.float32) / 255
+    if not isinstance(mask, np.ndarray):
+        raise UnirenderError(f"mask: got {type(mask).__name__}, expected a numpy array [h w 1] or a PIL picture")
+    mask = mask[..., None] if mask.ndim == 2 else mask
+    if mask.shape != (*size, 1):
+        raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
+    mask = _checked("mask", mask, "divide an 8-bit mask by 255")
+    if not (mask >= 0.5).any():
+        raise UnirenderError("mask: no pixel is covered by at least one half, expected an object in view")
+    return mask
+
+
+def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
+    """Radiance of a lat-long map.
+
+    Raises:
+        UnirenderError: wrong shape, NaN, negative, or black.
+    """
+    light = np.asarray(environment, dtype=np.float32)
+    if light.ndim != 3 or light.shape[-1] != 3 or min(light.shape[:2]) < 2:
+        raise UnirenderError(f"environment: got shape {light.shape}, expected a lat-long map [height, width, 3]")
+    if not np.isfinite(light).all() or light.min() < 0:
+        raise UnirenderError("environment: got NaN, infinite or negative radiance, expected finite values >= 0")
+    if light.max() <= 0:
+        raise UnirenderError("environment: the light is black, expected some radiance")
+    return light
+
+
+def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
+    """Intrinsics that the renderer can use: with a mask, and with s and d derived where a light is given.
+
+    Raises:
+        UnirenderError: normal, roughness or metallic is missing; leading axes; a bad size.
+    """
+    intrinsics.require(*RENDER_NEEDS)
+    if intrinsics.roughness is not None and intrinsics.roughness.ndim != 3:
+        raise UnirenderError(
+            f"render: got maps of shape {intrinsics.roughness.shape}, expected one picture [height, width, channels]"
+        )
+    if intrinsics.mask is None:
+        ones = np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32)
+        intrinsics = intrinsics.replace(mask=ones)
+    as_mask(intrinsics.mask, (intrinsics.height, intrinsics.width))
+    if intrinsics.environment is None:
+        return intrinsics
+    light, maps = as_environment(intrinsics.environment), intrinsics.require("normal", "roughness")
+    if intrinsics.diffuse is None:
+        intrinsics = intrinsics.replace(diffuse=diffuse_light(maps["normal"], light))
+    if intrinsics.specular is None:
+        specular = specular_light(maps["normal"], maps["roughness"], light, intrinsics.camera)
+        intrinsics = intrinsics.replace(specular=specular)
+    return intrinsics
+
+
+def unit_value(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    """A number or map in [0, 1].
+
+    Raises:
+        UnirenderError: it is not.
+    """
+    return _checked(name, np.asarray(value, dtype=np.float32), "roughness and metallic are fractions")
+
+
+def _checked(name: str, value: np.ndarray, advice: str) -> Float[np.ndarray, "..."]:
+    value = np.asarray(value, dtype=np.float32)
+    if not np.isfinite(value).all():
+        bad = int(np.count_nonzero(~np.isfinite(value)))
+        raise UnirenderError(f"{name}: {bad} of {value.size} values are NaN or infinite, expected values in [0, 1]")
+    low, high = float(value.min()), float(value.max())
+    if low < -RANGE_TOLERANCE or high > 1 + RANGE_TOLERANCE:
+        raise UnirenderError(f"{name}: got values in [{low:.4g}, {high:.4g}], expected [0, 1]; {advice}")
+    return np.asarray(np.clip(value, 0, 1))

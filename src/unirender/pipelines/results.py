@@ -1,0 +1,82 @@
+"""What the pipeline returns, and how predictions become `Intrinsics`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.editing import constant_map, masked_mean
+from unirender.pipelines.framing import Frame
+
+PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")
+MIN_NORMAL = 1e-3  # length below which a mean of normals has no direction
+
+
+@dataclass(frozen=True)
+class Decomposition:
+    """What a picture was taken apart into.
+
+    Attributes:
+        intrinsics: all maps at the picture's size, the light at the model's, the mask as given.
+        roughness: coverage-weighted mean over the object.
+        metallic: the same.
+        std: per map, standard deviation over the samples; None in mode `mean` or with one sample.
+        samples: each sample's intrinsics, where there are several; `intrinsics` is their mean.
+    """
+
+    intrinsics: Intrinsics
+    roughness: float
+    metallic: float
+    std: dict[str, np.ndarray] | None = None
+    samples: tuple[Intrinsics, ...] = ()
+
+
+@dataclass(frozen=True)
+class EditResult:
+    """An edited picture.
+
+    Attributes:
+        image_linear: premultiplied, linear, >= 0; an anchored edit may exceed display white.
+        intrinsics: the edited maps.
+        decomposition: of the input.
+        bounded: share of the specular values whose change was bounded: there the predicted light is too coarse to say.
+    """
+
+    image_linear: Float[np.ndarray, "h w 3"]
+    intrinsics: Intrinsics
+    decomposition: Decomposition
+    bounded: float = 0.0
+
+
+def predicted_intrinsics(
+    maps: dict[str, np.ndarray], frame: Frame, mask: Float[np.ndarray, "h w 1"], camera: Camera, material: str
+) -> Intrinsics:
+    """One prediction `[s s c]` at the picture's size: unit normals, 0 outside the mask, scalar materials if asked."""
+    sized = {name: frame.leave_map(maps[name], mask) for name in PREDICTED if name != "environment"}
+    sized["normal"] = unit_normal(sized["normal"])
+    for name in ("roughness", "metallic"):
+        value = np.clip(sized[name], 0, 1)
+        sized[name] = constant_map(masked_mean(value, mask), mask) if material == "scalar" else value
+    return Intrinsics(**sized, environment=maps["environment"], mask=mask, camera=camera)
+
+
+def combine(samples: tuple[Intrinsics, ...]) -> Decomposition:
+    """The mean and spread of samples; normals are averaged and made unit again."""
+    mean = samples[0]
+    std: dict[str, np.ndarray] | None = None
+    if len(samples) > 1:
+        stacks = {name: np.stack([getattr(sample, name) for sample in samples]) for name in PREDICTED}
+        averages = {name: stack.mean(axis=0) for name, stack in stacks.items()}
+        mean = mean.replace(**averages | {"normal": unit_normal(averages["normal"])})
+        std = {name: stack.std(axis=0) for name, stack in stacks.items()}
+    maps = mean.require("roughness", "metallic", "mask")
+    roughness, metallic = (masked_mean(maps[name], maps["mask"]) for name in ("roughness", "metallic"))
+    return Decomposition(mean, roughness, metallic, std, samples if len(samples) > 1 else ())
+
+
+def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Normals of length 1; 0 stays 0."""
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.where(length > MIN_NORMAL, normal / np.maximum(length, MIN_NORMAL), 0).astype(np.float32)

@@ -1,0 +1,358 @@
+"""`UniRenderPipeline`: decompose, render, edit and relight with one dual-stream model.
+
+It is a diffusers pipeline (`from_pretrained`, `save_pretrained`, `to`, `torch_dtype`, progress bars) whose public
+arrays are numpy. A *picture* is straight display values like a PNG's, with its mask beside it; a *linear image* that
+comes back is premultiplied. Any size: pictures are brought to the model's square and results back
+(`unirender.pipelines.framing`).
+"""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from jaxtyping import Float
+from PIL import Image
+
+from unirender.camera import Camera
+from unirender.color import image_srgb as encode_srgb
+from unirender.color import srgb_decode
+from unirender.composite import composite_image
+from unirender.diffusion.sampling import NUM_SAMPLES, infer_attributes, infer_image, steps_of
+from unirender.errors import UnirenderError
+from unirender.exposure import exposure_factor
+from unirender.intrinsics import MAPS, Intrinsics
+from unirender.lighting import diffuse_light, resample_environment, specular_light
+from unirender.models.codec import make_codec
+from unirender.models.conditioning import TRIPLETS, Conditioning, Maps
+from unirender.models.dual_stream import DualStreamModel
+from unirender.models.precision import resolve_device, resolve_dtype
+from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, unit_value
+from unirender.pipelines.results import Decomposition, EditResult, combine, predicted_intrinsics, unit_normal
+
+__all__ = [
+    "SHIPPED_CHECKPOINT",
+    "Decomposition",
+    "EditResult",
+    "UniRenderPipeline",
+    "resolve_device",
+    "resolve_dtype",
+]
+
+SHIPPED_CHECKPOINT = Path(__file__).parent.parent / "checkpoints" / "tiny"
+RELIGHT_TARGET = (
+    0.75  # brightness of white under a light whose exposure is chosen here: the middle of the gauge's range
+)
+
+Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
+
+
+class UniRenderPipeline(DiffusionPipeline):
+    """One dual-stream model in both directions.
+
+    Args:
+        dual_stream: the network.
+        scheduler: with zero terminal SNR and `prediction_type="sample"`.
+        vae: for models with the KL codec.
+        material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
+    """
+
+    model_cpu_offload_seq = "dual_stream"
+    _optional_components: ClassVar[list[str]] = ["vae"]
+
+    def __init__(
+        self,
+        dual_stream: DualStreamModel,
+        scheduler: DDIMScheduler,
+        vae: AutoencoderKL | None = None,
+        material: str = "scalar",
+    ) -> None:
+        super().__init__()
+        self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
+        self.register_to_config(material=material)
+        self.dual_stream: DualStreamModel
+        self.scheduler: DDIMScheduler
+        codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
+        self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
+        self.size = dual_stream.config["sample_size"] * codec.factor
+
+    @classmethod
+    def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
+        cls, pretrained_model_name_or_path: str | Path | None = None, **kwargs: Any
+    ) -> "UniRenderPipeline":
+        """Loads a pipeline folder; the shipped `tiny` without one. Weights become float32 without `torch_dtype`.
+
+        Raises:
+            UnirenderError: no such folder, or no pipeline in it.
+        """
+        path = Path(pretrained_model_name_or_path or SHIPPED_CHECKPOINT)
+        if not (path / "model_index.json").is_file():
+            raise UnirenderError(
+                f"{path}: no pipeline folder (model_index.json is missing), expected one written by `unirender train`"
+            )
+        old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
+        kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
+        return super().from_pretrained(str(path), **kwargs)
+
+    def __call__(self, image: Any, mask: Any = None, **kwargs: Any) -> Decomposition:
+        """The same as `decompose`."""
+        return self.decompose(image, mask, **kwargs)
+
+    def decompose(
+        self,
+        image_srgb: Picture,
+        mask: Picture | None = None,
+        *,
+        camera: Camera | None = None,
+        mode: str = "mean",
+        num_inference_steps: int | None = None,
+        num_samples: int | None = None,
+        generator: torch.Generator | None = None,
+        material: str | None = None,
+    ) -> Decomposition:
+        """Inverse rendering.
+
+        Args:
+            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture.
+            mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
+            camera: the contract's default if None.
+            mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
+            num_inference_steps: of `sample`; 20 if None.
+            num_samples: of `sample`; 5 if None.
+            generator: a CPU generator for the noise.
+            material: one number per object or maps; None: as the checkpoint was trained.
+
+        Raises:
+            UnirenderError: the picture, the mask or a setting is not usable; the message says why.
+        """
+        picture, cover = as_picture(image_srgb, mask)
+        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
+        camera, material = camera or Camera(), material or self.config["material"]
+        if material not in ("scalar", "map"):
+            raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
+        frame = Frame(picture.shape[0], picture.shape[1], self.size)
+        inside = frame.enter(cover)
+        image = self._tensor(frame.enter(srgb_decode(picture) * cover)).expand(count, -1, -1, -1)
+        maps = infer_attributes(
+            self.dual_stream,
+            self.conditioning,
+            self.scheduler,
+            image,
+            self._tensor(inside).expand(count, -1, -1, -1),
+            steps=steps,
+            generator=generator,
+            camera=frame.camera(camera),
+            progress=self._progress,
+        )
+        arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
+        rows = [{name: value[i] for name, value in arrays.items()} for i in range(count)]
+        return combine(tuple(predicted_intrinsics(row, frame, cover, camera, material) for row in rows))
+
+    def render(
+        self,
+        intrinsics: Intrinsics,
+        *,
+        mode: str = "mean",
+        num_inference_steps: int | None = None,
+        num_samples: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Float[np.ndarray, "h w 3"]:
+        """Rendering; several samples are averaged in linear light.
+
+        Args:
+            intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
+                missing, and a missing mask is the whole frame. Missing s and d are derived from the environment
+                (without shadows) where it is given.
+
+        Returns:
+            Premultiplied linear image at the intrinsics' size, in [0, 1].
+
+        Raises:
+            UnirenderError: a map that is needed is missing, or a setting is not usable.
+        """
+        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
+        intrinsics = ready_to_render(intrinsics)
+        frame = Frame(intrinsics.height, intrinsics.width, self.size)
+        small = self._enter(intrinsics, frame)
+        maps, given = self._maps(small)
+        image = infer_image(
+            self.dual_stream,
+            self.conditioning,
+            self.scheduler,
+            {name: value.expand(count, -1, -1, -1) for name, value in maps.items()},
+            given.expand(count, -1),
+            steps=steps,
+            generator=generator,
+            camera=small.camera,
+            progress=self._progress,
+        )
+        rendered = image.mean(dim=0).permute(1, 2, 0).float().cpu().numpy()
+        known = {"albedo", "specular", "diffuse"} <= set(intrinsics.present)
+        if frame.identity or not known:
+            return frame.leave(rendered)
+        # The detail of a larger picture is in its composite; the model adds what it lacks, in display values.
+        change = frame.leave(encode_srgb(rendered) - encode_srgb(composite_image(small)))
+        return srgb_decode(np.clip(encode_srgb(composite_image(intrinsics)) + change, 0, 1))
+
+    def edit(
+        self,
+        image_srgb: Picture,
+        mask: Picture | None = None,
+        *,
+        roughness: Float[np.ndarray, "h w 1"] | float | None = None,
+        metallic: Float[np.ndarray, "h w 1"] | float | None = None,
+        anchored: bool = True,
+        decomposition: Decomposition | None = None,
+        **sampling: Any,
+    ) -> EditResult:
+        """Decomposes, changes the material, derives s for the new roughness, renders.
+
+        Args:
+            image_srgb: as for `decompose`.
+            mask: as for `decompose`.
+            roughness: new value or map, [0, 1]; None: unchanged.
+            metallic: new value or map, [0, 1]; None: unchanged.
+            anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
+            decomposition: of this picture, if it is at hand.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, as for `decompose`.
+
+        Raises:
+            UnirenderError: as `decompose`; or nothing to change; or a value outside [0, 1].
+        """
+        if roughness is None and metallic is None:
+            raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
+        picture, cover = as_picture(image_srgb, mask)
+        decomposition = decomposition or self.decompose(picture, cover, **sampling)
+        before = decomposition.intrinsics
+        edited, bounded = before, 0.0
+        if metallic is not None:
+            edited = edited.replace(metallic=constant_map(unit_value("metallic", metallic), cover))
+        if roughness is not None:
+            target = constant_map(unit_value("roughness", roughness), cover)
+            specular, bounded = specular_for_roughness(before, target)
+            edited = edited.replace(roughness=target, specular=specular)
+        image = self._rerender(picture, cover, before, edited, anchored, sampling)
+        return EditResult(image, edited, decomposition, bounded)
+
+    def relight(
+        self,
+        image_srgb: Picture,
+        environment: np.ndarray | None,
+        mask: Picture | None = None,
+        *,
+        exposure: str = "auto",
+        anchored: bool = True,
+        specular: Float[np.ndarray, "h w 3"] | None = None,
+        diffuse: Float[np.ndarray, "h w 3"] | None = None,
+        decomposition: Decomposition | None = None,
+        **sampling: Any,
+    ) -> EditResult:
+        """Decomposes, puts the object under another light, renders.
+
+        s and d are derived from the predicted normal and roughness at the light's own resolution (without shadows),
+        unless they are given.
+
+        Args:
+            image_srgb: as for `decompose`.
+            environment: lat-long radiance [eh ew 3] in camera axes, any size; None where both s and d are given.
+            mask: as for `decompose`.
+            exposure: `auto` scales the light so that white under it is as bright as in the training data; `keep` not.
+            anchored: as for `edit`.
+            specular: s under the new light, if known.
+            diffuse: d under the new light, if known.
+            decomposition: of this picture, if it is at hand.
+            **sampling: as for `edit`.
+
+        Raises:
+            UnirenderError: as `decompose`; or neither a light nor both s and d are given.
+        """
+        if exposure not in ("auto", "keep"):
+            raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
+        if environment is None and (specular is None or diffuse is None):
+            raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
+        picture, cover = as_picture(image_srgb, mask)
+        if environment is not None:
+            environment = as_environment(environment)
+        decomposition = decomposition or self.decompose(picture, cover, **sampling)
+        before = decomposition.intrinsics
+        maps = before.require("normal", "roughness")
+        if environment is not None:
+            derived = diffuse_light(maps["normal"], environment)
+            factor = exposure_factor(derived, cover, RELIGHT_TARGET) if exposure == "auto" else 1.0
+            environment = (environment * factor).astype(np.float32)
+            diffuse = derived * factor if diffuse is None else diffuse
+            if specular is None:
+                specular = specular_light(maps["normal"], maps["roughness"], environment, before.camera)
+        edited = before.replace(environment=environment, specular=specular, diffuse=diffuse)
+        image = self._rerender(picture, cover, before, edited, anchored, sampling)
+        return EditResult(image, edited, decomposition)
+
+    def _rerender(
+        self,
+        picture: Float[np.ndarray, "h w 3"],
+        cover: Float[np.ndarray, "h w 1"],
+        before: Intrinsics,
+        edited: Intrinsics,
+        anchored: bool,
+        sampling: dict[str, Any],
+    ) -> Float[np.ndarray, "h w 3"]:
+        names = ("mode", "num_inference_steps", "num_samples")
+        settings = {name: sampling[name] for name in names if name in sampling}
+        # Both renders see the same noise, so that it cancels in what changes.
+        seed = _draw_seed(sampling.get("generator"))
+        after = self.render(edited, generator=torch.Generator().manual_seed(seed), **settings)
+        if not anchored:
+            return after
+        plain = self.render(before, generator=torch.Generator().manual_seed(seed), **settings)
+        return anchor(srgb_decode(picture) * cover, plain, after)
+
+    def _enter(self, intrinsics: Intrinsics, frame: Frame) -> Intrinsics:
+        """The intrinsics at the model's size, the light at the size that it predicts."""
+        mask = intrinsics.require("mask")["mask"]
+        names = [name for name in intrinsics.present if name not in ("mask", "environment")]
+        changes = {name: frame.enter_map(getattr(intrinsics, name), mask) for name in names}
+        if "normal" in changes:
+            changes["normal"] = unit_normal(changes["normal"])
+        size = self.conditioning.packing.environment_size
+        if intrinsics.environment is not None and intrinsics.environment.shape[:2] != size:
+            changes["environment"] = resample_environment(intrinsics.environment, size)
+        entered = {"environment": intrinsics.environment} | changes
+        return Intrinsics(**entered, mask=np.clip(frame.enter(mask), 0, 1), camera=frame.camera(intrinsics.camera))
+
+    def _maps(self, small: Intrinsics) -> tuple[Maps, torch.Tensor]:
+        """Tensors of all maps (zeros for the unknown) and which of the six pictures are given."""
+        size = (self.size, self.size)
+        shapes = {"environment": (*self.conditioning.packing.environment_size, 3)}
+        maps: Maps = {}
+        for name, channels in MAPS.items():
+            value = getattr(small, name)
+            unknown = np.zeros(shapes.get(name, (*size, channels)), np.float32)
+            maps[name] = self._tensor(unknown if value is None else value)
+        given = [name == "material" or getattr(small, name) is not None for name in TRIPLETS]
+        return maps, torch.tensor([given], device=self.dual_stream.device)
+
+    def _tensor(self, array: Float[np.ndarray, "h w c"]) -> torch.Tensor:
+        contiguous = np.ascontiguousarray(np.moveaxis(array, -1, 0), dtype=np.float32)
+        return torch.from_numpy(contiguous)[None].to(self.dual_stream.device)
+
+    def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
+        return self.progress_bar(steps)  # pyright: ignore[reportReturnType, reportCallIssue, reportArgumentType] - tqdm
+
+
+def _sample_count(mode: str, num_samples: int | None) -> int:
+    if num_samples is not None and num_samples < 1:
+        raise UnirenderError(f"num_samples: got {num_samples}, expected at least 1")
+    if mode == "mean" and num_samples not in (None, 1):
+        raise UnirenderError(f"mode mean gives 1 sample, got num_samples {num_samples}; use mode 'sample'")
+    return 1 if mode == "mean" else num_samples or NUM_SAMPLES
+
+
+def _draw_seed(generator: torch.Generator | None) -> int:
+    device = generator.device if generator is not None else "cpu"
+    return int(torch.randint(0, 2**62, (), generator=generator, device=device))

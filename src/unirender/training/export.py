@@ -1,0 +1,40 @@
+"""From a training run to what users load: the averaged weights as a pipeline folder, and the figures it came from."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from unirender.models.build import build_model
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+if TYPE_CHECKING:
+    from unirender.training.trainer import Trainer
+
+TRAINING_FILE = "training.json"
+
+
+def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch.float16) -> Path:
+    """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes, presets.
+
+    Weights are stored as `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
+    """
+    model, _ = build_model(trainer.config.model)
+    trainer.ema.copy_to(model)
+    nn.Module.to(model, dtype)  # in place
+    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler)
+    pipeline.save_pretrained(folder, safe_serialization=True)
+    for path in folder.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
+        path.chmod(0o644)
+    facts = {
+        "steps": trainer.step,
+        "samples": trainer.step * trainer.config.batch_size,
+        "minutes": round(trainer.seconds / 60, 2),
+        "device": str(trainer.device),
+        "autocast": str(trainer.dtype).removeprefix("torch."),
+        "train": trainer.state_dict()["config"],
+    }
+    (folder / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+    return folder

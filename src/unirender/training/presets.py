@@ -1,0 +1,126 @@
+"""The presets: one table, a row per model. Torch-free, so that the command line can show and change them quickly.
+
+`paper` is the supplement's recipe; `tiny` trains on two CPU cores. Ablations are rows, not forks.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+from unirender.errors import UnirenderError
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The network: what `DualStreamModel` is built from; latent channels follow from codec and patch."""
+
+    resolution: int = 64  # training image size, one way
+    codec: Literal["pixel", "kl"] = "pixel"
+    patch: int = 2  # pixel codec: image pixels per latent pixel, one way
+    block_out_channels: tuple[int, ...] = (64, 64, 96, 128)  # widths from the finest level down
+    layers_per_block: int = 1
+    attention_levels: tuple[int, ...] = (3,)  # the lowest must be among them
+    attention_head_dim: int | tuple[int, ...] = 32  # channels of a head; a tuple: number of heads by level
+    cross_attention_dim: int = 16
+    prompt_tokens: int = 1
+    norm_num_groups: int = 16
+    physics_prior: bool = True  # the image stream predicts what the composite leaves out
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """The loss; see `unirender.training.losses`."""
+
+    # squared error of [-1, 1] pictures, per triplet
+    material: float = 1.0
+    albedo: float = 2.0
+    normal: float = 1.5
+    specular: float = 2.0
+    diffuse: float = 2.0
+    environment: float = 0.5
+    image: float = 4.0
+    background: float = 0.02  # weight of a pixel outside the mask, beside 1 inside
+    cycle: float = 1.0  # weight of the re-rendered image; 0: no cycle pass
+    cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
+    cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
+    cycle_warmup: float = 0.1  # share of the training before the cycle sets in
+    composite: float = 0.0  # weight of the closed-form image of the predicted maps (ours)
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW, linear warm-up, cosine decay."""
+
+    learning_rate: float = 1e-3
+    beta1: float = 0.9
+    beta2: float = 0.99
+    weight_decay: float = 0.01
+    warmup_steps: int = 100
+    final_lr: float = 0.01  # of the learning rate, reached at the end; 1: constant
+    clip_norm: float = 1.0
+    ema_decay: float = 0.999
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run but for its data, its length and its folder."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    batch_size: int = 16
+    timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
+    p_render: float = 0.5  # share of rendering; the paper's p_direction
+    p_t: float = 0.5  # share of random t instead of T
+    map_dropout: float = 0.0  # probability that each of albedo, s, d, environment is withheld when rendering
+    seed: int = 0
+
+
+_TINY = TrainConfig(loss=LossConfig(cycle_into_renderer=False), batch_size=12, p_render=0.3, p_t=0.15, map_dropout=0.03)
+_SD_MODEL = ModelConfig(
+    resolution=512,
+    codec="kl",
+    patch=8,
+    block_out_channels=(320, 640, 1280, 1280),
+    layers_per_block=2,
+    attention_levels=(0, 1, 2, 3),
+    attention_head_dim=(8, 8, 8, 8),
+    cross_attention_dim=768,
+    prompt_tokens=77,
+    norm_num_groups=32,
+    physics_prior=False,
+)
+_SD = TrainConfig(
+    model=_SD_MODEL,
+    optimizer=OptimizerConfig(
+        learning_rate=1e-5, beta1=0.8, beta2=0.999, warmup_steps=0, final_lr=1.0, ema_decay=0.9999
+    ),
+    batch_size=4,
+)
+
+PRESETS: dict[str, TrainConfig] = {
+    "tiny": _TINY,
+    "tiny_plain": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior=False)),
+    "tiny_without_cycle": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle=0.0)),
+    "tiny_cycle_into_renderer": dataclasses.replace(
+        _TINY, loss=dataclasses.replace(_TINY.loss, cycle_into_renderer=True)
+    ),
+    "small": dataclasses.replace(
+        _TINY,
+        model=ModelConfig(resolution=128, block_out_channels=(96, 128, 192, 256), layers_per_block=2),
+        optimizer=OptimizerConfig(learning_rate=5e-4, ema_decay=0.9995),
+    ),
+    "sd15": _SD,
+    "paper": dataclasses.replace(_SD, loss=LossConfig(cycle_warmup=0.0, background=1.0)),
+}
+
+
+def get_preset(name: str) -> TrainConfig:
+    """The named row.
+
+    Raises:
+        UnirenderError: no such row.
+    """
+    if name not in PRESETS:
+        raise UnirenderError(f"preset: got {name!r}, expected one of: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,89 @@
+"""Where a training run's batches come from, and how it remembers where it was."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from unirender.errors import UnirenderError
+from unirender.training.data import Batch, GroupDataset, iterate_batches
+
+
+@runtime_checkable
+class BatchSource(Protocol):
+    """An endless source of batches whose place can be saved."""
+
+    def next(self) -> Batch:
+        """The next batch."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data from which `load_state_dict` continues."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues where the state was taken."""
+        ...
+
+    def refresh(self) -> str | None:
+        """Takes in data that came since; returns a line about it, or None."""
+        ...
+
+
+class ShardSource:
+    """Batches from a data folder; the folder may still be growing.
+
+    The stream is a function of (shards, seed, samples consumed); the shards in use are part of the state, so that a
+    resumed run sees the same samples. `refresh` is the one place where the shards change, and it says so.
+    """
+
+    def __init__(self, folder: str | Path, batch_size: int, seed: int, workers: int = 1) -> None:
+        self.folder, self.batch_size, self.seed, self.workers = Path(folder), batch_size, seed, workers
+        self.consumed = 0
+        self.dataset: GroupDataset | None = None
+        self._batches: Iterator[Batch] | None = None
+
+    def next(self) -> Batch:
+        if self._batches is None:
+            self.dataset = self.dataset or GroupDataset(self.folder)
+            self._batches = iterate_batches(self.dataset, self.batch_size, self.seed, self.consumed, self.workers)
+        self.consumed += self.batch_size
+        return next(self._batches)
+
+    def state_dict(self) -> dict[str, Any]:
+        shards = list(self.dataset.shard_names) if self.dataset else None
+        fingerprint = self.dataset.fingerprint if self.dataset else None
+        return {"consumed": self.consumed, "seed": self.seed, "shards": shards, "fingerprint": fingerprint}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continues a run.
+
+        Raises:
+            UnirenderError: the folder's shards of the same names have other contents.
+        """
+        self.close()
+        self.consumed, self.seed = state["consumed"], state["seed"]
+        if state["shards"] is None:
+            return
+        self.dataset = GroupDataset(self.folder, tuple(state["shards"]))
+        if self.dataset.fingerprint != state["fingerprint"]:
+            raise UnirenderError(
+                f"{self.folder}: the shards differ from those that this run was trained on, expected the same data; "
+                "pass the old folder, or another --out to start anew"
+            )
+
+    def refresh(self) -> str | None:
+        if self.dataset is None:
+            return None
+        dataset = GroupDataset(self.folder)
+        if dataset.fingerprint == self.dataset.fingerprint:
+            return None
+        grown = f"data: {len(self.dataset.shard_names)} -> {len(dataset.shard_names)} shards at sample {self.consumed}"
+        self.close()
+        self.dataset = dataset
+        return grown
+
+    def close(self) -> None:
+        """Stops the background threads."""
+        if self._batches is not None:
+            self._batches.close()  # pyright: ignore[reportAttributeAccessIssue] - the reader's iterators are generators
+        self._batches, self.dataset = None, None

@@ -1,0 +1,275 @@
+"""The training loop.
+
+A run is a folder: `config.json`, `state.pt` (everything that the next step depends on), `log.jsonl`, `pictures/`, and
+at the end `pipeline/` with the averaged weights. Running the same command again resumes. With a length in steps the
+losses after a resume are those of an uninterrupted run, bit for bit; with a length in minutes the learning rate follows
+the clock.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import math
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from unirender.diffusion.schedule import last_timestep, make_scheduler
+from unirender.diffusion.timesteps import Timesteps, draw_timesteps
+from unirender.errors import UnirenderError
+from unirender.models.build import build_model
+from unirender.models.conditioning import Maps
+from unirender.training.checkpoint import load_state, save_state
+from unirender.training.ema import Ema
+from unirender.training.losses import LossFunction, LossTerms
+from unirender.training.pictures import save_sheet, training_sheet
+from unirender.training.presets import OptimizerConfig, TrainConfig
+from unirender.training.source import BatchSource
+
+Report = Callable[[dict[str, Any]], None]
+Validate = Callable[["Trainer"], dict[str, float]]
+
+
+@dataclasses.dataclass(frozen=True)
+class RunConfig:
+    """How long a run is and what it leaves behind. The run ends with whichever of `steps` and `minutes` comes first."""
+
+    out: Path
+    steps: int | None = None
+    minutes: float | None = None  # of training, over all resumes
+    log_every: int = 20  # steps
+    save_minutes: float = 3.0
+    picture_minutes: float = 5.0
+    refresh_minutes: float | None = None  # look for new shards; None: never
+    parallel: int = 1  # parts of a batch that run side by side, each on one CPU thread; changes the noise drawn
+
+
+def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
+    """Linear warm-up by steps, then cosine decay by progress in [0, 1] to `final_lr` of the peak."""
+    warmup = min(1.0, (step + 1) / (config.warmup_steps + 1))
+    decay = config.final_lr + (1 - config.final_lr) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return config.learning_rate * warmup * decay
+
+
+@dataclasses.dataclass(frozen=True)
+class Pass:
+    """A forward pass: its share of the batch, and the function that gives its loss terms."""
+
+    share: float
+    terms: Callable[[], LossTerms]
+
+
+class Trainer:
+    """One run: model, optimiser, average, random state and place in the data."""
+
+    def __init__(self, config: TrainConfig, run: RunConfig, device: torch.device, dtype: torch.dtype) -> None:
+        if run.steps is None and run.minutes is None:
+            raise UnirenderError("training: no length given, expected steps or minutes (or both)")
+        self.config, self.run, self.device, self.dtype = config, run, device, dtype
+        torch.manual_seed(config.seed)  # initial weights; everything later draws from self.generator
+        model, conditioning = build_model(config.model)
+        nn.Module.to(model, device)  # in place; ModelMixin hides the signature of its own `to`
+        for p in model.parameters():
+            if p.dim() == 4:
+                p.data = p.data.contiguous(memory_format=torch.channels_last)
+        self.model = model
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
+        o = config.optimizer
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(), o.learning_rate, betas=(o.beta1, o.beta2), weight_decay=o.weight_decay
+        )
+        self.ema = Ema(self.model, o.ema_decay)
+        # On a CPU that others use too, two passes on one thread each are far faster than one pass on two threads, which
+        # wait for each other at every operation (measured: 10 against 0.5 samples/s under load).
+        self.pool = ThreadPoolExecutor(run.parallel, "unirender-pass") if run.parallel > 1 else None
+        self.step = 0
+        self.seconds = 0.0  # of training, over all resumes
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, by steps or by the clock, whichever is further."""
+        by_steps = self.step / self.run.steps if self.run.steps else 0.0
+        by_clock = self.seconds / (60 * self.run.minutes) if self.run.minutes else 0.0
+        return max(by_steps, by_clock)
+
+    def train_step(self, batch: Maps) -> dict[str, float]:
+        """One optimiser step; returns the loss terms."""
+        batch = {name: value.to(self.device) for name, value in batch.items()}
+        rate = learning_rate(self.config.optimizer, self.step, self.progress)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.loss.cycle_scale = float(self.progress >= self.config.loss.cycle_warmup)
+        terms = self._backward(list(self._passes(batch)))
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.optimizer.clip_norm)
+        if not torch.isfinite(norm):
+            raise UnirenderError(
+                f"training: the gradient at step {self.step} is {float(norm)}; lower the learning rate"
+            )
+        self.optimizer.step()
+        self.ema.update(self.model)
+        self.step += 1
+        return terms | {"grad_norm": float(norm), "lr": rate}
+
+    def fit(self, source: BatchSource, report: Report = lambda line: None, validate: Validate | None = None) -> None:
+        """Trains to the end of the run, resuming where the folder's state stands."""
+        self.resume(source)
+        self._write_config()
+        fixed: Maps | None = None
+        sums: dict[str, list[float]] = defaultdict(list)
+        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
+
+        def due(name: str, minutes: float | None) -> bool:
+            if minutes is None or time.monotonic() - clock[name] < 60 * minutes:
+                return False
+            clock[name] = time.monotonic()
+            return True
+
+        while self.progress < 1:
+            batch = source.next()
+            fixed = batch if fixed is None else fixed
+            for name, value in self.train_step(batch).items():
+                sums[name].append(value)
+            now = time.monotonic()
+            self.seconds += now - clock["step"]
+            clock["step"] = now
+            if self.step % self.run.log_every == 0 or self.progress >= 1:
+                line: dict[str, Any] = {name: sum(values) / len(values) for name, values in sums.items()}
+                count = max(len(values) for values in sums.values())
+                speed = count * self.config.batch_size / (now - clock["log"])
+                line = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed, **line}
+                clock["log"] = now
+                sums.clear()
+                self._log(line)
+                report(line)
+            if due("save", self.run.save_minutes):
+                self.save(source)
+            if due("picture", self.run.picture_minutes):
+                self.picture(fixed)
+                if validate is not None:
+                    with self.averaged():
+                        self._log({"step": self.step, "validation": validate(self)})
+            if due("refresh", self.run.refresh_minutes) and (news := source.refresh()):
+                self._log({"step": self.step, "data": news})
+                report({"step": self.step, "data": news})
+        self.save(source)
+        if fixed is not None:
+            self.picture(fixed)
+
+    def picture(self, batch: Maps) -> None:
+        """Writes the picture of the averaged weights."""
+        with self.averaged():
+            sheet = training_sheet(self.loss, {name: value.to(self.device) for name, value in batch.items()})
+        save_sheet(self.run.out / "pictures" / f"step_{self.step:06d}.png", sheet)
+
+    @contextlib.contextmanager
+    def averaged(self) -> Iterator[None]:
+        """The model carries the averaged weights inside this block."""
+        trained = [p.detach().clone() for p in self.model.parameters()]
+        self.ema.copy_to(self.model)
+        self.model.eval()
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                for p, value in zip(self.model.parameters(), trained, strict=True):
+                    p.copy_(value)
+            self.model.train()
+
+    def save(self, source: BatchSource) -> Path:
+        """Writes everything that the next step depends on."""
+        return save_state(self.run.out, self.state_dict() | {"source": source.state_dict()})
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "config": json.loads(json.dumps(dataclasses.asdict(self.config))),
+            "step": self.step,
+            "seconds": self.seconds,
+            "model": self.model.state_dict(),
+            "ema": self.ema.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def resume(self, source: BatchSource) -> bool:
+        """Continues from the folder's state, if it has one.
+
+        Raises:
+            UnirenderError: the state is broken or belongs to another config.
+        """
+        state = load_state(self.run.out)
+        if state is None:
+            return False
+        config = self.state_dict()["config"]
+        if state["config"] != config:
+            differing = sorted(key for key in config if state["config"].get(key) != config[key])
+            raise UnirenderError(
+                f"{self.run.out}: holds a run with another {', '.join(differing)}; pass another --out, or the preset"
+            )
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.model.load_state_dict(state["model"])
+        self.ema.load_state_dict(state["ema"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        source.load_state_dict(state["source"])
+        return True
+
+    def _backward(self, passes: list[Pass]) -> dict[str, float]:
+        """Runs the passes, side by side where `parallel` says so; sums their gradients and averages their terms."""
+        parameters = list(self.model.parameters())
+
+        def run(part: Pass) -> tuple[tuple[Tensor | None, ...], dict[str, Tensor]]:
+            with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
+                terms = part.terms()
+            loss = part.share * self.loss.total(terms)
+            return torch.autograd.grad(loss, parameters, allow_unused=True), terms
+
+        results = list(self.pool.map(run, passes)) if self.pool else [run(part) for part in passes]
+        for p, *gradients in zip(parameters, *(grads for grads, _ in results), strict=True):
+            known = [g for g in gradients if g is not None]
+            p.grad = sum(known[1:], start=known[0]) if known else None
+        weighted: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        for part, (_, terms) in zip(passes, results, strict=True):
+            for name, value in terms.items():
+                weighted[name].append((part.share, float(value.detach())))
+        return {name: sum(w * v for w, v in pairs) / sum(w for w, _ in pairs) for name, pairs in weighted.items()}
+
+    def _passes(self, batch: Maps) -> Iterator[Pass]:
+        """The forward passes of a batch: by direction, and cut into parts that can run side by side."""
+        size = len(batch["image"])
+        c, last = self.config, last_timestep(self.loss.scheduler)
+        drawn = draw_timesteps(c.timestep_rule, size, last, c.p_render, c.p_t, self.generator)
+        if c.timestep_rule == "conditional":  # rendering samples come first; every part gets its share of both kinds
+            count = int((drawn.attributes == 0).sum())
+            kinds = torch.arange(count), torch.arange(count, size)
+            parts = [torch.cat(rows) for rows in zip(*(k.tensor_split(self.run.parallel) for k in kinds), strict=True)]
+        else:
+            parts = list(torch.arange(size).tensor_split(self.run.parallel))
+        terms = self.loss.terms if c.timestep_rule == "conditional" else self.loss.joint_terms
+        for rows in parts:
+            if not len(rows):
+                continue
+            part = {name: value[rows] for name, value in batch.items()}
+            t = Timesteps(drawn.attributes[rows].to(self.device), drawn.image[rows].to(self.device))
+            seed = int(torch.randint(0, 2**62, (), generator=self.generator))
+            generator = torch.Generator().manual_seed(seed)
+            yield Pass(len(rows) / size, functools.partial(terms, part, t, generator))
+
+    def _write_config(self) -> None:
+        run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
+        hardware = {"device": str(self.device), "dtype": str(self.dtype), "threads": torch.get_num_threads()}
+        text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
+        self.run.out.mkdir(parents=True, exist_ok=True)
+        (self.run.out / "config.json").write_text(text + "\n")
+
+    def _log(self, line: dict[str, Any]) -> None:
+        self.run.out.mkdir(parents=True, exist_ok=True)
+        with (self.run.out / "log.jsonl").open("a") as file:
+            file.write(json.dumps(line) + "\n")

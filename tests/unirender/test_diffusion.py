@@ -1,0 +1,171 @@
+"""Schedule, timesteps and samplers, against closed forms."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
+from torch import Tensor
+
+from unirender.diffusion.sampling import denoise, draw_noise, steps_of
+from unirender.diffusion.schedule import add_noise, last_timestep, make_scheduler, zero_terminal_betas
+from unirender.diffusion.timesteps import algorithm1_timesteps, conditional_timesteps, draw_timesteps
+from unirender.errors import UnirenderError
+
+# --- schedule
+
+
+def test_both_ends_are_exact() -> None:
+    alpha_bar = make_scheduler().alphas_cumprod
+    assert alpha_bar[0] == 1.0
+    assert alpha_bar[-1] == 0.0
+    assert (alpha_bar.diff() < 0).all()
+
+
+def test_noising_is_clean_at_0_and_pure_noise_at_the_last_index() -> None:
+    scheduler = make_scheduler()
+    clean, noise = torch.randn(3, 2, 4, 4), torch.randn(3, 2, 4, 4)
+    noised = add_noise(scheduler, clean, noise, torch.tensor([0, last_timestep(scheduler), 500]))
+    assert torch.equal(noised[0], clean[0])
+    assert torch.equal(noised[1], noise[1])
+    alpha_bar = scheduler.alphas_cumprod[500]
+    torch.testing.assert_close(noised[2], alpha_bar.sqrt() * clean[2] + (1 - alpha_bar).sqrt() * noise[2])
+
+
+def test_schedule_is_the_rescaled_scaled_linear_one() -> None:
+    """Lin et al. 2024, algorithm 1: sqrt(alpha_bar) is an affine function of the original one."""
+    root = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0).sqrt()
+    ours = torch.cumprod(1 - torch.tensor(zero_terminal_betas(), dtype=torch.float64), 0).sqrt()
+    slope = (ours[0] - ours[-1]) / (root[0] - root[-1])
+    torch.testing.assert_close(ours, slope * (root - root[-1]), rtol=1e-9, atol=1e-9)
+
+
+def test_sampling_starts_at_the_last_index() -> None:
+    scheduler = make_scheduler()
+    for steps in (1, 2, 20, 50):
+        scheduler.set_timesteps(steps)
+        assert scheduler.timesteps[0] == last_timestep(scheduler)
+        assert len(scheduler.timesteps) == steps
+
+
+# --- timesteps
+
+
+def test_section_3_2_one_stream_is_always_clean() -> None:
+    generator = torch.Generator().manual_seed(0)
+    n, last, p_render, p_t = 20000, 999, 0.35, 0.3
+    t = conditional_timesteps(n, last, p_render, p_t, generator)
+    rendering = t.attributes == 0
+    assert ((t.attributes == 0) != (t.image == 0)).all()
+    assert abs(rendering.double().mean().item() - p_render) <= 1 / n
+    assert rendering.int().diff().max() <= 0  # rendering samples first
+    noisy = torch.where(rendering, t.image, t.attributes)
+    partial = noisy[noisy < last]
+    # binomial share within 5 standard deviations; uniform t by its mean and extremes
+    assert abs(len(partial) / n - p_t) < 5 * math.sqrt(p_t * (1 - p_t) / n)
+    assert abs(partial.double().mean().item() - 499.5) < 5 * 998 / math.sqrt(12 * len(partial))
+    assert partial.min() >= 1
+    assert partial.max() <= last - 1
+
+
+def test_small_batches_round_at_random_to_the_right_share() -> None:
+    generator = torch.Generator().manual_seed(0)
+    counts = [int((conditional_timesteps(3, 999, 0.5, 0.3, generator).attributes == 0).sum()) for _ in range(2000)]
+    assert set(counts) == {1, 2}
+    assert abs(np.mean(counts) - 1.5) < 5 * 0.5 / math.sqrt(2000)
+
+
+def algorithm1_literal(num_timesteps: int, bs: int, rng: np.random.Generator, len_t: int = 2) -> np.ndarray:
+    """The supplement's pseudo-code, line by line; it returns the array that it fills."""
+    all_t = np.zeros((len_t, bs), dtype=np.int64)
+    idx = rng.integers(0, len_t)
+    all_t[idx] = rng.integers(0, num_timesteps, bs)  # 0 .. num_timesteps - 1
+    for i in range(len_t):
+        if i != idx:
+            for j in range(bs):
+                all_t[i][j] = rng.choice([0, num_timesteps - 1])
+    return all_t
+
+
+def test_algorithm_1_has_the_distribution_of_the_pseudo_code() -> None:
+    """Few timesteps, so that the joint distribution of a pair can be compared cell by cell (chi-square)."""
+    last, bs, draws = 4, 3, 4000
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(1)
+    literal, ours = np.zeros((last + 1, last + 1)), np.zeros((last + 1, last + 1))
+    for _ in range(draws):
+        a, i = algorithm1_literal(last + 1, bs, rng)
+        np.add.at(literal, (a, i), 1)
+        t = algorithm1_timesteps(bs, last, generator)
+        np.add.at(ours, (t.attributes.numpy(), t.image.numpy()), 1)
+    seen = literal + ours > 0
+    assert seen.sum() == 16  # each stream uniform on 0 .. 4, the other 0 or 4, the corners shared
+    chi_square = ((literal - ours)[seen] ** 2 / (literal + ours)[seen]).sum()
+    assert chi_square < 45  # 15 degrees of freedom: p < 1e-4
+    shifted = np.roll(ours, 1, axis=0)
+    assert ((literal - shifted)[seen] ** 2 / (literal + shifted)[seen]).sum() > 1000  # the twin that must fail
+
+
+def test_algorithm_1_picks_one_stream_for_the_whole_batch() -> None:
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        t = algorithm1_timesteps(64, 999, generator)
+        ends = [bool(torch.isin(x, torch.tensor([0, 999])).all()) for x in (t.attributes, t.image)]
+        assert sorted(ends) == [False, True]
+
+
+def test_unknown_rule() -> None:
+    with pytest.raises(UnirenderError, match="'conditional' or 'algorithm1'"):
+        draw_timesteps("both", 4, 999, 0.5, 0.5, torch.Generator())
+
+
+# --- sampling: x0 ~ N(mu, s^2), whose denoiser E[x0 | x_t] is known exactly
+
+MU, S = 0.7, 0.5
+
+
+def exact_denoiser(x_t: Tensor, t: Tensor) -> Tensor:
+    alpha_bar = make_scheduler().alphas_cumprod[t][:, None, None, None]
+    a, sigma_2 = alpha_bar.sqrt(), 1 - alpha_bar
+    return MU + a * S**2 / (a**2 * S**2 + sigma_2) * (x_t - a * MU)
+
+
+def test_one_step_is_the_mean() -> None:
+    x = denoise(exact_denoiser, torch.randn(4, 1, 8, 8), make_scheduler(), 1)
+    torch.testing.assert_close(x, torch.full_like(x, MU))
+
+
+def ddim_error(steps: int) -> float:
+    """Largest error of the probability flow's end point: x0 = mu + s * noise, exactly."""
+    noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
+    return float((denoise(exact_denoiser, noise, make_scheduler(), steps) - (MU + S * noise)).abs().max())
+
+
+def test_ddim_samples_the_gaussian_with_first_order_error() -> None:
+    errors = [ddim_error(n) for n in (10, 20, 40)]
+    orders = [math.log2(a / b) for a, b in pairwise(errors)]
+    assert all(0.6 < order < 1.6 for order in orders), f"orders {orders}, errors {errors}"
+    assert errors[-1] < 0.1
+
+
+def test_other_schedulers_work() -> None:
+    scheduler = UniPCMultistepScheduler.from_config(make_scheduler().config, final_sigmas_type="zero")
+    noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
+    x = denoise(exact_denoiser, noise, scheduler, 20)
+    assert torch.isfinite(x).all()
+    assert float((x - (MU + S * noise)).abs().max()) < 0.3
+
+
+def test_noise_of_a_row_does_not_depend_on_the_batch() -> None:
+    like = torch.zeros(1)
+    one = draw_noise((1, 3, 4, 4), like, torch.Generator().manual_seed(5))
+    many = draw_noise((6, 3, 4, 4), like, torch.Generator().manual_seed(5))
+    assert torch.equal(one[0], many[0])
+
+
+def test_modes() -> None:
+    assert (steps_of("mean", None), steps_of("sample", None), steps_of("sample", 4)) == (1, 20, 4)
+    for mode, steps, words in (("mode", None, "'sample'"), ("mean", 5, "takes 1 step"), ("sample", 0, "at least 1")):
+        with pytest.raises(UnirenderError, match=words):
+            steps_of(mode, steps)

@@ -1,0 +1,283 @@
+"""The pipeline with an untrained model: shapes, sizes, seeds, anchoring, errors. Scores are the benchmark's task."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny_models import SIZE, make_pipeline
+
+from unirender.camera import Camera
+from unirender.color import image_srgb, srgb_decode
+from unirender.composite import composite_image
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import specular_light
+from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> UniRenderPipeline:
+    return make_pipeline()
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def get(intrinsics: Intrinsics, name: str) -> np.ndarray:
+    return intrinsics.require(name)[name]
+
+
+def picture(height: int = SIZE, width: int = SIZE) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:height, 0:width]
+    mask = ((x - width / 2) ** 2 + (y - height / 2) ** 2 < (0.45 * min(height, width)) ** 2)[..., None]
+    image = np.clip(rng.uniform(0.2, 0.8, 3) + 0.2 * np.sin(x / 5.0)[..., None], 0, 1)
+    return image.astype(np.float32), mask.astype(np.float32)
+
+
+def scene(size: int = SIZE) -> Intrinsics:
+    _, mask = picture(size, size)
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    x, y = np.meshgrid(axis, -axis)
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0.05))], axis=-1)
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True) * mask
+    environment = np.random.default_rng(1).uniform(0.2, 1.5, (16, 32, 3)).astype(np.float32)
+    maps: dict[str, Any] = {
+        "albedo": 0.5 * mask.repeat(3, axis=-1),
+        "normal": normal,
+        "mask": mask,
+        "environment": environment,
+    }
+    lit: dict[str, Any] = {"specular": 0.6 * mask.repeat(3, axis=-1), "diffuse": 0.8 * mask.repeat(3, axis=-1)}
+    return Intrinsics(**maps, **lit, roughness=0.5 * mask, metallic=0.3 * mask)
+
+
+@pytest.mark.parametrize("size", [(SIZE, SIZE), (50, 37), (20, 90), (130, 128)])
+def test_decompose_any_size(pipeline: UniRenderPipeline, size: tuple[int, int]) -> None:
+    image, mask = picture(*size)
+    result = pipeline.decompose(image, mask, generator=seeded())
+    maps = result.intrinsics
+    assert maps.present == ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
+    assert (maps.height, maps.width) == size
+    assert maps.environment is not None
+    assert maps.environment.shape == (16, 32, 3)
+    for name, value in maps.require("albedo", "normal", "roughness", "metallic", "specular", "diffuse").items():
+        assert not value[mask[..., 0] == 0].any(), name
+    lengths = np.linalg.norm(get(maps, "normal"), axis=-1)[mask[..., 0] > 0]
+    np.testing.assert_allclose(lengths, 1, atol=1e-5)
+    assert result.std is None
+    assert result.samples == ()
+
+
+def test_materials_are_scalars_or_maps(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    scalar = pipeline.decompose(image, mask, generator=seeded())
+    per_pixel = pipeline.decompose(image, mask, generator=seeded(), material="map")
+    inside = mask[..., 0] > 0
+    assert np.ptp(get(scalar.intrinsics, "roughness")[inside]) < 1e-6
+    assert np.ptp(get(per_pixel.intrinsics, "roughness")[inside]) > 1e-3
+    assert scalar.roughness == pytest.approx(per_pixel.roughness, abs=1e-5)
+
+
+def test_seed_decides(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    first, again, other = (pipeline.decompose(image, mask, generator=seeded(s)).intrinsics for s in (0, 0, 1))
+    assert np.array_equal(get(first, "albedo"), get(again, "albedo"))
+    assert not np.array_equal(get(first, "albedo"), get(other, "albedo"))
+
+
+def test_samples_have_a_mean_and_a_spread(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    sampling: dict[str, Any] = {"mode": "sample", "num_inference_steps": 2, "generator": seeded()}
+    result = pipeline.decompose(image, mask, num_samples=3, **sampling)
+    assert result.std is not None
+    assert len(result.samples) == 3
+    albedos = np.stack([get(s, "albedo") for s in result.samples])
+    np.testing.assert_allclose(get(result.intrinsics, "albedo"), albedos.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(result.std["albedo"], albedos.std(axis=0), atol=1e-6)
+    sampling["generator"] = seeded()
+    alone = pipeline.decompose(image, mask, num_samples=1, **sampling)
+    np.testing.assert_allclose(get(alone.intrinsics, "albedo"), albedos[0], atol=1e-5)  # whatever the batch
+
+
+def test_pil_pictures_bring_their_alpha(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    rgba = np.concatenate([image, mask], axis=-1)
+    pil = Image.fromarray((255 * rgba + 0.5).astype(np.uint8), "RGBA")
+    result = pipeline(pil, generator=seeded())
+    np.testing.assert_allclose(get(result.intrinsics, "mask"), mask)
+    opaque = pipeline(pil.convert("RGB"), generator=seeded())
+    assert opaque.intrinsics.mask is not None
+    assert opaque.intrinsics.mask.min() == 1
+
+
+def test_untrained_prior_renders_the_composite() -> None:
+    """With the image stream's last convolution at zero the render is the closed form."""
+    pipeline = make_pipeline()
+    for p in pipeline.dual_stream.image_unet.conv_out.parameters():
+        torch.nn.init.zeros_(p)
+    given = scene()
+    np.testing.assert_allclose(
+        image_srgb(pipeline.render(given)), image_srgb(composite_image(given)), rtol=0, atol=1e-4
+    )
+    large = scene(80)
+    np.testing.assert_allclose(
+        image_srgb(pipeline.render(large)), image_srgb(composite_image(large)), rtol=0, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("size", [SIZE, 75])
+def test_render_any_size(pipeline: UniRenderPipeline, size: int) -> None:
+    image = pipeline.render(scene(size), generator=seeded())
+    assert image.shape == (size, size, 3)
+    assert image.min() >= 0
+    assert image.max() <= 1
+
+
+def test_missing_light_is_derived_or_left_to_the_model(pipeline: UniRenderPipeline) -> None:
+    given = scene()
+    derived = pipeline.render(given.replace(specular=None, diffuse=None), generator=seeded())
+    free = pipeline.render(given.replace(specular=None, diffuse=None, environment=None), generator=seeded())
+    without_albedo = pipeline.render(given.replace(albedo=None), generator=seeded())
+    assert not np.allclose(derived, free)
+    assert np.isfinite(without_albedo).all()
+    with pytest.raises(UnirenderError, match="normal missing"):
+        pipeline.render(given.replace(normal=None))
+
+
+def test_edit_changes_what_was_asked_for(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture(48, 40)
+    base = pipeline.decompose(image, mask, generator=seeded())
+    result = pipeline.edit(image, mask, metallic=1.0, decomposition=base, generator=seeded())
+    edited, before = result.intrinsics, base.intrinsics
+    assert result.image_linear.shape == (48, 40, 3)
+    assert get(edited, "metallic")[mask > 0].min() == 1
+    for name in ("albedo", "normal", "roughness", "specular", "diffuse", "environment"):
+        assert np.array_equal(getattr(edited, name), getattr(before, name)), name
+    rougher = pipeline.edit(image, mask, roughness=0.9, decomposition=base, generator=seeded())
+    assert not np.array_equal(get(rougher.intrinsics, "specular"), get(before, "specular"))
+
+
+def test_anchored_edit_without_a_change_is_the_input(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    base = pipeline.decompose(image, mask, generator=seeded(), material="map")
+    same = pipeline.edit(image, mask, metallic=get(base.intrinsics, "metallic"), decomposition=base, generator=seeded())
+    np.testing.assert_allclose(same.image_linear, srgb_decode(image) * mask, rtol=0, atol=1e-6)
+    plain = pipeline.edit(
+        image, mask, metallic=get(base.intrinsics, "metallic"), decomposition=base, anchored=False, generator=seeded()
+    )
+    assert np.abs(plain.image_linear - same.image_linear).max() > 1e-2  # the twin
+
+
+def test_relight_takes_any_light(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    base = pipeline.decompose(image, mask, generator=seeded())
+    light = np.random.default_rng(0).uniform(0, 3, (40, 80, 3)).astype(np.float32)
+    kept = pipeline.relight(image, light, mask, exposure="keep", decomposition=base)
+    assert kept.intrinsics.environment is not None
+    assert kept.intrinsics.environment.shape == (40, 80, 3)
+    auto, brighter = (pipeline.relight(image, k * light, mask, decomposition=base) for k in (1.0, 5.0))
+    np.testing.assert_allclose(
+        get(auto.intrinsics, "diffuse"), get(brighter.intrinsics, "diffuse"), rtol=1e-4, atol=1e-6
+    )
+    target = 0.3 * mask.repeat(3, axis=-1)
+    given = pipeline.relight(image, None, mask, specular=target, diffuse=target, decomposition=base)
+    assert np.array_equal(get(given.intrinsics, "diffuse"), target)
+
+
+def test_anchor_closed_forms() -> None:
+    shape = (1, 1, 3)
+    image, before, after = (np.full(shape, v, dtype=np.float32) for v in (0.4, 0.5, 0.25))
+    exact = 0.4 + (0.42 / 0.52) * (0.25 - 0.5)
+    np.testing.assert_allclose(anchor(image, before, after), exact, rtol=1e-5)
+    dark = np.zeros(shape, dtype=np.float32)  # bounded: the difference form with at most twice the gain
+    np.testing.assert_allclose(anchor(image, dark, after), 0.4 + 2 * 0.25, rtol=1e-5)
+    assert anchor(dark, before, dark).min() >= 0
+
+
+def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_constant() -> None:
+    given = scene()
+    roughness = get(given, "roughness")
+    same, held = specular_for_roughness(given, roughness)
+    np.testing.assert_allclose(same, get(given, "specular"), rtol=1e-5)
+    assert held == 0
+    uniform = given.replace(environment=np.ones((16, 32, 3), dtype=np.float32))
+    smoother, _ = specular_for_roughness(uniform, constant_map(0.2, get(given, "mask")))
+    maps = uniform.require("normal", "environment")
+    ratio = specular_light(maps["normal"], 0.2, maps["environment"]) / np.maximum(
+        specular_light(maps["normal"], roughness, maps["environment"]), 1e-6
+    )
+    middle = (slice(12, 20), slice(12, 20))
+    np.testing.assert_allclose(smoother[middle] / 0.6, ratio[middle], rtol=0.02)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (48, 20), (33, 65)])
+def test_frame_keeps_constants_and_rays(size: tuple[int, int]) -> None:
+    frame = Frame(*size, SIZE)
+    mask = picture(*size)[1]
+    value = 0.7 * (mask > 0)
+    there = frame.enter_map(value.astype(np.float32), mask)
+    np.testing.assert_allclose(there[frame.enter(mask) > 1e-2], 0.7, rtol=1e-4)
+    back = frame.leave_map(there, mask)
+    np.testing.assert_allclose(back[frame.leave(frame.enter(mask)) * mask > 1e-2], 0.7, rtol=1e-3)
+    camera = Camera()
+    padded = frame.camera(camera).rays(frame.side, frame.side)
+    top, left = frame.offset
+    inner = padded[top : top + size[0], left : left + size[1]]
+    np.testing.assert_allclose(inner, camera.rays(*size), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"image_srgb": np.zeros((32, 32), dtype=np.float32)}, r"expected \[height, width, 3\]"),
+        ({"image_srgb": np.zeros((32, 32, 3), dtype=np.uint8)}, "divide by 255"),
+        ({"image_srgb": np.full((32, 32, 3), np.nan, dtype=np.float32)}, "NaN"),
+        ({"image_srgb": np.full((32, 32, 3), 7.0, dtype=np.float32)}, r"expected \[0, 1\]"),
+        ({"image_srgb": np.zeros((4, 4, 3), dtype=np.float32)}, "at least 8"),
+        ({"mask": np.zeros((32, 32, 1), dtype=np.float32)}, "no pixel is covered"),
+        ({"mask": np.ones((16, 32, 1), dtype=np.float32)}, "size of the picture"),
+        ({"mode": "mean", "num_samples": 3}, "gives 1 sample"),
+        ({"mode": "fast"}, "'sample'"),
+        ({"material": "texture"}, "'scalar' or 'map'"),
+    ],
+)
+def test_bad_input_is_refused_with_a_reason(pipeline: UniRenderPipeline, change: dict, words: str) -> None:
+    image, mask = picture()
+    arguments: dict[str, Any] = {"image_srgb": image, "mask": mask} | change
+    with pytest.raises(UnirenderError, match=words):
+        pipeline.decompose(**arguments)
+
+
+def test_bad_edits_are_refused(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    with pytest.raises(UnirenderError, match="nothing to change"):
+        pipeline.edit(image, mask)
+    with pytest.raises(UnirenderError, match=r"expected \[0, 1\]"):
+        pipeline.edit(image, mask, roughness=1.5)
+    with pytest.raises(UnirenderError, match="no light"):
+        pipeline.relight(image, None, mask)
+    with pytest.raises(UnirenderError, match="the light is black"):
+        pipeline.relight(image, np.zeros((4, 8, 3), dtype=np.float32), mask)
+
+
+def test_diffusers_conventions(pipeline: UniRenderPipeline, tmp_path: Path) -> None:
+    pipeline.save_pretrained(tmp_path)
+    assert not list(tmp_path.rglob("*.bin"))
+    loaded = UniRenderPipeline.from_pretrained(tmp_path)
+    loaded.set_progress_bar_config(disable=True)
+    image, mask = picture()
+    first, second = (p.decompose(image, mask, generator=seeded()).intrinsics for p in (pipeline, loaded))
+    np.testing.assert_allclose(get(first, "albedo"), get(second, "albedo"), atol=1e-6)
+    half = UniRenderPipeline.from_pretrained(tmp_path, torch_dtype=torch.bfloat16).to("cpu")
+    assert half.dtype == torch.bfloat16
+    rough = half.decompose(image, mask, generator=seeded()).intrinsics
+    assert np.abs(get(rough, "albedo") - get(first, "albedo")).mean() < 0.05
+    with pytest.raises(UnirenderError, match="no pipeline folder"):
+        UniRenderPipeline.from_pretrained(tmp_path / "missing")

@@ -1,0 +1,228 @@
+"""The trainer: exact resume, averaged weights, overfitting one sample, and a run on shards."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from synthetic_shards import write_dataset
+from tiny_models import TRAIN, make_batch
+from torch import Tensor, nn
+
+from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.errors import UnirenderError
+from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.training.checkpoint import STATE_FILE, load_state, save_state
+from unirender.training.ema import Ema
+from unirender.training.export import export_pipeline
+from unirender.training.presets import PRESETS, OptimizerConfig, TrainConfig, get_preset
+from unirender.training.source import ShardSource
+from unirender.training.trainer import RunConfig, Trainer, learning_rate
+
+CPU = torch.device("cpu")
+OVERFIT_STEPS = 150
+
+
+class SyntheticSource:
+    """Batch k is a function of k: a source whose place is one number."""
+
+    def __init__(self, fixed: bool = False) -> None:
+        self.place, self.fixed = 0, fixed
+
+    def next(self) -> dict[str, Tensor]:
+        self.place += 1
+        return make_batch(TRAIN.batch_size, seed=0 if self.fixed else self.place)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"place": self.place}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.place = state["place"]
+
+    def refresh(self) -> str | None:
+        return None
+
+
+def run_for(
+    folder: Path, steps: int, of: int = 3, config: TrainConfig = TRAIN, parallel: int = 1
+) -> list[dict[str, Any]]:
+    """Trains up to `steps` of a run of `of` steps, as if killed there after a save; the logged lines."""
+    trainer = Trainer(config, RunConfig(folder, steps=of, log_every=1, parallel=parallel), CPU, torch.float32)
+    source, lines = SyntheticSource(), []
+    trainer.resume(source)
+    while trainer.step < steps:
+        lines.append(trainer.train_step(source.next()))
+    trainer.save(source)
+    return lines
+
+
+@pytest.mark.parametrize("parallel", [1, 2])
+def test_resume_is_exact(tmp_path: Path, parallel: int) -> None:
+    whole = run_for(tmp_path / "a", 3, parallel=parallel)
+    parts = run_for(tmp_path / "b", 1, parallel=parallel) + run_for(tmp_path / "b", 3, parallel=parallel)
+    assert parts == whole
+    a, b = (load_state(tmp_path / name) for name in "ab")
+    assert a is not None
+    assert b is not None
+    for group in ("model", "ema"):
+        first, second = (x[group].get("average", x[group]) for x in (a, b))
+        assert all(torch.equal(first[name], second[name]) for name in first), group
+    other = run_for(tmp_path / "c", 1, config=dataclasses.replace(TRAIN, seed=1), parallel=parallel)
+    assert other != whole[:1]  # the twin that must differ
+
+
+def test_state_of_another_config_is_refused(tmp_path: Path) -> None:
+    run_for(tmp_path, 1)
+    with pytest.raises(UnirenderError, match="another batch_size"):
+        run_for(tmp_path, 2, config=dataclasses.replace(TRAIN, batch_size=2))
+
+
+def test_broken_state_is_refused(tmp_path: Path) -> None:
+    (tmp_path / STATE_FILE).write_bytes(b"no state")
+    with pytest.raises(UnirenderError, match="cannot be read"):
+        load_state(tmp_path)
+    assert load_state(tmp_path / "empty") is None
+
+
+def test_save_replaces_at_once(tmp_path: Path) -> None:
+    save_state(tmp_path, {"step": 1})
+    save_state(tmp_path, {"step": 2, "t": torch.ones(2)})
+    assert [p.name for p in tmp_path.iterdir()] == [STATE_FILE]
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["step"] == 2
+
+
+def test_training_needs_a_length(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="steps or minutes"):
+        Trainer(TRAIN, RunConfig(tmp_path), CPU, torch.float32)
+
+
+def test_learning_rate_warms_up_and_decays() -> None:
+    config = OptimizerConfig(learning_rate=1.0, warmup_steps=9, final_lr=0.1)
+    assert learning_rate(config, 0, 0.0) == pytest.approx(0.1)
+    assert learning_rate(config, 9, 0.0) == pytest.approx(1.0)
+    assert learning_rate(config, 500, 0.5) == pytest.approx(0.55)
+    assert learning_rate(config, 999, 1.0) == pytest.approx(0.1)
+    assert learning_rate(config, 999, 7.0) == pytest.approx(0.1)
+
+
+def test_ema_is_the_recursion() -> None:
+    layer = nn.Linear(2, 2)
+    ema, expected = Ema(layer, decay=0.5), layer.weight.detach().clone()
+    for n in range(30):
+        with torch.no_grad():
+            layer.weight.add_(1.0)
+        ema.update(layer)
+        decay = min(0.5, (1 + n) / (10 + n))
+        expected = decay * expected + (1 - decay) * layer.weight.detach()
+    torch.testing.assert_close(ema.average["weight"], expected)
+    restored = Ema(nn.Linear(2, 2), decay=0.5)
+    restored.load_state_dict(ema.state_dict())
+    copy = nn.Linear(2, 2)
+    restored.copy_to(copy)
+    assert torch.equal(copy.weight, ema.average["weight"])
+    assert restored.updates == 30
+
+
+def test_averaged_weights_are_in_place_only_inside_the_block(tmp_path: Path) -> None:
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=3), CPU, torch.float32)
+    trainer.train_step(make_batch())
+    before = [p.detach().clone() for p in trainer.model.parameters()]
+    with trainer.averaged():
+        name, p = next(iter(trainer.model.named_parameters()))
+        assert torch.equal(p, trainer.ema.average[name])
+    assert all(torch.equal(p, q) for p, q in zip(trainer.model.parameters(), before, strict=True))
+    assert trainer.model.training
+
+
+def masked_psnr(a: Tensor, b: Tensor, mask: Tensor) -> float:
+    return -10 * math.log10(float(((a - b).square() * mask).sum() / (3 * mask.sum())))
+
+
+@pytest.mark.slow
+def test_plain_model_overfits_one_sample(tmp_path: Path) -> None:
+    """Both directions, without the prior, in a few seconds on one core."""
+    config = dataclasses.replace(
+        TRAIN,
+        model=dataclasses.replace(TRAIN.model, physics_prior=False),
+        loss=dataclasses.replace(TRAIN.loss, cycle=0.0),
+        optimizer=OptimizerConfig(learning_rate=5e-3, warmup_steps=10, ema_decay=0.9),
+        batch_size=2,
+        p_t=0.0,
+        map_dropout=0.0,
+    )
+    trainer = Trainer(config, RunConfig(tmp_path, steps=OVERFIT_STEPS), CPU, torch.float32)
+    one = {name: value.repeat(2, 1, 1, 1) for name, value in make_batch(1).items()}
+    while trainer.step < OVERFIT_STEPS:
+        trainer.train_step(one)
+    parts = (trainer.loss.model, trainer.loss.conditioning, trainer.loss.scheduler)
+    with trainer.averaged():
+        maps = infer_attributes(*parts, one["image"], one["mask"], generator=torch.Generator().manual_seed(1))
+        given = torch.ones(2, 6, dtype=torch.bool)
+        image = infer_image(*parts, one, given, generator=torch.Generator().manual_seed(1))
+    assert masked_psnr(maps["albedo"], one["albedo"], one["mask"]) > 20
+    assert masked_psnr(image, one["image"].clamp(0, 1), one["mask"]) > 20
+
+
+def test_run_on_shards_writes_what_it_says(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", size=32)
+    lines: list[dict[str, Any]] = []
+    for steps in (2, 3):  # the second call resumes
+        run = RunConfig(tmp_path / "run", steps=steps, log_every=1, picture_minutes=0.0, refresh_minutes=0.0)
+        trainer = Trainer(TRAIN, run, CPU, torch.float32)
+        source = ShardSource(data, TRAIN.batch_size, TRAIN.seed)
+        trainer.fit(source, lines.append)
+        source.close()
+    assert [line["step"] for line in lines] == [1, 2, 3]
+    logged = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in logged] == [1, 2, 3]
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["train"]["batch_size"] == TRAIN.batch_size
+    assert (tmp_path / "run" / "pictures" / "step_000003.png").is_file()
+    folder = export_pipeline(trainer, tmp_path / "run" / "pipeline")
+    assert json.loads((folder / "training.json").read_text())["samples"] == 3 * TRAIN.batch_size
+    pipeline = UniRenderPipeline.from_pretrained(folder)
+    assert pipeline.dtype == torch.float32
+    weight = trainer.ema.average["image_unet.conv_in.weight"].half().float()
+    assert torch.equal(pipeline.dual_stream.image_unet.conv_in.weight, weight)
+
+
+def test_growing_folder(tmp_path: Path) -> None:
+    """New shards are taken in at a refresh; a resumed run keeps the shards that it had."""
+    data = write_dataset(tmp_path, shards=1)
+    source = ShardSource(data, 2, 0)
+    source.next()
+    assert source.refresh() is None
+    state = source.state_dict()
+    write_dataset(tmp_path, shards=3)
+    assert source.refresh() == "data: 1 -> 3 shards at sample 2"
+    grown = source.next()
+    resumed = ShardSource(data, 2, 0)
+    resumed.load_state_dict(state)
+    old = resumed.next()
+    assert resumed.state_dict()["shards"] == state["shards"]
+    assert not torch.equal(grown["image"], old["image"])
+    source.close()
+    resumed.close()
+
+
+def test_presets_are_rows() -> None:
+    assert get_preset("paper").optimizer == dataclasses.replace(PRESETS["sd15"].optimizer)
+    assert (get_preset("paper").optimizer.beta1, get_preset("paper").batch_size) == (0.8, 4)
+    assert get_preset("tiny_without_cycle").loss.cycle == 0
+    with pytest.raises(UnirenderError, match="expected one of: tiny"):
+        get_preset("huge")
+
+
+def test_device_and_dtype_names() -> None:
+    assert resolve_device("auto").type in ("cuda", "mps", "cpu")
+    assert resolve_dtype("float16", CPU) == torch.float16
+    assert resolve_dtype("auto", CPU) == (torch.bfloat16 if cpu_has_bf16() else torch.float32)
+    with pytest.raises(UnirenderError, match="expected one of: auto"):
+        resolve_dtype("int8", CPU)
+    with pytest.raises(UnirenderError, match="not available here"):
+        resolve_device("tpu")
