@@ -1,0 +1,1 @@
+"""The scorer: metrics, suites, methods, tables and the physics table."""

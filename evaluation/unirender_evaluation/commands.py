@@ -1,0 +1,181 @@
+"""`unirender bench ...`: the benchmark's commands. Light to import; each command loads what it needs when it runs."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from unirender.errors import UnirenderError
+
+
+@dataclass(frozen=True)
+class BenchRun:
+    """Score methods on a suite: tables, verdict, per-sample records and an HTML report. A second run continues."""
+
+    suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    out: Path = Path("results")
+    """Folder of the run."""
+    checkpoint: Path | None = None
+    """Folder of our model; None: the shipped tiny."""
+    methods: tuple[str, ...] = ("ours", "trivial", "plugins")
+    """Groups of rows."""
+    predictions: tuple[str, ...] = ()
+    """NAME=FOLDER of somebody's predictions (`unirender bench export` writes the inputs); repeatable."""
+    limit: int | None = None
+    """Scenes; the tables of a partial run carry a watermark."""
+    seed: int = 0
+    """Of sampling methods and of the truth check."""
+    check_scenes: int = 4
+    """Scenes that Mitsuba renders again on the spot."""
+    sample_scenes: int = 4
+    """Scenes of the sampling rows; 0 leaves them out."""
+    jobs: int = 2
+    """Worker processes of one thread each; 0: all in this one."""
+    device: str = "cpu"
+    """Where our model runs."""
+    full: bool = False
+    """Run the slow rows on the whole suite instead of on their fixed subset."""
+
+    def run(self) -> int:
+        """Returns the exit status: 1 where the shipped truth does not stand up to Mitsuba."""
+        from rich.console import Console
+
+        from unirender_evaluation import benchmark
+        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.table_formats import print_table
+
+        console = Console()
+        whole = len(load_suite(self.suite).scenes)
+        result = benchmark.run(
+            benchmark.BenchConfig(
+                suite=self.suite,
+                out=self.out,
+                checkpoint=self.checkpoint,
+                methods=self.methods,
+                predictions=named_folders(self.predictions),
+                limit=self.limit,
+                seed=self.seed,
+                check_scenes=self.check_scenes,
+                jobs=self.jobs,
+                device=self.device,
+                sample_scenes=whole if self.full else self.sample_scenes,
+            ),
+            console,
+        )
+        for table in result.tables:
+            print_table(console, table)
+        console.print(result.verdict, markup=False, highlight=False)
+        console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
+        return 0 if result.truth_check.get("passed") else 1
+
+
+@dataclass(frozen=True)
+class BenchCheck:
+    """Render a random part of a suite's truth again with Mitsuba and z-test it against the shipped files."""
+
+    suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    scenes: int = 4
+    """How many."""
+    seed: int = 0
+    """Chooses the scenes and the render seeds."""
+
+    def run(self) -> int:
+        """Returns 1 where a test fails."""
+        from rich.console import Console
+
+        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.truth_check import TruthCheck, check_truth
+
+        console = Console()
+        for step in check_truth(load_suite(self.suite), self.scenes, self.seed):
+            if isinstance(step, TruthCheck):
+                console.print_json(json.dumps(step.summary()))
+                return 0 if step.passed else 1
+            console.print(f"{step.name}: {step.test}", highlight=False)
+        raise UnirenderError("truth check: nothing was rendered, expected at least one scene")
+
+
+@dataclass(frozen=True)
+class BenchTruth:
+    """Make a suite's truth file with Mitsuba; resumes by running the same command again."""
+
+    suite: str
+    """Path of the suite's TOML file; the tar is written beside it and its hash into it."""
+    work: Path | None = None
+    """Folder for finished objects; None: `${UNIRENDER_CACHE}/truth`."""
+    workers: int = 2
+    """Processes."""
+
+    def run(self) -> int:
+        """Renders what is missing."""
+        from rich.progress import track
+
+        from unirender.paths import cache_dir
+        from unirender_evaluation.suites import read_spec
+        from unirender_evaluation.truth import make_truth
+
+        work = self.work or cache_dir() / "truth"
+        steps = make_truth(self.suite, work, self.workers)
+        for _ in track(steps, "truth", total=len(read_spec(self.suite).objects)):
+            pass
+        return 0
+
+
+@dataclass(frozen=True)
+class BenchExport:
+    """Write a suite's inputs for foreign code: pictures, masks, lights and what is asked of each."""
+
+    out: Path
+    """Folder to write."""
+    suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    limit: int | None = None
+    """Scenes; None: all."""
+
+    def run(self) -> int:
+        """Writes the folder."""
+        from unirender.files import new_folder
+        from unirender_evaluation.export import export_inputs
+        from unirender_evaluation.suites import load_suite
+
+        with new_folder(self.out) as folder:
+            count = export_inputs(load_suite(self.suite), folder, self.limit)
+        print(f"{self.out}: {count} questions")
+        return 0
+
+
+@dataclass(frozen=True)
+class Bench:
+    """The benchmark: score methods, check the truth, export inputs."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[BenchRun, tyro.conf.subcommand("run")]
+        | Annotated[BenchCheck, tyro.conf.subcommand("check")]
+        | Annotated[BenchExport, tyro.conf.subcommand("export")]
+        | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
+    ] = field()
+
+    def run(self) -> int:
+        """Runs the chosen command."""
+        return self.command.run()
+
+
+def named_folders(pairs: tuple[str, ...]) -> dict[str, Path]:
+    """`NAME=FOLDER` strings as a dict.
+
+    Raises:
+        UnirenderError: a string of another form, or a name given twice.
+    """
+    folders: dict[str, Path] = {}
+    for pair in pairs:
+        name, separator, folder = pair.partition("=")
+        if not (name and separator and folder):
+            raise UnirenderError(f"--predictions {pair}: expected NAME=FOLDER")
+        if name in folders:
+            raise UnirenderError(f"--predictions {name}: given twice, expected one folder for each name")
+        folders[name] = Path(folder)
+    return folders

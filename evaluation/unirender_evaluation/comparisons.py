@@ -1,0 +1,97 @@
+"""Who beats whom: values of two rows, paired by sample, with the interval of their difference."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.metrics import DEFAULT_VARIANT, Metric, Variant
+from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.statistics import Estimate, beats, paired_difference
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which records: one table under one protocol over one population."""
+
+    table: str
+    protocol: str
+    subset: str = "main"
+
+    def of(self, records: Iterable[Record]) -> list[Record]:
+        """The records that belong to it, in their order."""
+        wanted = (self.table, self.protocol, self.subset)
+        return [record for record in records if (record.table, record.protocol, record.subset) == wanted]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Difference a - b of one number, with the verdict."""
+
+    a: str
+    b: str
+    key: str  # metric key
+    difference: Estimate
+    a_beats_b: bool
+    b_beats_a: bool
+
+    @property
+    def verdict(self) -> str:
+        return "beats" if self.a_beats_b else "is beaten by" if self.b_beats_a else "is level with"
+
+
+def values_of(records: Iterable[Record], method: str, key: str) -> dict[str, float]:
+    """Sample -> value of a method, for the records that have the metric key."""
+    return {record.sample: record.values[key] for record in records if record.method == method and key in record.values}
+
+
+def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str) -> Comparison:
+    """Paired comparison of two methods on the samples they share; `records` is one `Selection`.
+
+    Raises:
+        UnirenderError: if one of the two has no such value, they share no sample, or a difference is not finite.
+    """
+    values = {method: values_of(records, method, key) for method in (a, b)}
+    for method, found in values.items():
+        if not found:
+            known = ", ".join(sorted({record.method for record in records if key in record.values})) or "no method"
+            raise UnirenderError(f"comparison: {method!r} has no value {key!r}; {known} has")
+    clusters = {record.sample: record.object for record in records}
+    better = metric.higher_is_better
+    return Comparison(
+        a=a,
+        b=b,
+        key=key,
+        difference=paired_difference(values[a], values[b], clusters),
+        a_beats_b=beats(values[a], values[b], higher_is_better=better, clusters=clusters),
+        b_beats_a=beats(values[b], values[a], higher_is_better=better, clusters=clusters),
+    )
+
+
+def verdicts(
+    spec: TableSpec,
+    records: Sequence[Record],
+    run: RunInfo,
+    *,
+    variant: Variant = DEFAULT_VARIANT,
+    kind: str = "ours",
+    against: Sequence[str] = ("trivial", "baseline"),
+) -> list[tuple[Column, Comparison]]:
+    """Every row of one kind against every row of other kinds, column by column; `records` is one `Selection`.
+
+    Pairs that share no sample, or have an infinite difference (identical images), have no verdict and are left out.
+    """
+    present = list(dict.fromkeys(record.method for record in records))
+    ours = [key for key in present if run.method(key).kind == kind]
+    others = [key for key in present if run.method(key).kind in against and key not in ours]
+    found = []
+    for column in spec.columns:
+        key = column.key(variant)
+        values = {method: values_of(records, method, key) for method in (*ours, *others)}
+        for a in ours:
+            for b in others:
+                common = values[a].keys() & values[b].keys()
+                if common and all(math.isfinite(values[a][s] - values[b][s]) for s in common):
+                    found.append((column, compare(records, column.metric, key, a, b)))
+    return found

@@ -1,0 +1,224 @@
+"""The engine of a run: asks methods, scores their answers, and never does again what is done.
+
+Every record carries a content key, sha256 of (scene truth, task, method configuration, code): a second run, or one more
+method, computes only what has no record. Records are appended as they are made, so that a killed run resumes.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.methods import Image
+from unirender_evaluation.records import MethodInfo, Record, append_record, write_records
+from unirender_evaluation.rows import Row
+from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+
+CODE = {
+    "unirender": ("*.py", "models/*.py", "diffusion/*.py", "pipelines/*.py"),
+    "unirender_evaluation": (
+        "metrics.py",
+        "scoring.py",
+        "lpips.py",
+        "methods.py",
+        "predictions.py",
+        "tasks.py",
+        "physics.py",
+        "suites.py",
+        "ceiling.py",
+        "rows.py",
+        "bounds.py",
+        "truth_check.py",
+    ),
+    "unirender_reference": ("shade.py", "render.py", "passes.py", "materials.py", "scene.py", "statistics.py"),
+}
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A method's answer to one task; what it cannot do stays None."""
+
+    image: Image | None = None
+    maps: Intrinsics | None = None
+    seconds: float = 0.0
+
+
+@runtime_checkable
+class Keeper(Protocol):
+    """What keeps the predictions of some samples (`pictures.Pictures`)."""
+
+    def has(self, task: Task, method: str, key: str) -> bool: ...
+
+    def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None: ...
+
+
+@cache
+def code_version() -> str:
+    """sha256 over the sources that results depend on: a change makes every stored record stale."""
+    from importlib.util import find_spec
+
+    digest = hashlib.sha256()
+    for package, patterns in CODE.items():
+        found = find_spec(package)
+        if found is None or not found.submodule_search_locations:
+            raise UnirenderError(f"package {package!r} is not installed: `pip install -e .`")
+        root = Path(found.submodule_search_locations[0])
+        for path in sorted({p for pattern in patterns for p in root.glob(pattern)}):
+            if path.name != "cli.py":
+                digest.update(f"{package}/{path.relative_to(root)}".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any], code: str) -> str:
+    """What a record depends on: the scene's truth, the question, the method's configuration, the code."""
+    text = json.dumps([suite.scene_hash(scene), what, config, code], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def answer(row: Row, task: Task) -> Prediction:
+    """Asks a method one question; it is handed `task.inputs`, never the truth."""
+    start = time.perf_counter()
+    if row.predictions is not None:
+        image, maps = row.predictions.answer(task)
+        return Prediction(image, maps, 0.0)
+    image = maps = None
+    for capability in task.asks:
+        function = getattr(row.method, capability, None)
+        if function is None:
+            continue
+        result = function(**task.inputs[capability])
+        if capability == "decompose":
+            maps = result
+        else:
+            image = result
+    return Prediction(image, maps, time.perf_counter() - start)
+
+
+def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[str, float]:
+    """All values of one prediction."""
+    from unirender_evaluation import lpips
+    from unirender_evaluation.scoring import score_image, score_maps
+
+    networks = [lpips.load(name) for name in backbones]
+    values: dict[str, float] = {}
+    if prediction.image is not None and task.truth_image is not None:
+        values |= score_image(prediction.image, task.truth_image, task.mask, quantity=task.quantity, lpips=networks)
+    if prediction.maps is not None and task.truth_maps is not None:
+        values |= score_maps(prediction.maps.replace(mask=None), task.truth_maps, lpips=networks)
+    return values
+
+
+def record_of(
+    task: Task, info: MethodInfo, values: Mapping[str, float], key: str, seconds: float | None = None
+) -> Record:
+    """The record of one method on one task."""
+    return Record(
+        table=task.table,
+        protocol=task.protocol,
+        method=info.key,
+        sample=task.sample,
+        object=task.scene.object,
+        values=values,
+        key=key,
+        seconds=seconds,
+    )
+
+
+@dataclass
+class Store:
+    """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end."""
+
+    path: Path
+    known: dict[str, Record] = field(default_factory=dict)
+    used: dict[str, Record] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, path: Path) -> "Store":
+        """Reads what an earlier run left: stale records too (of older code or rows), which `close` drops."""
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
+        known = {record.key: record for record in map(Record.from_json, complete.splitlines())}
+        if complete != text:
+            path.write_text(complete, encoding="utf-8")
+        return cls(path, known)
+
+    def has(self, key: str) -> bool:
+        """Whether a record is there; marks it as part of this run."""
+        if key in self.known:
+            self.used[key] = self.known[key]
+        return key in self.used
+
+    def add(self, record: Record) -> None:
+        """Stores a record, unless it is there (its picture was made again)."""
+        if record.key not in self.used:
+            append_record(self.path, record)
+        self.used[record.key] = record
+
+    def close(self) -> list[Record]:
+        """Drops stale records, sorts the rest and writes them."""
+        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+        write_records(self.path, records)
+        return records
+
+
+@dataclass(frozen=True)
+class Job:
+    """One record that a run wants.
+
+    Attributes:
+        key: its content key.
+        label: for the progress bar.
+        make: computes it.
+        kept: whether the picture that belongs to it is there (or none is wanted).
+    """
+
+    key: str
+    label: str
+    make: Callable[[], Record]
+    kept: bool = True
+
+    def is_done(self, has: Callable[[str], bool]) -> bool:
+        """Whether nothing is to do; `has` says whether a record is there."""
+        return has(self.key) and self.kept
+
+
+def method_jobs(
+    suite: Suite,
+    rows: Sequence[Row],
+    scenes: list[Scene],
+    scene: Scene,
+    version: str,
+    backbones: Sequence[str],
+    pictures: Keeper,
+) -> Iterator[Job]:
+    """Every question about one scene to every row that answers it; row innermost, so that rows share decompositions.
+
+    Args:
+        suite: the suite.
+        rows: the rows.
+        scenes: of the whole run: rows on a subset choose from them.
+        scene: whose questions are asked.
+        version: of the code and of what it depends on.
+        backbones: LPIPS backbones.
+        pictures: keeps the predictions of the gallery.
+    """
+    for table, protocol in PROTOCOLS:
+        for task in tasks(suite, table, protocol, [scene]):
+            for row in rows:
+                if row.answers(task, scenes):
+                    key = content_key(suite, scene, task.identity, row.config, version)
+                    make = partial(_ask, row, task, key, backbones, pictures)
+                    yield Job(key, row.info.label, make, pictures.has(task, row.info.key, key))
+
+
+def _ask(row: Row, task: Task, key: str, backbones: Sequence[str], pictures: Keeper) -> Record:
+    prediction = answer(row, task)
+    pictures.keep(task, row.info.key, key, prediction)
+    return record_of(task, row.info, score(task, prediction, backbones), key, prediction.seconds)

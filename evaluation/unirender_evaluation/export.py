@@ -1,0 +1,69 @@
+"""Writes a suite's inputs for foreign code, in the folder names that `predictions` reads answers from.
+
+    <picture>/image.png      what a method may see: 8-bit sRGB, straight, with the mask as alpha
+    <picture>/meta.json      what is asked of this picture: file names of the answers; camera
+    <picture>/<answer>/...   what is given with a question: light.exr, or s and d, or true maps (`given.exr`, linear)
+
+No truth is written but what its protocol gives away.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unirender.exr import intrinsics_channels, write_exr
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import PROTOCOLS, Task, scene_ids, tasks
+
+
+def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> int:
+    """Writes the inputs of all protocols (see the module); returns the number of questions."""
+    asked: dict[str, dict[str, Any]] = {}
+    count = 0
+    for table, protocol in PROTOCOLS:
+        for task in tasks(suite, table, protocol, scene_ids(suite, limit)):
+            folder = out / task.folder
+            folder.mkdir(parents=True, exist_ok=True)
+            asked.setdefault(task.folder, {})[task.answer] = _write_question(task, folder)
+            count += 1
+    for name, questions in asked.items():
+        meta = {
+            "suite": suite.spec.name,
+            "suite_sha256": suite.sha256,
+            "fov_deg": suite.spec.fov_deg,
+            "answers": questions,
+        }
+        (out / name / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+    return count
+
+
+def _write_question(task: Task, folder: Path) -> dict[str, Any]:
+    """Writes what comes with a question and describes it."""
+    question: dict[str, Any] = {"table": task.table, "protocol": task.protocol}
+    for capability in task.asks:
+        inputs = task.inputs[capability]
+        if "image_srgb" in inputs:
+            _write_picture(folder / "image.png", inputs["image_srgb"], inputs["mask"])
+        question |= {name: inputs[name] for name in ("metallic", "roughness") if name in inputs}
+        given = inputs.get("intrinsics") or Intrinsics(
+            **{name: inputs[name] for name in ("specular", "diffuse", "environment") if inputs.get(name) is not None}
+        )
+        channels = intrinsics_channels(given)
+        if channels:
+            (folder / task.answer).mkdir(exist_ok=True)
+            write_exr(folder / task.answer / "given.exr", channels)
+        if given.environment is not None:
+            (folder / task.answer).mkdir(exist_ok=True)
+            light = {c: given.environment[..., i] for i, c in enumerate("RGB")}
+            write_exr(folder / task.answer / "environment.exr", light, half=False)
+    return question
+
+
+def _write_picture(path: Path, image_srgb: np.ndarray, mask: np.ndarray) -> None:
+    from PIL import Image
+
+    levels = np.round(np.concatenate([image_srgb, mask], axis=-1) * 255).astype(np.uint8)
+    Image.fromarray(levels).save(path)

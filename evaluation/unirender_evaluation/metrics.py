@@ -1,0 +1,258 @@
+"""Metrics: what each number is, which direction is better, and the plain functions behind it.
+
+Notation: `p` prediction, `t` truth, `w` coverage weights in [0, 1] (the *true* mask). Masked figures are
+coverage-weighted means, sum(w e) / sum(w); whole-frame figures are plain means over a composite (see `scoring`). All
+functions take float arrays `[h, w, c]`, compute in float64 and return a float. There is no hidden floor: the PSNR of
+identical images is inf.
+
+A metric key names one number: `<quantity>.<metric>` and, behind an @, the variant axes that the metric has, in the
+order mask, space, scale: `albedo.psnr@masked-srgb-raw`, `roughness.mse@masked`, `normal.cosine`.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from unirender.errors import UnirenderError
+
+Mask = Literal["masked", "whole"]
+Space = Literal["srgb", "linear"]
+Scale = Literal["raw", "aligned", "aligned_rgb"]
+MASKS: tuple[Mask, ...] = ("masked", "whole")
+SPACES: tuple[Space, ...] = ("srgb", "linear")
+SCALES: tuple[Scale, ...] = ("raw", "aligned", "aligned_rgb")
+
+SSIM_SIGMA, SSIM_TRUNCATE = 1.5, 3.5  # Wang et al. 2004: an 11 x 11 Gaussian window
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+LOG_EPSILON = 0.01  # added before the logarithm, display units: a hundredth of display white
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How a number is taken.
+
+    Attributes:
+        mask: "masked" = coverage-weighted over the object; "whole" = whole frame over the declared background.
+        space: "srgb" = display values; "linear" = linear light, both clipped to [0, 1].
+        scale: "raw"; "aligned" = one least-squares factor per image; "aligned_rgb" = one per image and channel. Factors
+            are fitted in linear light inside the true mask.
+    """
+
+    mask: Mask = "masked"
+    space: Space = "srgb"
+    scale: Scale = "raw"
+
+    @property
+    def label(self) -> str:
+        return f"{self.mask}-{self.space}-{self.scale}"
+
+    @classmethod
+    def parse(cls, text: str) -> "Variant":
+        """Reads "masked-linear", "whole-srgb-aligned_rgb", ...; an axis that is left out keeps its default.
+
+        Raises:
+            UnirenderError: if a word is on no axis, or an axis is named twice.
+        """
+        axes: dict[str, str] = {}
+        for word in text.split("-"):
+            found = [axis for axis, words in (("mask", MASKS), ("space", SPACES), ("scale", SCALES)) if word in words]
+            if not found or found[0] in axes:
+                known = ", ".join((*MASKS, *SPACES, *SCALES))
+                raise UnirenderError(
+                    f"variant {text!r}: got {word!r}, expected one word per axis of {known}, '-' between"
+                )
+            axes[found[0]] = word
+        return cls(**axes)  # type: ignore[arg-type]  # each word was looked up among its axis' values
+
+
+DEFAULT_VARIANT = Variant()  # what we believe; the paper's column stands beside Variant("whole")
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One kind of number. The direction belongs here and nowhere else.
+
+    Attributes:
+        name: as in metric keys.
+        label: as in table headers.
+        unit: "" for dimensionless.
+        higher_is_better: direction.
+        perfect: value of a perfect prediction.
+        axes: the axes of `Variant` that the metric has, in the order mask, space, scale.
+        decimals: digits after the point in tables; ranks are taken on rounded values.
+        formula: one line for the protocol.
+    """
+
+    name: str
+    label: str
+    unit: str
+    higher_is_better: bool
+    perfect: float
+    axes: tuple[str, ...] = ()
+    decimals: int = 4
+    formula: str = ""
+
+    def better(self, a: float, b: float) -> bool:
+        """Whether a is strictly better than b."""
+        return a > b if self.higher_is_better else a < b
+
+    @property
+    def arrow(self) -> str:
+        return "↑" if self.higher_is_better else "↓"
+
+
+_ALL = ("mask", "space", "scale")
+METRICS: dict[str, Metric] = {
+    metric.name: metric
+    for metric in (
+        Metric("psnr", "PSNR", "dB", True, math.inf, _ALL, 2, "-10 log10 MSE, peak 1, mean over images"),
+        Metric("ssim", "SSIM", "", True, 1.0, _ALL, 4, "Wang et al. 2004, Gaussian 11 x 11, sigma 1.5"),
+        Metric("lpips_vgg", "LPIPS-VGG", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
+        Metric("lpips_alex", "LPIPS-Alex", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
+        Metric("mse", "MSE", "", False, 0.0, ("mask",), 4, "mean squared error per pixel"),
+        Metric("mse_object", "MSE (object)", "", False, 0.0, (), 4, "squared difference of the in-mask means"),
+        Metric("cosine", "cos", "", True, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
+        Metric("angle_deg", "angle", "deg", False, 0.0, (), 1, "coverage-weighted mean angle between normals"),
+        Metric("ciede2000", "CIEDE2000", "", False, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
+        Metric("log_rmse", "log-RMSE", "", False, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
+    )
+}
+
+
+def metric_key(quantity: str, metric: Metric | str, variant: Variant = DEFAULT_VARIANT) -> str:
+    """The key under which a value is recorded; axes that the metric does not have are left out."""
+    metric = METRICS[metric] if isinstance(metric, str) else metric
+    axes = "-".join(getattr(variant, axis) for axis in metric.axes)
+    return f"{quantity}.{metric.name}" + (f"@{axes}" if axes else "")
+
+
+def mse(
+    p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"] | None = None
+) -> float:
+    """Mean squared error; coverage-weighted where `w` is given.
+
+    Raises:
+        UnirenderError: if shapes differ, or the weights sum to 0.
+    """
+    if p.shape != t.shape:
+        raise UnirenderError(f"metric: got shapes {p.shape} and {t.shape}, expected equal ones; resample one of them")
+    error = np.square(p.astype(np.float64) - t.astype(np.float64))
+    return float(error.mean()) if w is None else weighted_mean(error.mean(axis=-1, keepdims=True), w)
+
+
+def psnr_from_mse(error: float) -> float:
+    """dB for a peak of 1; inf for an error of exactly 0."""
+    return math.inf if error == 0 else -10 * math.log10(error)
+
+
+def psnr(
+    p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"] | None = None
+) -> float:
+    """Peak signal-to-noise ratio of images in [0, 1]; inf if they are identical."""
+    return psnr_from_mse(mse(p, t, w))
+
+
+def weighted_mean(x: Float[np.ndarray, "*pixels 1"], w: Float[np.ndarray, "*pixels 1"]) -> float:
+    """sum(w x) / sum(w); raises UnirenderError if the mask is empty."""
+    total = float(w.sum(dtype=np.float64))
+    if total <= 0:
+        raise UnirenderError("metric: the true mask is empty, expected an object in the picture; drop the sample")
+    return float((x * w.astype(np.float64)).sum() / total)
+
+
+def ssim_map(p: Float[np.ndarray, "*n h w c"], t: Float[np.ndarray, "*m h w c"]) -> Float[np.ndarray, "*n h w"]:
+    """Structural similarity at every pixel, averaged over channels; images in [0, 1].
+
+    The same numbers as `skimage.metrics.structural_similarity(gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False, data_range=1, full=True)`, and many images at once: the variants of a sample share a
+    call (a test holds the two together). Leading axes of the truth broadcast against the prediction's.
+    """
+    p, t = p.astype(np.float64), t.astype(np.float64)
+    c1, c2 = SSIM_K1**2, SSIM_K2**2
+    mean_p, mean_t = _blur(p), _blur(t)
+    var_p, var_t = _blur(p * p) - mean_p**2, _blur(t * t) - mean_t**2
+    covariance = _blur(p * t) - mean_p * mean_t
+    numerator = (2 * mean_p * mean_t + c1) * (2 * covariance + c2)
+    return (numerator / ((mean_p**2 + mean_t**2 + c1) * (var_p + var_t + c2))).mean(axis=-1)
+
+
+def ssim(
+    p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"] | None = None
+) -> float:
+    """Mean SSIM: over the frame without the half-window border (as scikit-image), or weighted by coverage over all."""
+    values = ssim_map(p, t)
+    return float(crop_border(values).mean()) if w is None else weighted_mean(values[..., None], w)
+
+
+def crop_border(values: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n hc wc"]:
+    """Leaves out the border where the SSIM window sticks out of the frame."""
+    pad = int(SSIM_TRUNCATE * SSIM_SIGMA + 0.5)
+    if min(values.shape[-2:]) <= 2 * pad:
+        raise UnirenderError(f"SSIM: got {values.shape[-2:]} pixels, expected more than {2 * pad} a side")
+    return values[..., pad:-pad, pad:-pad]
+
+
+def cosine(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 1"]:
+    """Cosine of the angle between vectors of any length; 0 where one has no direction (length 0)."""
+    p, t = p.astype(np.float64), t.astype(np.float64)
+    lengths = np.linalg.norm(p, axis=-1, keepdims=True) * np.linalg.norm(t, axis=-1, keepdims=True)
+    dot = (p * t).sum(axis=-1, keepdims=True)
+    return np.clip(np.divide(dot, lengths, out=np.zeros_like(dot), where=lengths > 0), -1.0, 1.0)
+
+
+def align_scale(
+    p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"], scale: Scale
+) -> Float[np.ndarray, "h w c"]:
+    """Multiplies the prediction (linear) by the least-squares factor sum(w p t) / sum(w p p), per image or channel.
+
+    A prediction that is 0 everywhere (or in a channel) has no factor and stays as it is.
+    """
+    if scale == "raw":
+        return p
+    axes = (0, 1, 2) if scale == "aligned" else (0, 1)
+    weighted = p.astype(np.float64) * w
+    cross, power = (weighted * t).sum(axis=axes), (weighted * p).sum(axis=axes)
+    return (p * np.divide(cross, power, out=np.ones_like(cross), where=power > 0)).astype(np.float32)
+
+
+def log_rmse(p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"]) -> float:
+    """Root of the coverage-weighted mean of (ln(p + eps) - ln(t + eps))^2 for radiance >= 0, eps = `LOG_EPSILON`."""
+    logs = [np.log(np.maximum(x.astype(np.float64), 0) + LOG_EPSILON) for x in (p, t)]
+    return math.sqrt(mse(logs[0], logs[1], w))
+
+
+def ciede2000(
+    p_linear: Float[np.ndarray, "h w 3"], t_linear: Float[np.ndarray, "h w 3"], w: Float[np.ndarray, "h w 1"]
+) -> float:
+    """Coverage-weighted mean CIEDE2000 of linear Rec.709 colours in [0, 1] (reference white D65)."""
+    import colour  # 2 s to import, and only this function needs it
+
+    inside = w[..., 0] > 0
+    space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
+    labs = [
+        colour.XYZ_to_Lab(np.clip(x[inside], 0, 1).astype(np.float64) @ space.matrix_RGB_to_XYZ.T, space.whitepoint)
+        for x in (p_linear, t_linear)
+    ]
+    difference = np.asarray(colour.delta_E(labs[0], labs[1], method="CIE 2000"))
+    return weighted_mean(difference[:, None], w[inside])
+
+
+def _blur(x: Float[np.ndarray, "*n h w c"]) -> Float[np.ndarray, "*n h w c"]:
+    height, width = x.shape[-3:-1]
+    if max(height, width) > 256:  # beyond it the separable filter needs fewer operations than a dense product
+        for axis in (-3, -2):
+            x = gaussian_filter1d(x, SSIM_SIGMA, axis=axis, truncate=SSIM_TRUNCATE)
+        return x
+    x = _blur_matrix(height) @ x.reshape(*x.shape[:-3], height, -1)
+    x = np.moveaxis(x.reshape(*x.shape[:-1], width, -1), -2, -1)
+    return np.moveaxis(x @ _blur_matrix(width).T, -1, -2)
+
+
+@lru_cache(maxsize=8)
+def _blur_matrix(size: int) -> Float[np.ndarray, "n n"]:
+    return gaussian_filter1d(np.eye(size), SSIM_SIGMA, axis=0, truncate=SSIM_TRUNCATE)

@@ -1,0 +1,84 @@
+"""Runs the physics table: which row answers which test, on how many scenes."""
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.bounds import SHADE_SPP, Shade
+from unirender_evaluation.engine import Job
+from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.physics import RENDERER_TESTS, closed_loop, composite_shader, renderer_tests
+from unirender_evaluation.records import MethodInfo, Record
+from unirender_evaluation.rows import Row
+from unirender_evaluation.scoring import score_image
+from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.tasks import picture, scene_ids
+
+SCENES = 12
+TRUE_MAPS = MethodInfo(
+    "true-maps",
+    "True maps",
+    "reference",
+    note="the closed loops' ceiling, since one point per pixel is not a render",
+    config={"bound": "true-maps", "spp": SHADE_SPP},
+)
+INFOS = (TRUE_MAPS,)
+METHODS = ("composite", "ours-mean")
+
+
+def shade_under(maps: Intrinsics, environment: Any) -> Any:
+    """Mitsuba's shading of maps under a light."""
+    return Shade().render(maps.replace(environment=environment))
+
+
+SHADERS = {"shade": shade_under, "composite": composite_shader}
+
+
+def physics_scenes(suite: Suite, scenes: list[Scene]) -> list[Scene]:
+    """The scenes of the physics table: at most `SCENES` of the run's, evenly spaced."""
+    return scenes if len(scenes) <= SCENES else [s for s in scene_ids(suite, SCENES) if s in scenes] or scenes[:SCENES]
+
+
+def renderer_values(method: Any, suite: Suite, scene: Scene) -> dict[str, float]:
+    """Metric key -> value of a renderer's tests on one scene."""
+    values = renderer_tests(method.render, suite, scene)
+    return {metric_key(name, RENDERER_TESTS[name][1]): value for name, value in values.items()}
+
+
+def loop_values(maps: Intrinsics, suite: Suite, scene: Scene) -> dict[str, float]:
+    """Metric key -> value of the closed loops of one picture's maps."""
+    base, mask, values = suite.spec.base, suite.mask(scene), {}
+    for name, image in closed_loop(maps.replace(mask=mask), suite, scene, SHADERS).items():
+        lit = scene if name.endswith("input") else suite.other_light(scene)
+        values |= score_image(image, suite.image(lit, base), mask, quantity=name)
+    return values
+
+
+def physics_jobs(
+    suite: Suite, scene: Scene, rows: Sequence[Row], key_of: Callable[[str, MethodInfo], str]
+) -> Iterator[Job]:
+    """The records of the physics table on one scene: renderers, decomposers, and the true maps."""
+    for info, method in [(TRUE_MAPS, None), *((row.info, row.method) for row in rows if takes_part(row))]:
+        key = key_of("physics", info)
+        yield Job(key, f"physics: {info.label}", partial(_record, suite, scene, info, method, key))
+
+
+def _record(suite: Suite, scene: Scene, info: MethodInfo, method: Any, key: str) -> Record:
+    values: dict[str, float] = {}
+    if method is None:
+        values = loop_values(suite.intrinsics(scene, suite.spec.base), suite, scene)
+    if callable(getattr(method, "render", None)):
+        values |= renderer_values(method, suite, scene)
+    decompose: Any = getattr(method, "decompose", None)
+    if decompose is not None:
+        maps = decompose(**picture(suite, scene, suite.spec.base))
+        if {"albedo", "normal", "roughness", "metallic"} <= set(maps.present):
+            values |= loop_values(maps, suite, scene)
+    return Record("physics", "physics", info.key, scene.key, scene.object, values, key)
+
+
+def takes_part(row: Row) -> bool:
+    """Whether a row is in the physics table: strangers' methods, Mitsuba's shading, the composite and our main row."""
+    able = any(callable(getattr(row.method, name, None)) for name in ("render", "decompose"))
+    return able and (row.info.kind in ("external", "reference") or row.info.key in METHODS)

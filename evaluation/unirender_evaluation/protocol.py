@@ -1,0 +1,68 @@
+"""The protocol line: everything one must know to compare a number with one's own."""
+
+from collections.abc import Sequence
+
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.published import not_stated
+from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.specs import Protocol
+from unirender_evaluation.statistics import CONFIDENCE, RESAMPLES, SEED
+
+SPACE_TEXT = {"srgb": "sRGB (clipped to [0, 1], then encoded)", "linear": "linear Rec.709, clipped to [0, 1]"}
+SCALE_TEXT = {
+    "raw": "none",
+    "aligned": "one least-squares factor per image, fitted in linear light in the true mask",
+    "aligned_rgb": "one least-squares factor per image and channel, fitted in linear light in the true mask",
+}
+
+
+def protocol_line(
+    protocol: Protocol,
+    variant: Variant,
+    run: RunInfo,
+    methods: Sequence[MethodInfo],
+    records: Sequence[Record],
+    with_published: bool,
+) -> tuple[tuple[str, str], ...]:
+    """(what, value) pairs in the order in which they are printed."""
+    samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
+    items = [
+        ("given", protocol.given),
+        ("mask", _mask_text(variant, methods)),
+        ("colour", SPACE_TEXT[variant.space]),
+        ("scale alignment", SCALE_TEXT[variant.scale]),
+        ("exposure", run.exposure),
+        ("resolution", f"{run.resolution} x {run.resolution}"),
+        ("n", f"{len(samples)} samples of {len(objects)} objects"),
+        ("coverage", "-" if run.coverage is None else f"{run.coverage:.3f}"),
+        ("steps x samples", _sampling_text(methods)),
+        ("seeds", ", ".join(map(str, run.seeds)) or "-"),
+        ("LPIPS", f"v0.1, {' and '.join(run.lpips)}" if run.lpips else "n/a (no weights)"),
+        ("interval", f"{CONFIDENCE:.0%} bootstrap over objects, {RESAMPLES} draws, seed {SEED}"),
+        ("suite", f"{run.suite} {run.suite_hash[:12]}"),
+        ("truth", f"Mitsuba {run.mitsuba or '-'}, {'-' if run.truth_spp is None else run.truth_spp} spp"),
+        ("code", f"{run.code or '-'}, {run.date or '-'}"),
+    ]
+    if with_published:
+        items.append(("published", f"as printed in the paper, on its own test set; not stated there: {not_stated()}"))
+    return tuple(items)
+
+
+def protocol_text(items: Sequence[tuple[str, str]]) -> str:
+    """One line of text."""
+    return " · ".join(f"{name}: {value}" for name, value in items)
+
+
+def _mask_text(variant: Variant, methods: Sequence[MethodInfo]) -> str:
+    if variant.mask == "masked":
+        return "inside the true mask, weighted by coverage"
+    text = "whole frame in linear light over white (0 behind materials)"
+    own = [info.label for info in methods if info.mask == "own"]
+    if not own:
+        return f"{text}, the true mask pasted on every row"
+    return f"{text}; own mask: {', '.join(own)}; true mask pasted: all other rows"
+
+
+def _sampling_text(methods: Sequence[MethodInfo]) -> str:
+    sampled = [info for info in methods if info.steps is not None or info.samples is not None]
+    return "; ".join(f"{info.label} {info.steps or 1} x {info.samples or 1}" for info in sampled) or "no sampling"

@@ -1,0 +1,120 @@
+"""Copies the tables of a benchmark run into the README and into the documentation, so that no number is typed.
+
+    python -m unirender_evaluation.readme RUN [--readme README.md] [--stored FOLDER]
+
+`RUN` is the folder that `unirender bench run` wrote. The README gets the tables of `SHOWN` and the facts of the
+checkpoint, between comments made for them; the stored folder (`evaluation/results` of a checkout, which the
+documentation includes) gets one Markdown file per table. A partial run (`--limit`) is refused.
+"""
+
+import argparse
+import json
+import math
+import re
+import sys
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+
+from safetensors import safe_open
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.physics import PHYSICS_TABLE
+from unirender_evaluation.records import RunInfo, read_records, read_run
+from unirender_evaluation.specs import TABLES
+from unirender_evaluation.table_formats import to_markdown
+from unirender_evaluation.tables import Table, build_tables
+
+SHIPPED = Path(str(resources.files("unirender"))) / "checkpoints" / "tiny"
+SHOWN = (  # table, protocol, subset
+    ("rendering", "from-image", "main"),
+    ("inverse", "single-image", "main"),
+    ("relighting", "from-image-hdri", "main"),
+    ("physics", "physics", "main"),
+)
+
+
+def run_tables(folder: Path) -> tuple[RunInfo, list[Table]]:
+    """The tables of a run folder.
+
+    Raises:
+        UnirenderError: the folder holds no complete run.
+    """
+    if not (folder / "run.json").is_file():
+        raise UnirenderError(f"{folder}: no run.json, expected the folder that `unirender bench run --out` wrote")
+    run = read_run(folder / "run.json")
+    if run.limit is not None:
+        raise UnirenderError(
+            f"{folder}: a partial run (--limit {run.limit}), expected a whole one; run it without --limit"
+        )
+    return run, build_tables(read_records(folder / "records.jsonl"), run, {**TABLES, "physics": PHYSICS_TABLE})
+
+
+def fill(readme: str, name: str, text: str) -> str:
+    """The README with what stands between the comments `name:begin` and `name:end` replaced.
+
+    Raises:
+        UnirenderError: the comments are not there, once each and in order.
+    """
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    pattern = re.compile(f"{re.escape(begin)}.*?{re.escape(end)}", re.DOTALL)
+    if readme.count(begin) != 1 or readme.count(end) != 1 or not pattern.search(readme):
+        raise UnirenderError(f"README: expected one {begin!r} followed by one {end!r}")
+    return pattern.sub(lambda _: f"{begin}\n\n{text.strip()}\n\n{end}", readme)
+
+
+def checkpoint_text(folder: Path) -> str:
+    """What the shipped checkpoint was trained on, from the files that the training wrote beside its weights."""
+    facts = json.loads((folder / "training.json").read_text())
+    parameters = 0
+    for path in folder.rglob("*.safetensors"):
+        with safe_open(path, framework="numpy") as weights:
+            parameters += sum(math.prod(weights.get_slice(name).get_shape()) for name in weights.keys())  # noqa: SIM118 - no dict
+    return (
+        f"The shipped checkpoint has {parameters / 1e6:.1f} million parameters. It was trained for "
+        f"{facts['minutes']:.0f} minutes on {facts['device']} ({facts['autocast']}): {facts['steps']:,} steps, "
+        f"{facts['samples']:,} samples, at {facts['train']['model']['resolution']} pixels."
+    )
+
+
+def selection(tables: Sequence[Table]) -> str:
+    """The tables of `SHOWN`, masked, as Markdown."""
+    shown = [
+        table
+        for table in tables
+        if (table.name, table.protocol_key, table.subset) in SHOWN and table.variant.mask == "masked"
+    ]
+    return "\n".join(to_markdown(table) for table in shown)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; 0, or 1 with one line on standard error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m unirender_evaluation.readme", description="Copies result tables into the README."
+    )
+    parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote")
+    parser.add_argument(
+        "--readme", type=Path, help="rewritten in place, between its comments `results` and `checkpoint`"
+    )
+    parser.add_argument("--checkpoint", type=Path, default=SHIPPED, help="pipeline folder of the model that was scored")
+    parser.add_argument("--stored", type=Path, help="folder for one Markdown file per table")
+    arguments = parser.parse_args(argv)
+    try:
+        run, tables = run_tables(arguments.run)
+        if arguments.readme:
+            head = f"Printed by `make bench` ({run.suite}, {run.date}); masked. The report has the other variants."
+            text = fill(arguments.readme.read_text(), "results", f"{head}\n\n{selection(tables)}")
+            arguments.readme.write_text(fill(text, "checkpoint", checkpoint_text(arguments.checkpoint)))
+        if arguments.stored:
+            arguments.stored.mkdir(parents=True, exist_ok=True)
+            for number, table in enumerate(tables):
+                name = f"{number:02d}-{table.name}-{table.protocol_key}-{table.variant.mask}-{table.subset}.md"
+                (arguments.stored / name).write_text(to_markdown(table))
+    except (UnirenderError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

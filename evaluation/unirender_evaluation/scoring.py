@@ -1,0 +1,217 @@
+"""Scores of a prediction against the truth: every variant of every metric at once, as one flat dict.
+
+Compositing (DESIGN, "Edges and background"). *Masked* figures compare un-premultiplied maps and weight by the true
+coverage. *Whole-frame* figures composite in linear light, then clip, then encode: white behind image, albedo, specular
+and diffuse light, 0 behind materials; the prediction with its own mask, or with the true one where it has none
+(pasted: `mask_source` says which, and the protocol line prints it). SSIM and LPIPS look at neighbourhoods: their
+masked variants compare whole-frame composites with the true mask pasted on both sides; SSIM then weights its map by
+coverage, LPIPS (which has no map) stays a mean over the frame.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import metrics
+from unirender_evaluation.lpips import Lpips
+from unirender_evaluation.metrics import MASKS, SCALES, SPACES, Mask, Scale, Space, Variant, metric_key
+
+Rgb = Float[np.ndarray, "h w 3"]
+Weights = Float[np.ndarray, "h w 1"]
+MATERIALS = ("roughness", "metallic")
+IMAGE_SCALES: tuple[Scale, ...] = ("raw", "aligned")
+
+
+def mask_source(prediction_mask: Weights | None) -> Literal["own", "pasted"]:
+    """Which mask whole-frame figures of a prediction use."""
+    return "pasted" if prediction_mask is None else "own"
+
+
+def score_maps(
+    prediction: Intrinsics,
+    truth: Intrinsics,
+    *,
+    lpips: Sequence[Lpips] = (),
+    lpips_scales: Sequence[Scale] = ("raw",),
+) -> dict[str, float]:
+    """Scores every map that prediction and truth both have.
+
+    Args:
+        prediction: one picture's intrinsics `[h, w, c]`; maps that are None get no values.
+        truth: the same at the same size, with its mask.
+        lpips: backbones to compute; a backbone left out has no values (the cell says n/a).
+        lpips_scales: scale alignments for which LPIPS is computed; each one more costs a third of the scoring time.
+
+    Returns:
+        Metric key -> value, for the quantities albedo, specular, diffuse, roughness, metallic, normal, environment.
+
+    Raises:
+        UnirenderError: if the truth has no mask or an empty one, or sizes differ.
+    """
+    w = _truth_mask(truth.mask)
+    own = _own_mask(prediction.mask, w)
+    values: dict[str, float] = {}
+    colours = [
+        (name, p, t) for name in ("albedo", "specular", "diffuse") if (p := getattr(prediction, name)) is not None
+        and (t := getattr(truth, name)) is not None
+    ]  # fmt: skip
+    for name, p, t in colours:
+        _check_shapes(name, p, t)
+        values |= score_colour(name, p, t, w, own, SCALES, lpips, lpips_scales)
+        for scale in SCALES:
+            aligned, variant = metrics.align_scale(p, t, w, scale), Variant(scale=scale)
+            if name == "albedo":
+                values[metric_key(name, "ciede2000", variant)] = metrics.ciede2000(aligned, t, w)
+            else:
+                values[metric_key(name, "log_rmse", variant)] = metrics.log_rmse(aligned, t, w)
+    for name in MATERIALS:
+        p, t = getattr(prediction, name), getattr(truth, name)
+        if p is not None and t is not None:
+            _check_shapes(name, p, t)
+            values[metric_key(name, "mse", Variant("masked"))] = metrics.mse(p, t, w)
+            values[metric_key(name, "mse", Variant("whole"))] = metrics.mse(p * own, t * w)
+            difference = metrics.weighted_mean(p, w) - metrics.weighted_mean(t, w)
+            values[metric_key(name, "mse_object")] = difference**2
+    if prediction.normal is not None and truth.normal is not None:
+        _check_shapes("normal", prediction.normal, truth.normal)
+        cosine = metrics.cosine(prediction.normal, truth.normal)
+        values[metric_key("normal", "cosine")] = metrics.weighted_mean(cosine, w)
+        values[metric_key("normal", "angle_deg")] = metrics.weighted_mean(np.degrees(np.arccos(cosine)), w)
+    if prediction.environment is not None and truth.environment is not None:
+        values |= _score_environment(prediction.environment, truth.environment)
+    return values
+
+
+def score_image(
+    prediction_linear: Rgb,
+    truth_linear: Rgb,
+    truth_mask: Weights,
+    *,
+    prediction_mask: Weights | None = None,
+    quantity: str = "relit",
+    lpips: Sequence[Lpips] = (),
+    lpips_scales: Sequence[Scale] = ("raw",),
+) -> dict[str, float]:
+    """Scores a rendered image.
+
+    Args:
+        prediction_linear: premultiplied linear RGB, background 0.
+        truth_linear: the same.
+        truth_mask: coverage of the truth.
+        prediction_mask: the method's own coverage; None pastes the true one.
+        quantity: name in the metric keys: "relit", "edit_metallic", "edit_roughness".
+        lpips: backbones to compute.
+        lpips_scales: scale alignments for which LPIPS is computed.
+
+    Returns:
+        Metric key -> value, scales raw and aligned (one factor per image).
+
+    Raises:
+        UnirenderError: if the mask is empty, sizes differ, or the prediction is not finite.
+    """
+    w = _truth_mask(truth_mask)
+    own = _own_mask(prediction_mask, w)
+    _check_shapes(quantity, prediction_linear, truth_linear)
+    p, t = (unpremultiply(x, m) for x, m in ((prediction_linear, own), (truth_linear, w)))
+    return score_colour(quantity, p, t, w, own, IMAGE_SCALES, lpips, lpips_scales)
+
+
+def unpremultiply(image: Rgb, mask: Weights) -> Rgb:
+    """Radiance of the covered part of each pixel: image / mask, 0 where the mask is 0."""
+    return np.divide(image, mask, out=np.zeros_like(image), where=mask > 0)
+
+
+def over_white(colour: Rgb, mask: Weights) -> Rgb:
+    """Composite of an un-premultiplied linear map over white; not clipped."""
+    return colour * mask + (1 - mask)
+
+
+def score_colour(
+    quantity: str,
+    p: Rgb,
+    t: Rgb,
+    w: Weights,
+    own: Weights,
+    scales: Sequence[Scale],
+    lpips: Sequence[Lpips] = (),
+    lpips_scales: Sequence[Scale] = ("raw",),
+) -> dict[str, float]:
+    """PSNR, SSIM and LPIPS of un-premultiplied linear maps, all variants; `own` is the prediction's mask."""
+    values: dict[str, float] = {}
+    aligned = {scale: metrics.align_scale(p, t, w, scale) for scale in scales}
+    # With the true mask pasted, masked and whole composites are one picture: it is compared once.
+    masks: dict[Mask, Weights] = {"masked": w} if own is w else {"masked": w, "whole": own}
+    frames = np.stack([over_white(aligned[scale], mask) for mask in masks.values() for scale in scales])
+    names: list[tuple[Mask, Scale]] = [(mask, scale) for mask in masks for scale in scales]
+    truth = over_white(t, w)
+    for space in SPACES:
+        shown, shown_truth = _display(frames, space), _display(truth, space)
+        similarity = dict(zip(names, metrics.ssim_map(shown, shown_truth[None]), strict=True))
+        pictures = dict(zip(names, shown, strict=True))
+        truth_map = _display(t, space)
+        for scale in scales:
+            masked, whole = Variant("masked", space, scale), Variant("whole", space, scale)
+            in_whole = ("masked" if own is w else "whole", scale)
+            values[metric_key(quantity, "psnr", masked)] = metrics.psnr(_display(aligned[scale], space), truth_map, w)
+            values[metric_key(quantity, "psnr", whole)] = metrics.psnr(pictures[in_whole], shown_truth)
+            similarity_masked = similarity["masked", scale][..., None]
+            values[metric_key(quantity, "ssim", masked)] = metrics.weighted_mean(similarity_masked, w)
+            values[metric_key(quantity, "ssim", whole)] = float(metrics.crop_border(similarity[in_whole]).mean())
+        if space == "srgb":
+            chosen = [i for i, (_, scale) in enumerate(names) if scale in lpips_scales]
+            for network in lpips if chosen else ():
+                for i, distance in zip(chosen, network.distance(shown[chosen], shown_truth[None]), strict=True):
+                    for mask in MASKS if own is w else (names[i][0],):
+                        values[metric_key(quantity, network.metric, Variant(mask, space, names[i][1]))] = float(
+                            distance
+                        )
+    return values
+
+
+def _display(linear: Float[np.ndarray, "*n h w 3"], space: Space) -> Float[np.ndarray, "*n h w 3"]:
+    clipped = np.clip(linear, 0, 1)
+    return srgb_encode(clipped) if space == "srgb" else clipped
+
+
+def _score_environment(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "th tw 3"]) -> dict[str, float]:
+    """log-RMSE weighted by solid angle, at the prediction's resolution."""
+    from unirender.lighting import resample_environment, texel_solid_angles
+
+    if p.shape != t.shape:
+        t = resample_environment(t, p.shape[:2])
+    w = texel_solid_angles(*p.shape[:2])[..., None]
+    return {
+        metric_key("environment", "log_rmse", Variant(scale=scale)): metrics.log_rmse(
+            metrics.align_scale(p, t, w, scale), t, w
+        )
+        for scale in SCALES
+    }
+
+
+def _truth_mask(mask: Weights | None) -> Weights:
+    if mask is None or not mask.any():
+        what = "no mask" if mask is None else "an empty mask"
+        raise UnirenderError(f"scoring: the truth has {what}, expected coverage in [0, 1] with an object in it")
+    return mask
+
+
+def _own_mask(mask: Weights | None, truth: Weights) -> Weights:
+    """The truth's very array where the method has no mask of its own, or the same one."""
+    if mask is None:
+        return truth
+    _check_shapes("mask", mask, truth)
+    return truth if np.array_equal(mask, truth) else mask
+
+
+def _check_shapes(name: str, p: np.ndarray, t: np.ndarray) -> None:
+    if p.shape != t.shape or p.ndim != 3:
+        raise UnirenderError(
+            f"scoring {name}: got shapes {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
+        )
+    if not np.isfinite(p).all():
+        raise UnirenderError(f"scoring {name}: the prediction has NaN or infinite values, expected finite ones")

@@ -1,0 +1,132 @@
+"""Intervals and paired tests, by the bootstrap.
+
+Samples of one object (several lights, several edits) are not independent, so a *cluster* bootstrap draws objects with
+replacement and takes all samples of each; the estimate stays the plain mean over samples. Everything is seeded: the
+same records give the same interval on every machine.
+
+"A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
+"""
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+
+CONFIDENCE = 0.95
+RESAMPLES = 2000
+SEED = 0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean with its bootstrap interval.
+
+    `low` and `high` are NaN where no interval exists: fewer than two clusters, or an infinite value among them.
+    """
+
+    mean: float
+    low: float
+    high: float
+    n: int  # samples
+    clusters: int  # objects
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the interval, NaN where there is none."""
+        return (self.high - self.low) / 2
+
+
+def bootstrap_mean(
+    values: Sequence[float] | Float[np.ndarray, " n"],
+    clusters: Sequence[Hashable] | None = None,
+    *,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+    seed: int = SEED,
+) -> Estimate:
+    """Mean and percentile interval.
+
+    Args:
+        values: one per sample; inf allowed (then there is no interval), NaN not.
+        clusters: what each sample belongs to, e.g. its object; None = every sample for itself.
+        confidence: share of the interval.
+        resamples: bootstrap draws.
+        seed: of the draws.
+
+    Raises:
+        UnirenderError: if there are no values, a value is NaN, or lengths differ.
+    """
+    x = np.asarray(values, dtype=np.float64)
+    if x.ndim != 1 or x.size == 0 or np.isnan(x).any():
+        raise UnirenderError(f"bootstrap: got {x.size} values of shape {x.shape}, expected at least one and no NaN")
+    labels = list(range(x.size)) if clusters is None else list(clusters)
+    if len(labels) != x.size:
+        raise UnirenderError(f"bootstrap: got {x.size} values and {len(labels)} cluster labels, expected as many")
+    members: dict[Hashable, int] = {}
+    index = np.array([members.setdefault(label, len(members)) for label in labels])
+    count = len(members)
+    mean = float(x.mean())
+    if count < 2 or not np.isfinite(x).all():
+        return Estimate(mean, math.nan, math.nan, x.size, count)
+    sums, sizes = np.bincount(index, weights=x), np.bincount(index)
+    draws = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
+    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Estimate(mean, float(low), float(high), x.size, count)
+
+
+def paired_difference(
+    a: Mapping[str, float],
+    b: Mapping[str, float],
+    clusters: Mapping[str, Hashable] | None = None,
+    *,
+    confidence: float = CONFIDENCE,
+    resamples: int = RESAMPLES,
+    seed: int = SEED,
+) -> Estimate:
+    """Mean of a - b over the samples that both have, with its paired bootstrap interval.
+
+    Args:
+        a: sample -> value.
+        b: sample -> value.
+        clusters: sample -> what is drawn, e.g. its object; None = every sample for itself.
+        confidence: share of the interval.
+        resamples: bootstrap draws.
+        seed: of the draws.
+
+    Raises:
+        UnirenderError: if the two share no sample, or a difference is not finite (two identical images: inf - inf).
+    """
+    common = sorted(a.keys() & b.keys())
+    if not common:
+        raise UnirenderError(f"paired test: the methods share no sample ({len(a)} and {len(b)} of their own)")
+    pairs = np.array([(a[sample], b[sample]) for sample in common])
+    with np.errstate(invalid="ignore"):  # inf - inf: refused below, by name
+        differences = pairs[:, 0] - pairs[:, 1]
+    if not np.isfinite(differences).all():
+        bad = [sample for sample, d in zip(common, differences, strict=True) if not math.isfinite(d)]
+        raise UnirenderError(
+            f"paired test: the difference on {bad[0]!r} (and {len(bad) - 1} more) is not finite: an identical image "
+            "has an infinite PSNR; compare the MSE"
+        )
+    labels = None if clusters is None else [clusters[sample] for sample in common]
+    return bootstrap_mean(differences, labels, confidence=confidence, resamples=resamples, seed=seed)
+
+
+def beats(
+    a: Mapping[str, float],
+    b: Mapping[str, float],
+    *,
+    higher_is_better: bool,
+    clusters: Mapping[str, Hashable] | None = None,
+) -> bool:
+    """Whether a beats b: the paired 95 % interval excludes 0 on the better side.
+
+    Without an interval (fewer than two objects in common) nothing beats anything.
+    """
+    difference = paired_difference(a, b, clusters)
+    return difference.low > 0 if higher_is_better else difference.high < 0

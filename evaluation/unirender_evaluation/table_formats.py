@@ -1,0 +1,234 @@
+"""Tables as Markdown, LaTeX, JSON and terminal text.
+
+In every format: best in bold, second underlined (on rounded values), "-" where a value does not exist, "n/a" where it
+could not be computed here, ± half of the bootstrap interval, a dagger on a published value that a trivial row beats,
+the watermark of a partial run, and the protocol below.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Sequence
+from itertools import groupby
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from unirender_evaluation.protocol import protocol_text
+from unirender_evaluation.specs import Column
+from unirender_evaluation.statistics import Estimate
+from unirender_evaluation.tables import Cell, Row, Table
+
+MISSING, NOT_AVAILABLE = "-", "n/a"
+
+
+def format_number(value: float, decimals: int) -> str:
+    """Fixed decimals; infinity as a symbol."""
+    return f"{value:.{decimals}f}" if math.isfinite(value) else ("∞" if value > 0 else "-∞")
+
+
+def format_estimate(estimate: Estimate, decimals: int) -> tuple[str, str]:
+    """(mean, "± half width"); the second is empty where there is no interval."""
+    spread = "" if math.isnan(estimate.half_width) else f"± {format_number(estimate.half_width, decimals)}"
+    return format_number(estimate.mean, decimals), spread
+
+
+def header(column: Column) -> str:
+    """Metric with its unit and direction."""
+    unit = f" ({column.metric.unit})" if column.metric.unit else ""
+    return f"{column.metric.label}{unit} {column.metric.arrow}"
+
+
+def row_label(row: Row, table: Table) -> str:
+    """Label with n where it differs from the table's, and "stored" where nothing ran."""
+    subset = f" (n = {row.n})" if row.info is not None and 0 < row.n < table.n else ""
+    return row.label + subset + (" (stored)" if row.stored else "")
+
+
+def measured_text(cell: Cell) -> str:
+    """What stands in place of a number."""
+    return NOT_AVAILABLE if cell.unavailable else MISSING
+
+
+def to_markdown(table: Table) -> str:
+    """GitHub-flavoured Markdown; columns that carry published values are doubled: "paper", then measured."""
+    titles, marks = ["Method"], [":--"]
+    for column, doubled in zip(table.columns, table.published_columns, strict=True):
+        name = f"{column.group} {header(column)}"
+        titles += [f"{name}, paper", f"{name}, here"] if doubled else [name]
+        marks += ["--:", "--:"] if doubled else ["--:"]
+    lines = [f"### {table.heading}", ""]
+    lines += [f"> **{table.watermark}**", ""] if table.watermark else []
+    lines += [_pipe(titles), _pipe(marks)]
+    for row in table.rows:
+        texts = [row_label(row, table)]
+        for column, cell, doubled in zip(table.columns, row.cells, table.published_columns, strict=True):
+            digits = column.metric.decimals
+            if doubled:
+                published = MISSING if cell.published is None else format_number(cell.published, digits)
+                texts.append(_markdown_rank(published, cell.published_rank) + ("†" if cell.dagger else ""))
+            if cell.measured is None:
+                texts.append(measured_text(cell))
+            else:
+                mean, spread = format_estimate(cell.measured, digits)
+                texts.append(f"{_markdown_rank(mean, cell.measured_rank)} {spread}".strip())
+        lines.append(_pipe(texts))
+    lines += ["", f"Protocol: {protocol_text(table.protocol)}."]
+    lines += [line for note in table.notes for line in ("", note)]
+    return "\n".join(lines) + "\n"
+
+
+def to_latex(table: Table) -> str:
+    """A booktabs `table*` in the paper's layout; needs packages booktabs, graphicx and (for ↑ and †) nothing else."""
+    groups = [(name, list(columns)) for name, columns in groupby(table.columns, key=lambda column: column.group)]
+    doubled = dict(zip(map(id, table.columns), table.published_columns, strict=True))
+    spans = [sum(1 + doubled[id(column)] for column in columns) for _, columns in groups]
+    top, rules, start = [""], [], 2
+    for (name, _), span in zip(groups, spans, strict=True):
+        top.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex(name)}}}")
+        rules.append(rf"\cmidrule(lr){{{start}-{start + span - 1}}}")
+        start += span
+    second = ["Method"]
+    for column in table.columns:
+        name = _tex(column.metric.label) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
+        second += [f"{name} paper", "here"] if doubled[id(column)] else [name]
+    lines = [
+        r"\begin{table*}[t]",
+        r"\centering",
+        rf"\caption{{\textbf{{{_tex(table.heading)}.}} {_tex_caption(table)}}}",
+    ]
+    lines += [r"\resizebox{\textwidth}{!}{%", rf"\begin{{tabular}}{{l{'c' * sum(spans)}}}", r"\toprule"]
+    lines += [_tex_row(top), "".join(rules), _tex_row(second)]
+    for _, rows in groupby(table.rows, key=lambda row: row.section):
+        lines += [r"\midrule", *(_tex_row(_latex_cells(row, table)) for row in rows)]
+    lines += [
+        r"\bottomrule",
+        r"\end{tabular}}",
+        rf"\label{{tab:{table.name}-{table.protocol_key}-{table.variant.mask}}}",
+    ]
+    return "\n".join([*lines, r"\end{table*}"]) + "\n"
+
+
+def to_json(tables: Iterable[Table]) -> str:
+    """Strict JSON of whole tables; NaN (no interval) becomes null, infinity the string "inf"."""
+    return json.dumps([_plain(table) for table in tables], indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Prints a table to a terminal, split by column groups where it is too narrow."""
+    if table.watermark:
+        console.print(f"[bold red]{escape(table.watermark)}[/]")
+    groups = [[i for i, _ in items] for _, items in groupby(enumerate(table.columns), key=lambda item: item[1].group)]
+    blocks = [[i for group in groups for i in group]]
+    if _rich_width(console, _rich_table(table, blocks[0], console.width)) > console.width:
+        blocks = groups
+    for number, indices in enumerate(blocks):
+        rich_table = _rich_table(table, indices, console.width)
+        rich_table.title = escape(table.heading) if number == 0 else None
+        console.print(rich_table)
+    console.print(f"[dim]{escape(protocol_text(table.protocol))}[/]", highlight=False)
+    for note in table.notes:
+        console.print(f"[dim]{escape(note)}[/]", highlight=False)
+
+
+def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
+    rich_table = RichTable(box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    rich_table.add_column("Method", no_wrap=False, min_width=min(26, width // 3))
+    for i in indices:
+        column, name = table.columns[i], f"{table.columns[i].group}\n{header(table.columns[i])}"
+        if table.published_columns[i]:
+            rich_table.add_column(f"{column.group}\npaper", justify="right", style="dim", no_wrap=True)
+        rich_table.add_column(name, justify="right", no_wrap=True)
+    section = None
+    for row in table.rows:
+        if section is not None and row.section != section:
+            rich_table.add_section()
+        section = row.section
+        texts = [escape(row_label(row, table))]
+        for i in indices:
+            cell, digits = row.cells[i], table.columns[i].metric.decimals
+            if table.published_columns[i]:
+                published = MISSING if cell.published is None else format_number(cell.published, digits)
+                texts.append(_rich_rank(published, cell.published_rank) + ("†" if cell.dagger else ""))
+            if cell.measured is None:
+                texts.append(measured_text(cell))
+            else:
+                mean, spread = format_estimate(cell.measured, digits)
+                texts.append(
+                    f"{_rich_rank(mean, cell.measured_rank)} [dim]{spread.replace(' ', '')}[/]" if spread else mean
+                )
+        rich_table.add_row(*texts)
+    return rich_table
+
+
+def _rich_width(console: Console, rich_table: RichTable) -> int:
+    return console.measure(rich_table, options=console.options.update(max_width=10_000)).maximum
+
+
+def _rich_rank(text: str, rank: int | None) -> str:
+    return {1: f"[bold]{text}[/]", 2: f"[underline]{text}[/]"}.get(rank or 0, text)
+
+
+def _markdown_rank(text: str, rank: int | None) -> str:
+    return {1: f"**{text}**", 2: f"<u>{text}</u>"}.get(rank or 0, text)
+
+
+def _pipe(texts: Iterable[str]) -> str:
+    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
+
+
+def _latex_cells(row: Row, table: Table) -> list[str]:
+    texts = [_tex(row_label(row, table))]
+    for column, cell, doubled in zip(table.columns, row.cells, table.published_columns, strict=True):
+        digits = column.metric.decimals
+        if doubled:
+            published = MISSING if cell.published is None else _tex_number(format_number(cell.published, digits))
+            texts.append(_tex_rank(published, cell.published_rank) + (r"$^\dagger$" if cell.dagger else ""))
+        if cell.measured is None:
+            texts.append(measured_text(cell))
+        else:
+            mean, spread = (_tex_number(text) for text in format_estimate(cell.measured, digits))
+            small = rf" {{\scriptsize {spread}}}" if spread else ""
+            texts.append(_tex_rank(mean, cell.measured_rank) + small)
+    return texts
+
+
+def _tex_caption(table: Table) -> str:
+    watermark = rf"\textbf{{{_tex(table.watermark)}.}} " if table.watermark else ""
+    return watermark + " ".join(_tex(text) for text in (f"{protocol_text(table.protocol)}.", *table.notes))
+
+
+def _tex_rank(text: str, rank: int | None) -> str:
+    return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(rank or 0, text)
+
+
+def _tex_number(text: str) -> str:
+    return text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
+
+
+def _tex(text: str) -> str:
+    for old, new in (("\\", r"\textbackslash "), ("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("#", r"\#"), ("$", r"\$")):
+        text = text.replace(old, new)
+    symbols = (("†", r"$^\dagger$"), ("·", r"$\cdot$"), ("±", r"$\pm$"))
+    for old, new in symbols:
+        text = text.replace(old, new)
+    return text
+
+
+def _tex_row(texts: Iterable[str]) -> str:
+    return " & ".join(texts) + r" \\"
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else "inf" if value > 0 else "-inf"
+    return value

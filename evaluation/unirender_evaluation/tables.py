@@ -1,0 +1,250 @@
+"""Tables: from per-sample records to rows with the published value beside the measured one.
+
+The paper's three tables keep its rows, columns and order; a system that does not run here shows its published value
+and "-" for the measured one. Each protocol is a table of its own: only the paper's protocol carries published values,
+so that "given" inputs can never stand beside them. Nothing is printed without its protocol (`Table.protocol`).
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.comparisons import Selection, values_of
+from unirender_evaluation.metrics import DEFAULT_VARIANT, Metric, Variant
+from unirender_evaluation.protocol import protocol_line
+from unirender_evaluation.published import PublishedRow, published_tables
+from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
+from unirender_evaluation.statistics import Estimate, bootstrap_mean
+
+RANKED_KINDS = ("ours", "paper", "baseline", "external", "trivial")  # bounds are no competitors
+KIND_ORDER = ("ours", "paper", "external", "baseline", "trivial", "ceiling", "reference")
+SECTIONS = {
+    "data-driven": "Data-driven methods",
+    "optimisation": "Optimisation",
+    "ours": "Ours",
+    "paper": "Other systems",
+    "external": "Other systems",
+    "baseline": "Closed form",
+    "trivial": "Trivial",
+    "ceiling": "Bounds",
+    "reference": "Bounds",
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: the published value and the measured estimate, either may be missing."""
+
+    published: float | None = None
+    measured: Estimate | None = None
+    unavailable: bool = False  # the metric could not be computed here: "n/a" instead of "-"
+    published_rank: int | None = None  # 1 = best, 2 = second, on rounded values
+    measured_rank: int | None = None
+    dagger: bool = False  # published value worse than the best trivial row
+
+
+@dataclass(frozen=True)
+class Row:
+    """One system."""
+
+    key: str
+    label: str
+    kind: str
+    section: str
+    cells: tuple[Cell, ...]
+    info: MethodInfo | None = None  # None = published only
+    n: int = 0  # samples behind the measured cells
+    stored: str | None = None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A finished table; `table_formats` renders it."""
+
+    name: str
+    title: str
+    protocol_key: str
+    protocol_label: str
+    subset: str
+    variant: Variant
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+    protocol: tuple[tuple[str, str], ...]  # (what, value): printed with the table
+    notes: tuple[str, ...] = ()
+    watermark: str | None = None
+    n: int = 0
+
+    @property
+    def published_columns(self) -> tuple[bool, ...]:
+        """For each column, whether any row has a published value."""
+        return tuple(any(row.cells[i].published is not None for row in self.rows) for i in range(len(self.columns)))
+
+    @property
+    def heading(self) -> str:
+        suffix = "" if self.subset == "main" else f", {self.subset}"
+        return f"{self.title}: {self.protocol_label} ({self.variant.mask}{suffix})"
+
+
+def build_table(
+    spec: TableSpec,
+    records: Sequence[Record],
+    run: RunInfo,
+    *,
+    protocol: str,
+    variant: Variant = DEFAULT_VARIANT,
+    subset: str = "main",
+) -> Table:
+    """Aggregates records to one table.
+
+    Args:
+        spec: columns and title.
+        records: of any table; those of this table, protocol and subset are used.
+        run: the rows' descriptions and the protocol.
+        protocol: key of `PROTOCOLS`. Published values appear only where it carries them and the frame is whole.
+        variant: how numbers are taken, where a column does not pin it.
+        subset: population.
+
+    Raises:
+        UnirenderError: if the protocol is not one of the table's, or a record's method is not described in `run`.
+    """
+    if protocol not in spec.protocols:
+        raise UnirenderError(f"table {spec.name!r}: got protocol {protocol!r}, expected one of {spec.protocols}")
+    declared = PROTOCOLS[protocol]
+    chosen = Selection(spec.name, protocol, subset).of(records)
+    methods = [run.method(key) for key in dict.fromkeys(record.method for record in chosen)]
+    show_published = declared.published and variant.mask == "whole" and subset == "main"
+    spec = _answered(spec, chosen, show_published)
+    measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
+    rows = _merge(published_tables().get(spec.name, ()) if show_published else (), spec, measured)
+    total = max((row.n for row in rows), default=0)
+    rows = _rank(spec, rows, total)
+    return Table(
+        name=spec.name,
+        title=spec.title,
+        protocol_key=protocol,
+        protocol_label=declared.label,
+        subset=subset,
+        variant=variant,
+        columns=spec.columns,
+        rows=tuple(rows),
+        protocol=protocol_line(declared, variant, run, methods, chosen, show_published),
+        notes=_notes(spec, rows, total),
+        watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
+        n=total,
+    )
+
+
+def build_tables(
+    records: Sequence[Record],
+    run: RunInfo,
+    specs: Mapping[str, TableSpec] | None = None,
+    variants: Sequence[Variant] = (Variant("whole"), Variant("masked")),
+) -> list[Table]:
+    """Every table, protocol and subset that has records; the paper's protocol in each variant, the others masked.
+
+    Whole frame is for the column beside the paper's; masked is what we believe.
+    """
+    tables = []
+    for spec in (TABLES if specs is None else specs).values():
+        for protocol in spec.protocols:
+            found = [record for record in records if record.table == spec.name and record.protocol == protocol]
+            for subset in dict.fromkeys(["main", *(record.subset for record in found)]):
+                if not any(record.subset == subset for record in found):
+                    continue
+                carries = PROTOCOLS[protocol].published and subset == "main"
+                for variant in variants if carries else [v for v in variants if v.mask == "masked"] or variants[:1]:
+                    tables.append(build_table(spec, records, run, protocol=protocol, variant=variant, subset=subset))
+    return tables
+
+
+def _answered(spec: TableSpec, records: Sequence[Record], show_published: bool) -> TableSpec:
+    """The table without columns whose quantity nobody was asked for under this protocol."""
+    asked = {key.partition(".")[0] for record in records for key in record.values}
+    kept = [column for column in spec.columns if column.quantity in asked or (show_published and column.published)]
+    return dataclasses.replace(spec, columns=tuple(kept))
+
+
+def _measured_row(spec: TableSpec, records: Sequence[Record], run: RunInfo, info: MethodInfo, variant: Variant) -> Row:
+    objects = {record.sample: record.object for record in records}
+    answered = {key.partition(".")[0] for record in records if record.method == info.key for key in record.values}
+    cells, n = [], 0
+    for column in spec.columns:
+        values = values_of(records, info.key, column.key(variant))
+        backbone = column.metric.name.removeprefix("lpips_")
+        missing = column.metric.name.startswith("lpips_") and backbone not in run.lpips
+        if values:
+            estimate = bootstrap_mean(list(values.values()), [objects[sample] for sample in values])
+            cells.append(Cell(measured=estimate))
+            n = max(n, estimate.n)
+        else:
+            cells.append(Cell(unavailable=missing and column.quantity in answered))
+    return Row(info.key, info.label, info.kind, SECTIONS[info.kind], tuple(cells), info, n, info.stored)
+
+
+def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping[str, Row]) -> list[Row]:
+    """The paper's rows in its order, a measured row in the place of its namesake, then the remaining measured rows."""
+    rows, left = [], dict(measured)
+    for entry in published:
+        values = [entry.values.get(column.published_key) if column.published else None for column in spec.columns]
+        namesakes = [row for row in left.values() if row.info and entry.is_called(row.info.published)]
+        section = SECTIONS[entry.group]
+        if not namesakes:
+            cells = tuple(Cell(published=value) for value in values)
+            rows.append(Row(f"published:{entry.name}", entry.name, "paper", section, cells))
+        for position, row in enumerate(namesakes):
+            pairs = zip(row.cells, values, strict=True)
+            cells = tuple(dataclasses.replace(c, published=v) if position == 0 else c for c, v in pairs)
+            label = f"{row.label} [{entry.name}]" if position == 0 and row.label != entry.name else row.label
+            rows.append(dataclasses.replace(row, cells=cells, label=label, section=section))
+            del left[row.key]
+    return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))
+
+
+def _rank(spec: TableSpec, rows: Sequence[Row], total: int) -> list[Row]:
+    """Ranks 1 and 2 per column on rounded values; rows on fewer samples than the table's n are not ranked."""
+    ranked = [list(row.cells) for row in rows]
+    for i, column in enumerate(spec.columns):
+        cells = [row.cells[i] for row in rows]
+        published = {r: cell.published for r, cell in enumerate(cells) if cell.published is not None}
+        means = {r: cell.measured.mean for r, cell in enumerate(cells) if cell.measured is not None}
+        competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and rows[r].n == total}
+        published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
+        trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
+        grid = column.uniform_grid  # comparable only where the suite's materials are distributed like the paper's
+        trivial = [mean for mean in trivial if grid is not None and abs(mean - grid) <= GRID_TOLERANCE]
+        for r, cell in enumerate(cells):
+            ranked[r][i] = dataclasses.replace(
+                cell,
+                published_rank=published_ranks.get(r),
+                measured_rank=measured_ranks.get(r),
+                dagger=r in published and any(column.metric.better(mean, published[r]) for mean in trivial),
+            )
+    return [dataclasses.replace(row, cells=tuple(cells)) for row, cells in zip(rows, ranked, strict=True)]
+
+
+def _ranks(values: Mapping[int, float], metric: Metric) -> dict[int, int]:
+    """Row -> 1 or 2, ties share a rank; nothing to rank with fewer than two rows."""
+    if len(values) < 2:
+        return {}
+    rounded = {r: round(value, metric.decimals) for r, value in values.items()}
+    order = sorted(set(rounded.values()), reverse=metric.higher_is_better)
+    return {r: order.index(value) + 1 for r, value in rounded.items() if value in order[:2]}
+
+
+def _notes(spec: TableSpec, rows: Iterable[Row], total: int) -> tuple[str, ...]:
+    rows = list(rows)
+    notes = [spec.description] if spec.description else []
+    notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
+    fewer = [f"{row.label} (n = {row.n})" for row in rows if row.info is not None and 0 < row.n < total]
+    if fewer:
+        notes.append(f"Measured on a fixed subset and not ranked: {'; '.join(fewer)}.")
+    if any(cell.dagger for row in rows for cell in row.cells):
+        notes.append(
+            "† The published value is worse than the constant 0.5, measured on materials distributed as in the paper."
+        )
+    if any(cell.unavailable for row in rows for cell in row.cells):
+        notes.append("n/a: the LPIPS backbone's weights are not on this machine (unirender_evaluation.lpips_convert).")
+    stored = [f"{row.label}: stored, not measured in this run ({row.stored})" for row in rows if row.stored]
+    return tuple(notes + stored)

@@ -1,0 +1,193 @@
+"""The questions that a suite asks: for every table and protocol its samples, what a method is given, and the truth to
+score against.
+
+    table       protocol          given                                   asked
+    rendering   from-image        picture (m .5, r .5), new material      the edited picture (the paper's protocol)
+    rendering   given             true maps, true s and d of the target   the picture
+    rendering   given-light       true maps, true light; no s, no d       the picture
+    inverse     single-image      picture                                 maps
+    relighting  from-image-sd     picture, s and d under another light    s, d of its own light; the relit picture
+                                                                          (the paper's protocol)
+    relighting  from-image-hdri   picture, another light                  the relit picture
+
+A picture is what a camera would store: 8-bit sRGB. No other truth reaches a method; the mask and the camera are inputs
+everywhere.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.methods import Image, Mask, quantise
+from unirender_evaluation.suites import Material, Scene, Suite, material_key
+
+Capability = Literal["decompose", "edit", "relight", "render"]
+PROTOCOLS: tuple[tuple[str, str], ...] = (
+    ("rendering", "from-image"),
+    ("rendering", "given"),
+    ("rendering", "given-light"),
+    ("inverse", "single-image"),
+    ("relighting", "from-image-sd"),
+    ("relighting", "from-image-hdri"),
+)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One question: its identity, what the method is handed (`inputs`), and what the scorer keeps (`truth_*`).
+
+    `folder` and `answer` name the file of a predictions folder that answers it: `<folder>/<answer>.exr` or `.png`; for
+    maps `<folder>/intrinsics.exr` or one PNG per map.
+    """
+
+    table: str
+    protocol: str
+    sample: str
+    scene: Scene
+    asks: tuple[Capability, ...]
+    folder: str
+    answer: str
+    mask: Mask
+    inputs: dict[str, dict[str, Any]] = field(repr=False)  # by capability
+    truth_image: Image | None = field(default=None, repr=False)
+    truth_variance: Image | None = field(default=None, repr=False)
+    truth_maps: Intrinsics | None = field(default=None, repr=False)
+    quantity: str = "relit"
+
+    @property
+    def identity(self) -> str:
+        return f"{self.table}/{self.protocol}/{self.sample}"
+
+
+def edit_quantity(base: Material, target: Material) -> str:
+    """Which column an edit belongs to."""
+    if base[0] != target[0] and base[1] != target[1]:
+        raise UnirenderError(f"edit {base} -> {target} changes metallic and roughness at once: expected one of them")
+    return "edit_metallic" if base[0] != target[0] else "edit_roughness"
+
+
+def picture(suite: Suite, scene: Scene, material: Material) -> dict[str, Any]:
+    """What a method sees of an image: 8-bit display values, mask, camera."""
+    return {
+        "image_srgb": quantise(suite.image(scene, material), suite.mask(scene)),
+        "mask": suite.mask(scene),
+        "camera": suite.spec.camera,
+    }
+
+
+def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
+    """The scenes of a run; a limited run takes them evenly spaced."""
+    scenes = list(suite.scenes)
+    if limit is None or limit >= len(scenes):
+        return scenes
+    if limit < 1:
+        raise UnirenderError(f"limit: got {limit}, expected at least 1 scene")
+    return [scenes[i] for i in np.linspace(0, len(scenes) - 1, limit).round().astype(int)]
+
+
+def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Iterator[Task]:
+    """All questions of one protocol, scene by scene, truth included."""
+    makers = {
+        ("rendering", "from-image"): _edits,
+        ("rendering", "given"): _renders,
+        ("rendering", "given-light"): _renders,
+        ("inverse", "single-image"): _inverse,
+        ("relighting", "from-image-sd"): _relights,
+        ("relighting", "from-image-hdri"): _relights,
+    }
+    if (table, protocol) not in makers:
+        raise UnirenderError(
+            f"no protocol {table}/{protocol}: expected one of {', '.join('/'.join(p) for p in PROTOCOLS)}"
+        )
+    for scene in scenes:
+        yield from makers[table, protocol](suite, scene, protocol)
+
+
+def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    base = suite.spec.base
+    seen = picture(suite, scene, base)
+    for target in suite.spec.edits:
+        change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
+        yield Task(
+            table="rendering",
+            protocol=protocol,
+            sample=f"{scene.key}_{material_key(target)}",
+            scene=scene,
+            asks=("edit",),
+            folder=f"{scene.key}_{material_key(base)}",
+            answer=f"edit_{material_key(target)}",
+            mask=suite.mask(scene),
+            inputs={"edit": {**seen, **change}},
+            truth_image=suite.image(scene, target),
+            truth_variance=suite.image_variance(scene, target),
+            quantity=edit_quantity(base, target),
+        )
+
+
+def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    for target in suite.spec.edits:
+        maps = suite.intrinsics(scene, target)
+        maps = maps.replace(environment=None) if protocol == "given" else maps.replace(specular=None, diffuse=None)
+        yield Task(
+            table="rendering",
+            protocol=protocol,
+            sample=f"{scene.key}_{material_key(target)}",
+            scene=scene,
+            asks=("render",),
+            folder=f"{scene.key}_{material_key(target)}",
+            answer=f"render_{protocol}",
+            mask=suite.mask(scene),
+            inputs={"render": {"intrinsics": maps}},
+            truth_image=suite.image(scene, target),
+            truth_variance=suite.image_variance(scene, target),
+            quantity=edit_quantity(suite.spec.base, target),
+        )
+
+
+def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    for material in scene.materials:
+        sample = f"{scene.key}_{material_key(material)}"
+        yield Task(
+            table="inverse",
+            protocol=protocol,
+            sample=sample,
+            scene=scene,
+            asks=("decompose",),
+            folder=sample,
+            answer="intrinsics",
+            mask=suite.mask(scene),
+            inputs={"decompose": picture(suite, scene, material)},
+            truth_maps=suite.intrinsics(scene, material).replace(specular=None, diffuse=None, environment=None),
+        )
+
+
+def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    base, target = suite.spec.base, suite.other_light(scene)
+    seen = picture(suite, scene, base)
+    given_sd = protocol == "from-image-sd"
+    lit = suite.intrinsics(target, base)
+    light: dict[str, Float[np.ndarray, "h w 3"] | None]
+    light = {"specular": lit.specular, "diffuse": lit.diffuse} if given_sd else {"environment": lit.environment}
+    own = suite.intrinsics(scene, base)
+    yield Task(
+        table="relighting",
+        protocol=protocol,
+        sample=f"{scene.key}_to_{target.key.rsplit('_', 1)[1]}",
+        scene=scene,
+        asks=("relight", "decompose") if given_sd else ("relight",),
+        folder=f"{scene.key}_{material_key(base)}",
+        answer=f"relight_{target.key.rsplit('_', 1)[1]}_{'sd' if given_sd else 'hdri'}",
+        mask=suite.mask(scene),
+        inputs={"relight": {**seen, **light}, "decompose": seen},
+        truth_image=suite.image(target, base),
+        truth_variance=suite.image_variance(target, base),
+        truth_maps=Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
+        if given_sd
+        else None,
+        quantity="relit",
+    )

@@ -1,0 +1,90 @@
+"""Measures the constants of the trivial rows on training data, once: `python -m
+unirender_evaluation.training_statistics DATA`.
+
+The trivial rows must know what a lazy method would know: the mean of the training distribution, never of a suite.
+Written to `data/training_statistics.toml`, which states where the numbers come from.
+"""
+
+import json
+import sys
+import tarfile
+from collections.abc import Iterator
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unirender.color import image_srgb
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, read_exr_bytes
+
+FILE = "data/training_statistics.toml"
+
+
+@cache
+def training_statistics() -> dict[str, Any]:
+    """`albedo_srgb` (display values), `normal` (unit, camera axes) and `provenance`."""
+    import tomllib
+
+    return tomllib.loads((resources.files("unirender_evaluation") / FILE).read_text(encoding="utf-8"))
+
+
+def object_means(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Coverage-weighted means of (albedo as display values, normal) of every group of a dataset folder."""
+    for shard in sorted(folder.glob("shard-*.tar")):
+        with tarfile.open(shard) as tar:
+            for member in tar.getmembers():
+                stream = tar.extractfile(member) if member.name.endswith(".shared.exr") else None
+                if stream is None:
+                    continue
+                channels = read_exr_bytes(stream.read())[0]
+                weight = channels.get("mask.Y", channels.get("A"))
+                if weight is None:
+                    raise UnirenderError(
+                        f"{shard}: {member.name} has no mask, expected a dataset of `unirender dataset`"
+                    )
+                weight = weight[..., None] / weight.sum()
+                albedo = image_srgb(channels_rgb(channels, "albedo"))
+                yield (albedo * weight).sum((0, 1)), (channels_rgb(channels, "normal", "XYZ") * weight).sum((0, 1))
+
+
+def write_statistics(folder: Path, path: Path) -> str:
+    """Measures a dataset folder and writes the TOML file; returns its text."""
+    means = list(object_means(folder))
+    if not means:
+        raise UnirenderError(
+            f"{folder}: no shard-*.tar with groups, expected the folder that `unirender dataset` wrote"
+        )
+    albedo, normal = (np.mean([pair[i] for pair in means], axis=0) for i in (0, 1))
+    normal = normal / np.linalg.norm(normal)
+    config = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["config"]
+    numbers = {"albedo_srgb": albedo, "normal": normal}
+    lines = [f"{name} = [{', '.join(f'{x:.4f}' for x in value)}]" for name, value in numbers.items()]
+    provenance = (
+        f"mean over {len(means)} training groups (split {config['split']}, seed {config['seed']}, "
+        f"{config['resolution']} px) "
+        "of each group's coverage-weighted mean; albedo as sRGB display values; the normal's mean, normalised"
+    )
+    text = (
+        "\n".join(
+            [
+                "# Written by `python -m unirender_evaluation.training_statistics DATA`.",
+                *lines,
+                f'provenance = "{provenance}"',
+            ]
+        )
+        + "\n"
+    )
+    path.write_text(text, encoding="utf-8")
+    return text
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m unirender_evaluation.training_statistics DATA")
+    try:
+        sys.stdout.write(write_statistics(Path(sys.argv[1]), Path(str(resources.files("unirender_evaluation") / FILE))))
+    except UnirenderError as error:
+        sys.exit(str(error))

@@ -1,0 +1,98 @@
+"""Runs a suite's scenes one by one, here or in worker processes that each build the rows for themselves."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from unirender_evaluation.bounds import ceiling_jobs
+from unirender_evaluation.engine import Job, content_key, method_jobs
+from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
+from unirender_evaluation.pictures import Pictures
+from unirender_evaluation.records import MethodInfo, Record
+from unirender_evaluation.rows import Row
+from unirender_evaluation.suites import Scene, Suite, load_suite
+
+
+@dataclass
+class Run:
+    """What one process needs to work on scenes: `rows` may load models, each process its own.
+
+    Attributes:
+        suite: the suite.
+        rows: the rows.
+        scenes: of the whole run.
+        version: of the code and of what it depends on; part of every content key.
+        backbones: LPIPS backbones.
+        pictures: folder of the gallery's predictions.
+    """
+
+    suite: Suite
+    rows: Sequence[Row]
+    scenes: list[Scene]
+    version: str
+    backbones: tuple[str, ...]
+    pictures: Path
+
+    def jobs(self, scene: Scene) -> Iterator[Job]:
+        """Every record that the run wants of one scene."""
+
+        def key_of(what: str, info: MethodInfo) -> str:
+            return content_key(self.suite, scene, what, info.config, self.version)
+
+        keeper = Pictures(self.pictures, self.suite, self.scenes)
+        yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.version, self.backbones, keeper)
+        yield from ceiling_jobs(self.suite, scene, key_of)
+        if scene in physics_scenes(self.suite, self.scenes):
+            yield from physics_jobs(self.suite, scene, self.rows, key_of)
+
+
+_here: tuple[Run, frozenset[str]] | None = None
+
+
+def _start(
+    build: Callable[[], Sequence[Row]],
+    suite: Path,
+    scenes: list[str],
+    version: str,
+    backbones: tuple[str, ...],
+    pictures: Path,
+    known: frozenset[str],
+) -> None:
+    import torch
+
+    global _here
+    torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
+    loaded = load_suite(suite)
+    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], version, backbones, pictures)
+    _here = run, known
+
+
+def _scene(key: str) -> list[Record]:
+    assert _here is not None, "the pool's initializer sets it"
+    run, known = _here
+    return [job.make() for job in run.jobs(run.suite.scene(key)) if not job.is_done(known.__contains__)]
+
+
+def run_in_workers(
+    run: Run, build: Callable[[], Sequence[Row]], scenes: list[Scene], known: frozenset[str], jobs: int
+) -> Iterator[list[Record]]:
+    """Records of `scenes`, a scene at a time as they come, from `jobs` processes; `build` makes the rows in each."""
+    arguments = (
+        build,
+        run.suite.spec.path,
+        [scene.key for scene in run.scenes],
+        run.version,
+        run.backbones,
+        run.pictures,
+        known,
+    )
+    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, arguments) as pool:
+        futures = [pool.submit(_scene, scene.key) for scene in scenes]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

@@ -1,0 +1,277 @@
+"""Runs: records, resume, the noise ceiling, a folder of predictions against the same method as a plug-in, the
+verdict."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from tiny_suites import make_suite
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, intrinsics_channels, write_exr
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import engine
+from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.engine import Store, content_key
+from unirender_evaluation.export import export_inputs
+from unirender_evaluation.methods import Composite, UneditedInput
+from unirender_evaluation.records import Record, RunInfo, read_records
+from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.verdict import Claim, ceiling_breaches, findings, verdict_text
+from unirender_evaluation.workers import Run, run_in_workers
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("bench"))
+
+
+class Guess:
+    """A deterministic stranger's method with all four capabilities, good at none."""
+
+    name = "guess"
+    config: dict[str, Any] = {"guess": 1}  # noqa: RUF012 - a constant of the test
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        grey = np.broadcast_to(image_srgb.mean(axis=-1, keepdims=True), image_srgb.shape).astype(np.float32)
+        half = ((mask > 0) * 0.25).astype(np.float32)
+        normal = ((mask > 0) * np.array([0, 0, 1])).astype(np.float32)
+        return Intrinsics(
+            albedo=grey,
+            normal=normal,
+            metallic=half,
+            roughness=half,
+            specular=grey,
+            diffuse=grey,
+            mask=mask,
+            camera=camera,
+        )
+
+    def edit(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **_: float) -> np.ndarray:
+        return (0.5 * image_srgb * mask).astype(np.float32)
+
+    def relight(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **_: Any) -> np.ndarray:
+        return (0.7 * image_srgb * mask).astype(np.float32)
+
+    def render(self, intrinsics: Intrinsics) -> np.ndarray:
+        maps = intrinsics.require("albedo", "mask")
+        return (0.4 * maps["albedo"] * maps["mask"]).astype(np.float32)
+
+
+def evaluate(suite: Suite, rows: list[Row], path: Path, stop_after: int | None = None) -> list[Record]:
+    """The engine without Mitsuba and without LPIPS; after `stop_after` records it is killed."""
+    store = Store.open(path)
+    whole = Run(suite, rows, list(suite.scenes), "test", (), path.parent / "pictures" / path.stem)
+    done = 0
+    for scene in suite.scenes:
+        for job in whole.jobs(scene):
+            if job.label.startswith("physics") or job.is_done(store.has):
+                continue
+            store.add(job.make())
+            done += 1
+            if done == stop_after:
+                raise KeyboardInterrupt
+    return store.close()
+
+
+def test_killed_run_resumes_to_the_same_records(suite: Suite, tmp_path: Path) -> None:
+    rows = trivial_rows()
+    whole = evaluate(suite, rows, tmp_path / "whole.jsonl")
+    path = tmp_path / "killed.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(suite, rows, path, stop_after=20)
+    with path.open("a") as stream:
+        stream.write('{"table": "inv')  # torn by the kill
+    asked = []
+    original = engine.answer
+
+    def counting(row: Row, task: Any) -> Any:
+        asked.append(task.identity)
+        return original(row, task)
+
+    engine.answer = counting
+    try:
+        resumed = evaluate(suite, rows, path)
+        first = len(asked)
+        again = evaluate(suite, rows, path)
+    finally:
+        engine.answer = original
+    strip = lambda records: [(r.table, r.protocol, r.method, r.sample, r.values, r.key) for r in records]  # noqa: E731 - one use
+    assert strip(resumed) == strip(whole) == strip(again) == strip(read_records(path))
+    assert first == sum(r.method != "noise-ceiling" for r in whole) - 20
+    assert len(asked) == first, "a third run asks nothing"
+
+
+def test_keys_change_with_what_results_depend_on(suite: Suite) -> None:
+    scene = suite.scenes[0]
+    base = content_key(suite, scene, "inverse/x", {"a": 1}, "code")
+    others = {
+        content_key(suite, suite.scenes[-1], "inverse/x", {"a": 1}, "code"),
+        content_key(suite, scene, "inverse/y", {"a": 1}, "code"),
+        content_key(suite, scene, "inverse/x", {"a": 2}, "code"),
+        content_key(suite, scene, "inverse/x", {"a": 1}, "other"),
+    }
+    assert len({base, *others}) == 5
+    assert base == content_key(suite, scene, "inverse/x", {"a": 1}, "code")
+    assert len(engine.code_version()) == 64
+
+
+def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl"
+    many = evaluate(suite, trivial_rows(), path)
+    few = evaluate(suite, [make_row(UneditedInput(), "trivial")], path)
+    assert {r.method for r in few} == {"unedited-input", "noise-ceiling"}
+    assert len(few) < len(many)
+    assert len(read_records(path)) == len(few)
+
+
+def test_workers_give_the_same_numbers(suite: Suite, tmp_path: Path) -> None:
+    here = evaluate(suite, trivial_rows(), tmp_path / "here.jsonl")
+    whole = Run(suite, (), list(suite.scenes), "test", (), tmp_path / "pictures")
+    made = [r for records in run_in_workers(whole, trivial_rows, [suite.scenes[0]], frozenset(), 1) for r in records]
+    expected = {r.key: r.values for r in here}
+    found = {r.key: r.values for r in made if r.table != "physics"}
+    assert len(found) > 20
+    assert found.items() <= expected.items()
+
+
+def test_ceiling_holds_and_a_leaking_method_is_caught(suite: Suite, tmp_path: Path) -> None:
+    """Honest rows stay below the noise ceiling; a method that returns the noisy truth itself breaches it."""
+    records = evaluate(suite, trivial_rows(), tmp_path / "records.jsonl")
+    # This suite's truth is noise-free composites with a claimed noise: its composite row is as good as a leak.
+    assert ceiling_breaches(records, exempt=("composite",)) == []
+    leaking = []
+    for record in records:
+        if record.method == "noise-ceiling" and record.table == "rendering":
+            values = {key: value + 3 for key, value in record.values.items()}
+            leaking.append(Record(record.table, record.protocol, "leak", record.sample, record.object, values))
+    breaches = ceiling_breaches([*records, *leaking], exempt=("composite",))
+    assert {b.method for b in breaches} == {"leak"}
+    assert all(b.low_db == pytest.approx(3) for b in breaches)
+
+
+def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
+    """A stranger's method, called and read back from EXR files: the same numbers to half-float rounding."""
+    method, folder = Guess(), tmp_path / "guess"
+    for table, protocol in PROTOCOLS:
+        for task in tasks(suite, table, protocol, list(suite.scenes)):
+            target = folder / task.folder
+            target.mkdir(parents=True, exist_ok=True)
+            for capability in task.asks:
+                result = getattr(method, capability)(**task.inputs[capability])
+                if isinstance(result, Intrinsics):
+                    write_exr(target / "intrinsics.exr", intrinsics_channels(result), half=False)
+                else:
+                    write_exr(target / f"{task.answer}.exr", image_channels(result), half=False)
+    called = evaluate(suite, [make_row(method, "external")], tmp_path / "called.jsonl")
+    read = evaluate(suite, prediction_rows({"guess": folder}), tmp_path / "read.jsonl")
+    pick = lambda records: {(r.table, r.protocol, r.sample): dict(r.values) for r in records if r.method == "guess"}  # noqa: E731 - one use
+    assert pick(called) == pick(read)
+    assert len(pick(read)) == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, list(suite.scenes)))
+
+
+def test_png_predictions_and_broken_files(suite: Suite, tmp_path: Path) -> None:
+    from PIL import Image
+
+    task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    folder = tmp_path / "png" / task.folder
+    folder.mkdir(parents=True)
+    truth = suite.intrinsics(task.scene, task.scene.materials[0])
+    levels = np.round((truth.require("normal")["normal"] + 1) / 2 * 255).astype(np.uint8)
+    Image.fromarray(levels).save(folder / "normal.png")
+    Image.fromarray(np.full(task.mask.shape[:2], 51, np.uint8)).save(folder / "roughness.png")
+    row = prediction_rows({"png": tmp_path / "png"})[0]
+    assert row.predictions is not None
+    _, maps = row.predictions.answer(task)
+    assert maps is not None
+    assert set(maps.present) == {"normal", "roughness", "mask"}
+    values = engine.score(task, engine.Prediction(maps=maps), ())
+    assert values["normal.cosine"] > 0.999
+    np.testing.assert_allclose(maps.require("roughness")["roughness"], 0.2, rtol=0, atol=1e-6)
+    Image.fromarray(levels[:16]).save(folder / "albedo.png")
+    with pytest.raises(UnirenderError, match="resample it"):
+        row.predictions.answer(task)
+    (folder / "albedo.png").write_text("no picture")
+    with pytest.raises(UnirenderError, match="not a readable PNG"):
+        row.predictions.answer(task)
+
+
+def test_export_writes_inputs_and_no_truth(suite: Suite, tmp_path: Path) -> None:
+    count = export_inputs(suite, tmp_path / "out")
+    assert count == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, list(suite.scenes)))
+    names = {path.name for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert names == {"image.png", "meta.json", "given.exr", "environment.exr"}
+    for meta in (tmp_path / "out").glob("*/meta.json"):
+        for answer, question in json.loads(meta.read_text())["answers"].items():
+            assert {"table", "protocol"} <= set(question)
+            given = meta.parent / answer / "given.exr"
+            assert given.exists() == (question["protocol"] in ("given", "given-light", "from-image-sd"))
+
+
+def test_limited_rows_run_on_their_subset(suite: Suite, tmp_path: Path) -> None:
+    row = make_row(Composite(), "baseline", scenes=2)
+    records = [
+        r for r in evaluate(suite, [row], tmp_path / "r.jsonl") if r.method == "composite" and r.protocol == "given"
+    ]
+    assert len(records) == 2 * len(suite.spec.edits)
+
+
+def test_verdict_states_claims_and_failures() -> None:
+    def record(method: str, index: int, value: float) -> Record:
+        key = "albedo.psnr@masked-srgb-raw"
+        return Record("inverse", "single-image", method, f"s{index}", f"o{index}", {key: value})
+
+    rng = np.random.default_rng(0)
+    level = rng.uniform(15, 20, 12)
+    records = [record("a", i, x + 2 + rng.uniform(0, 0.5)) for i, x in enumerate(level)]
+    records += [record("b", i, x) for i, x in enumerate(level)]
+    claims = [Claim("inverse", "single-image", "albedo", "psnr", *pair) for pair in (("a", "b"), ("b", "a"))]
+    found = findings(records, [*claims, Claim("inverse", "single-image", "albedo", "psnr", "a", "missing")])
+    assert [f.holds for f in found] == [True, False]
+    assert "HOLDS" in str(found[0])
+    assert "FAILS" in str(found[1])
+    check = {
+        "passed": False,
+        "members": 3,
+        "smallest_pass_share": 0.5,
+        "twin_detected": True,
+        "failed": ["x: z-test FAILED"],
+        "other_objects": ["x"],
+    }
+    text = verdict_text(records, RunInfo("t", "h", 64, (), limit=2), check)
+    assert "FAILS  truth" in text
+    assert "x: z-test FAILED" in text
+    assert "partial run" in text
+
+
+def test_row_groups_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="expected some of ours, trivial, plugins"):
+        build_rows(BenchConfig(methods=("everything",)))
+    with pytest.raises(UnirenderError, match="no checkpoint in"):
+        build_rows(BenchConfig(methods=("ours",), checkpoint=tmp_path))
+
+
+@pytest.mark.slow
+def test_run_end_to_end_and_again(tmp_path: Path) -> None:
+    """One scene of the shipped suite with Mitsuba's truth check; the second run computes nothing."""
+    config = BenchConfig(suite="tiny", out=tmp_path, methods=("trivial",), limit=1, seed=1, check_scenes=1, jobs=0)
+    first = run(config, Console(quiet=True))
+    assert first.truth_check["passed"], first.truth_check
+    assert first.computed == len(first.records) > 0
+    names = {"records.jsonl", "run.json", "truth_check.json", "tables.md", "tables.tex", "tables.json", "verdict.txt"}
+    assert names | {"report.html"} <= {path.name for path in tmp_path.iterdir()}
+    assert "limit 1" in (tmp_path / "tables.md").read_text()
+    assert all(table.watermark for table in first.tables)
+    assert not ceiling_breaches(first.records)
+    methods = {record.method for record in first.records}
+    assert {"noise-ceiling", "reference-other-seed", "shade-true-maps", "true-maps", "composite"} <= methods
+    second = run(config, Console(quiet=True))
+    assert second.computed == 0
+    assert [r.to_json() for r in second.records] == [r.to_json() for r in first.records]
+    assert second.verdict == first.verdict

@@ -1,0 +1,158 @@
+"""The rows that need no network: known values, capabilities, anchoring, plug-ins."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_suites import make_suite
+
+from unirender.camera import Camera
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import methods
+from unirender_evaluation.engine import Prediction, answer, score
+from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import tasks
+from unirender_evaluation.training_statistics import training_statistics
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("methods"))
+
+
+def test_constant_half_scores_the_spread_of_the_materials(suite: Suite) -> None:
+    values: list[float] = []
+    expected: list[float] = []
+    for task in tasks(suite, "inverse", "single-image", list(suite.scenes)):
+        maps = methods.ConstantMaterial().decompose(**task.inputs["decompose"])
+        values.append(score(task, Prediction(maps=maps), ())["metallic.mse@masked"])
+        metallic = float(task.sample.split("_m")[1][:3]) / 100
+        expected.append((metallic - 0.5) ** 2)
+    np.testing.assert_allclose(values, expected, rtol=0, atol=2e-4)  # half floats in the file
+
+
+def test_unedited_input_is_the_input(suite: Suite) -> None:
+    task = next(tasks(suite, "rendering", "from-image", list(suite.scenes)))
+    image = methods.UneditedInput().edit(**task.inputs["edit"])
+    base = suite.image(task.scene, suite.spec.base)
+    np.testing.assert_allclose(image, np.minimum(base, 1), rtol=0, atol=0.01)
+    assert score(task, Prediction(image=image), ())["edit_metallic.psnr@masked-srgb-raw"] < 40
+
+
+def test_composite_is_exact_where_the_truth_is_a_composite(suite: Suite) -> None:
+    """Given s and d: limited by half floats only. Given light: derived s and d are this suite's truth. A wrong albedo
+    is seen."""
+    for protocol in ("given", "given-light"):
+        for task in tasks(suite, "rendering", protocol, list(suite.scenes)[:2]):
+            maps = task.inputs["render"]["intrinsics"]
+            key = f"{task.quantity}.psnr@masked-srgb-raw"
+            good = score(task, Prediction(image=methods.Composite().render(maps)), ())[key]
+            wrong = methods.Composite().render(maps.replace(albedo=0.9 * maps.albedo))
+            assert good > 55
+            assert score(task, Prediction(image=wrong), ())[key] < 45
+
+
+def test_input_as_albedo_and_constants(suite: Suite) -> None:
+    task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    inputs = task.inputs["decompose"]
+    albedo = methods.InputAsAlbedo().decompose(**inputs).require("albedo")["albedo"]
+    np.testing.assert_allclose(albedo, srgb_decode(inputs["image_srgb"]), rtol=0, atol=1e-6)
+    mean = methods.MeanAlbedo().decompose(**inputs).require("albedo")["albedo"]
+    inside = task.mask[..., 0] > 0
+    np.testing.assert_allclose(
+        mean[inside][0], srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32)), rtol=0, atol=1e-6
+    )
+    assert np.all(mean[~inside] == 0)
+    assert "training" in training_statistics()["provenance"]
+
+
+def test_sphere_normal_is_exact_on_a_sphere(suite: Suite) -> None:
+    task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    sphere = score(task, Prediction(maps=methods.SphereNormal().decompose(**task.inputs["decompose"])), ())
+    flat = score(task, Prediction(maps=methods.MeanNormal().decompose(**task.inputs["decompose"])), ())
+    assert sphere["normal.cosine"] > 0.99
+    assert flat["normal.cosine"] < 0.75
+
+
+class TrueMaps:
+    """A decomposition oracle: knows the truth of one scene."""
+
+    name = "truth"
+    config: dict[str, Any] = {"oracle": 1}  # noqa: RUF012 - a constant of the test
+
+    def __init__(self, maps: Intrinsics) -> None:
+        self.maps = maps
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        del image_srgb, mask, camera
+        return self.maps
+
+
+def test_composite_of_a_perfect_decomposition_edits_perfectly(suite: Suite) -> None:
+    """Metallic exactly; roughness by the ratio of lobes, better than leaving the picture alone."""
+    for task in tasks(suite, "rendering", "from-image", [suite.scenes[1]]):
+        oracle = TrueMaps(suite.intrinsics(task.scene, suite.spec.base))
+        key = f"{task.quantity}.psnr@masked-srgb-raw"
+        unedited = score(task, Prediction(image=methods.UneditedInput().edit(**task.inputs["edit"])), ())[key]
+        for anchored in (False, True):
+            image = methods.CompositeOf(oracle, anchored).edit(**task.inputs["edit"])
+            found = score(task, Prediction(image=image), ())[key]
+            assert found > max(unedited + 2, 45 if task.quantity == "edit_metallic" else 0)
+
+
+def test_relighting_with_true_maps(suite: Suite) -> None:
+    for protocol in ("from-image-sd", "from-image-hdri"):
+        task = next(tasks(suite, "relighting", protocol, [suite.scenes[0]]))
+        oracle = TrueMaps(suite.intrinsics(task.scene, suite.spec.base))
+        image = methods.CompositeOf(oracle, anchored=False).relight(**task.inputs["relight"])
+        assert score(task, Prediction(image=image), ())["relit.psnr@masked-srgb-raw"] > 55
+
+
+def test_capabilities_are_checked() -> None:
+    assert methods.capabilities(methods.UneditedInput()) == ("edit", "relight")
+    assert methods.capabilities(methods.Composite()) == ("render",)
+
+    class Empty:
+        name = "empty"
+        config: dict[str, Any] = {}  # noqa: RUF012 - a constant of the test
+
+    with pytest.raises(UnirenderError, match="is not a method"):
+        methods.capabilities(Empty())
+    with pytest.raises(UnirenderError, match="no method 'nobody'"):
+        methods.plugin_methods(["nobody"])
+
+
+def test_rows_are_unique_and_named() -> None:
+    rows = check_rows(trivial_rows())
+    assert {row.info.key for row in rows} >= {
+        "unedited-input",
+        "input-as-albedo",
+        "mean-albedo",
+        "mean-normal",
+        "constant-0-5",
+    }
+    assert slug("Ours (mean, anchored)") == "ours-mean-anchored"
+    with pytest.raises(UnirenderError, match="occur twice"):
+        check_rows([*rows, rows[0]])
+
+
+def test_answer_asks_only_for_what_a_method_can(suite: Suite) -> None:
+    row = make_row(methods.InputAsAlbedo(), "trivial")
+    edit = next(tasks(suite, "rendering", "from-image", list(suite.scenes)))
+    assert not row.answers(edit, list(suite.scenes))
+    inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    prediction = answer(row, inverse)
+    assert prediction.image is None
+    assert prediction.maps is not None
+    assert prediction.maps.present == ("albedo", "mask")
+
+
+def test_predictions_folder_is_needed(tmp_path: Path) -> None:
+    from unirender_evaluation.predictions import PredictionFolder
+
+    with pytest.raises(UnirenderError, match="one subfolder per picture"):
+        PredictionFolder(tmp_path)

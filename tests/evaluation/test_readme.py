@@ -1,0 +1,83 @@
+"""Result tables reach the README and the documentation from a run's records, never by hand."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from unirender.errors import UnirenderError
+from unirender_evaluation import readme
+from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
+
+SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
+README = f"# title\n\n{SLOT.format('results')}\n{SLOT.format('checkpoint')}\nend\n"
+
+
+def write_example(folder: Path, limit: int | None = None) -> Path:
+    """A run of one method on two samples of the inverse table."""
+    folder.mkdir()
+    values = ({"albedo.psnr@masked-srgb-raw": 20.0}, {"albedo.psnr@masked-srgb-raw": 23.0})
+    records = [
+        Record("inverse", "single-image", "mine", f"s{i}", f"object{i}", value, key=f"k{i}")
+        for i, value in enumerate(values)
+    ]
+    write_records(folder / "records.jsonl", records)
+    methods = (MethodInfo("mine", "Mine", "external"),)
+    write_run(folder / "run.json", RunInfo("tiny", "0" * 64, 64, methods, date="2026-11-21", limit=limit))
+    return folder
+
+
+def write_checkpoint(folder: Path) -> Path:
+    """A folder with the facts of a training run and weights of 2,500,000 numbers."""
+    folder.mkdir()
+    facts = {"minutes": 61.4, "device": "cpu", "autocast": "bfloat16", "steps": 4000, "samples": 48000}
+    (folder / "training.json").write_text(json.dumps(facts | {"train": {"model": {"resolution": 64}}}))
+    save_file({"a": np.zeros((5, 400_000), np.float16), "b": np.zeros(500_000, np.float16)}, folder / "w.safetensors")
+    return folder
+
+
+def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path) -> None:
+    run = write_example(tmp_path / "run")
+    target = tmp_path / "README.md"
+    target.write_text(README)
+    checkpoint = write_checkpoint(tmp_path / "checkpoint")
+
+    for _ in range(2):  # filling a filled README changes nothing
+        options = ["--readme", str(target), "--stored", str(tmp_path / "stored"), "--checkpoint", str(checkpoint)]
+        assert readme.main([str(run), *options]) == 0
+
+    text = target.read_text()
+    assert text.startswith("# title\n\n<!-- results:begin -->\n\nPrinted by `make bench` (tiny, 2026-11-21)")
+    assert text.endswith("<!-- checkpoint:end -->\n\nend\n")
+    assert "2.5 million parameters" in text
+    assert "61 minutes on cpu (bfloat16): 4,000 steps, 48,000 samples" in text
+    assert "21.50" in text
+    assert "what was here" not in text
+    assert "Protocol:" in text
+    stored = [path.read_text() for path in (tmp_path / "stored").glob("*.md")]
+    assert any("21.50" in table for table in stored)
+
+
+def test_a_partial_run_is_refused_and_the_readme_untouched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write_example(tmp_path / "run", limit=1)
+    target = tmp_path / "README.md"
+    target.write_text(README)
+
+    assert readme.main([str(run), "--readme", str(target)]) == 1
+
+    assert target.read_text() == README
+    assert "partial run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["", "<!-- a:begin -->", "<!-- a:end --> <!-- a:begin -->", 2 * SLOT.format("a")])
+def test_a_readme_without_one_place_for_a_text_is_refused(text: str) -> None:
+    with pytest.raises(UnirenderError, match="README"):
+        readme.fill(text, "a", "table")
+
+
+def test_the_projects_own_readme_has_its_places() -> None:
+    text = (Path(__file__).resolve().parents[2] / "README.md").read_text()
+    for name in ("results", "checkpoint"):
+        assert "filled" in readme.fill(text, name, "filled")

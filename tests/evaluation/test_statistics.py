@@ -1,0 +1,93 @@
+"""Bootstrap: coverage of the interval, clusters, pairing, and what has no interval."""
+
+import math
+
+import numpy as np
+import pytest
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.statistics import beats, bootstrap_mean, paired_difference
+
+
+def coverage(clustered: bool, use_clusters: bool, trials: int = 300) -> float:
+    """Share of 95 % intervals that hold the true mean 0; clustered data have 8 samples of each of 30 objects."""
+    rng = np.random.default_rng(0)
+    hits = 0
+    for trial in range(trials):
+        values = np.repeat(rng.normal(size=30), 8) + 0.2 * rng.normal(size=240) if clustered else rng.normal(size=240)
+        labels = np.repeat(np.arange(30), 8).tolist() if use_clusters else None
+        estimate = bootstrap_mean(values, labels, resamples=400, seed=trial)
+        hits += estimate.low <= 0 <= estimate.high
+    return hits / trials
+
+
+def test_the_interval_holds_the_mean_as_often_as_it_says() -> None:
+    assert 0.90 <= coverage(clustered=False, use_clusters=False) <= 0.985
+
+
+def test_clusters_are_needed_where_samples_share_an_object() -> None:
+    assert 0.88 <= coverage(clustered=True, use_clusters=True) <= 0.985
+    assert coverage(clustered=True, use_clusters=False) < 0.70  # the twin: samples drawn as if independent
+
+
+def test_the_estimate_is_the_mean_over_samples_not_over_objects() -> None:
+    estimate = bootstrap_mean([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])
+    assert (estimate.mean, estimate.n, estimate.clusters) == (2.0, 4, 2)
+
+
+def test_the_same_seed_gives_the_same_interval() -> None:
+    values = np.random.default_rng(1).normal(size=50)
+    assert bootstrap_mean(values) == bootstrap_mean(values)
+    assert bootstrap_mean(values) != bootstrap_mean(values, seed=1)
+
+
+@pytest.mark.parametrize(("values", "labels"), [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None)])
+def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | None) -> None:
+    estimate = bootstrap_mean(values, labels)
+    assert math.isnan(estimate.low)
+    assert math.isnan(estimate.half_width)
+    assert estimate.mean == np.mean(values)
+
+
+@pytest.mark.parametrize("values", [[], [1.0, math.nan]])
+def test_nothing_and_nan_are_refused(values: list[float]) -> None:
+    with pytest.raises(UnirenderError, match="bootstrap"):
+        bootstrap_mean(values)
+
+
+def paired(shift: float, seed: int = 0) -> tuple[dict[str, float], dict[str, float]]:
+    """Two methods whose samples vary by 5 and whose difference varies by 0.5."""
+    rng = np.random.default_rng(seed)
+    base = 20 + 5 * rng.normal(size=60)
+    names = [f"s{i}" for i in range(60)]
+    return dict(zip(names, base + shift + 0.5 * rng.normal(size=60), strict=True)), dict(zip(names, base, strict=True))
+
+
+def test_pairing_sees_a_difference_that_intervals_of_the_means_hide() -> None:
+    a, b = paired(0.4)
+    alone = [bootstrap_mean(list(values.values())) for values in (a, b)]
+    assert alone[0].low < alone[1].high  # they overlap
+    assert beats(a, b, higher_is_better=True)
+    assert not beats(b, a, higher_is_better=True)
+    assert beats(b, a, higher_is_better=False)
+
+
+def test_a_method_does_not_beat_itself_or_an_equal() -> None:
+    a, b = paired(0.0)
+    assert not beats(a, a, higher_is_better=True)
+    wins = sum(beats(*paired(0.0, seed), higher_is_better=True) for seed in range(60))
+    assert wins <= 6  # 2.5 % a side
+    assert paired_difference(a, b).n == 60
+
+
+def test_only_common_samples_count() -> None:
+    a, b = paired(1.0)
+    b = dict(list(b.items())[:10]) | {"other": 100.0}
+    assert paired_difference(a, b).n == 10
+    with pytest.raises(UnirenderError, match="share no sample"):
+        paired_difference({"x": 1.0}, {"y": 1.0})
+
+
+def test_identical_images_have_no_difference_in_db() -> None:
+    with pytest.raises(UnirenderError, match="compare the MSE"):
+        paired_difference({"x": math.inf, "y": 1.0}, {"x": math.inf, "y": 2.0})

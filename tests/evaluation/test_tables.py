@@ -1,0 +1,246 @@
+"""Tables: published beside measured, ranks on rounded values, n/a, watermark, and the formats."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.comparisons import Selection, compare, verdicts
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.published import check_name, published_tables
+from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.specs import TABLES, Column, TableSpec
+from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+from unirender_evaluation.tables import Row, Table, build_table, build_tables
+
+METHODS = (
+    MethodInfo("ours", "Ours (mean)", "ours", "Ours", 1, 1, 0),
+    MethodInfo("sample", "Ours (sample)", "ours", None, 20, 5, 0, mask="own"),
+    MethodInfo("constant", "Constant 0.5", "trivial"),
+    MethodInfo("input", "Input as albedo", "trivial"),
+    MethodInfo("ceiling", "Noise ceiling", "ceiling"),
+)
+RUN = RunInfo("tiny", "abcdef0123456789", 64, METHODS, coverage=0.34, lpips=("alex",), mitsuba="3.9.1", truth_spp=2048)
+LEVEL = {"ours": 21.0, "sample": 20.0, "input": 12.0, "ceiling": 45.0}
+MATERIAL = {"ours": 0.06, "sample": 0.07, "constant": 0.1, "ceiling": 0.0}
+
+
+def inverse(method: str, n: int = 8) -> list[Record]:
+    records = []
+    for i in range(n):
+        values: dict[str, float] = {}
+        for mask in ("masked", "whole"):
+            variant = Variant(mask)
+            if method in LEVEL:
+                db = LEVEL[method] + 0.1 * (i % 4) + (5 if mask == "whole" else 0)
+                values[metric_key("albedo", "psnr", variant)] = db
+                values[metric_key("albedo", "lpips_alex", variant)] = 1 / db
+            if method in MATERIAL:
+                values[metric_key("metallic", "mse", variant)] = MATERIAL[method]
+        records.append(Record("inverse", "single-image", method, f"s{i}", f"o{i // 2}", values))
+    return records
+
+
+RECORDS = [record for key in ("ours", "constant", "input", "ceiling") for record in inverse(key)] + inverse("sample", 4)
+
+
+def table(mask: str = "whole", run: RunInfo = RUN) -> Table:
+    return build_table(TABLES["inverse"], RECORDS, run, protocol="single-image", variant=Variant.parse(mask))
+
+
+def row(found: Table, label: str) -> Row:
+    return next(r for r in found.rows if r.label.startswith(label))
+
+
+def test_published_numbers_are_the_papers() -> None:
+    """Spot checks against the paper's tables, one value in each corner."""
+    tables = {name: {r.name: r.values for r in rows} for name, rows in published_tables().items()}
+    assert [len(rows) for rows in tables.values()] == [5, 11, 5]
+    assert tables["rendering"]["InPix2Pix*"]["edit_metallic.psnr"] == 24.25
+    assert tables["rendering"]["Ours w/o re-render"]["edit_roughness.lpips_vgg"] == 0.0833
+    assert tables["inverse"]["Yi et al."] == {"albedo.psnr": 20.93, "albedo.ssim": 0.896, "albedo.lpips_vgg": 0.1024}
+    assert tables["inverse"]["Ours w/o constrain"]["normal.cosine"] == 0.922
+    assert tables["relighting"]["NvDiffrec"]["specular.psnr"] == 14.12
+    assert tables["relighting"]["Ours w/o constrain"]["relit.lpips_vgg"] == 0.0924
+
+
+def test_every_published_value_has_a_column() -> None:
+    for name, rows in published_tables().items():
+        columns = {column.published_key for column in TABLES[name].columns if column.published}
+        assert {key for entry in rows for key in entry.values} == columns
+
+
+def test_the_ablation_answers_to_both_of_its_names() -> None:
+    for rows in published_tables().values():
+        assert sum(entry.is_called("Ours w/o constrain") for entry in rows) == 1
+    check_name("Ours w/o re-render")
+    with pytest.raises(UnirenderError, match="expected one of"):
+        check_name("Theirs")
+
+
+def test_measured_stands_beside_published_in_the_papers_order() -> None:
+    found = table()
+    labels = [r.label for r in found.rows]
+    assert labels[:2] == ["Yi et al.", "IntrinsicAnything"]
+    assert labels.index("Ours (mean) [Ours]") == labels.index("GaussianShader") + 1
+    assert labels[-4:] == ["Ours (sample)", "Constant 0.5", "Input as albedo", "Noise ceiling"]
+    cell = row(found, "Ours (mean)").cells[0]
+    assert cell.published == 23.20
+    assert cell.measured is not None
+    assert (cell.measured.mean, cell.measured.n, cell.measured.clusters) == (pytest.approx(26.15), 8, 4)
+
+
+def test_published_values_never_stand_beside_another_protocol_or_mask() -> None:
+    assert not any(table("masked").published_columns)
+    given = [replace(record, table="rendering", protocol="given") for record in RECORDS]
+    for found in build_tables(given, RUN):
+        assert found.variant.mask == "masked"
+        assert all(r.info is not None for r in found.rows)
+
+
+def test_materials_are_taken_in_the_mask_in_every_variant() -> None:
+    masked, whole = (row(table(mask), "Ours (mean)") for mask in ("masked", "whole"))
+    index = [column.group for column in TABLES["inverse"].columns].index("Metallic")
+    assert masked.cells[-1].measured == whole.cells[index].measured
+
+
+def test_ranks_are_on_rounded_values_and_leave_bounds_and_subsets_out() -> None:
+    found = table("masked")
+    ranks = {r.label: r.cells[0].measured_rank for r in found.rows}
+    assert ranks == {
+        "Ours (mean)": 1, "Ours (sample)": None, "Constant 0.5": None, "Input as albedo": 2, "Noise ceiling": None
+    }  # fmt: skip
+    close = [replace(r, values={k: v - 1e-4 for k, v in r.values.items()}, method="input") for r in inverse("ours")]
+    tied = build_table(TABLES["inverse"], inverse("ours") + close, RUN, protocol="single-image")
+    assert [r.cells[0].measured_rank for r in tied.rows] == [1, 1]
+
+
+def test_a_published_value_worse_than_a_constant_has_a_dagger() -> None:
+    index = [column.group for column in TABLES["inverse"].columns].index("Metallic")
+    daggers = {r.label: r.cells[index].dagger for r in table().rows if r.cells[index].published is not None}
+    assert daggers == dict.fromkeys(daggers, True)  # 0.100 beats every published row
+    assert "**0.1182**†" in to_markdown(table())
+    without = [record for record in RECORDS if record.method != "constant"]
+    assert "†" not in to_markdown(build_table(TABLES["inverse"], without, RUN, protocol="single-image"))
+
+
+def test_an_absent_backbone_is_not_available_and_an_absent_value_is_a_dash() -> None:
+    text = to_markdown(table("masked"))
+    ours = next(line for line in text.splitlines() if line.startswith("| Ours (mean)"))
+    constant = next(line for line in text.splitlines() if line.startswith("| Constant"))
+    assert "n/a" in ours
+    assert "n/a" not in constant
+    assert "weights are not on this machine" in text
+
+
+def test_a_limited_run_is_watermarked_in_every_format() -> None:
+    found = table(run=replace(RUN, limit=3))
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=100), found)
+    for text in (to_markdown(found), to_latex(found), to_json([found]), buffer.getvalue()):
+        assert re.search(r"-?-limit 3: a partial run, not a result", text)
+    assert "partial run" not in to_markdown(table())
+
+
+def test_a_stored_row_says_so() -> None:
+    stored = replace(RUN, methods=(replace(METHODS[0], stored="2026-11-21, suite abc"), *METHODS[1:]))
+    text = to_markdown(table(run=stored))
+    assert "(stored)" in text
+    assert "not measured in this run (2026-11-21, suite abc)" in text
+
+
+def test_the_protocol_is_printed_with_every_format() -> None:
+    found = table()
+    names = [name for name, _ in found.protocol]
+    assert names[:7] == ["given", "mask", "colour", "scale alignment", "exposure", "resolution", "n"]
+    assert {"coverage", "steps x samples", "seeds", "LPIPS", "interval", "suite", "truth"} <= set(names)
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=90), found)
+    flat = " ".join(buffer.getvalue().split())
+    for text in (to_markdown(found), flat):
+        assert "resolution: 64 x 64" in text
+        assert "own mask: Ours (sample)" in text
+        assert "8 samples of 4 objects" in text
+    assert "published" not in [name for name, _ in table("masked").protocol]
+
+
+def test_markdown_is_a_table() -> None:
+    lines = [line for line in to_markdown(table()).splitlines() if line.startswith("|")]
+    assert len(lines) == 2 + len(table().rows)
+    assert len({line.count("|") for line in lines}) == 1
+    assert "| **23.20** | **26.15** ± 0.10 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
+
+
+def test_latex_is_balanced_booktabs() -> None:
+    text = to_latex(table())
+    body = text[text.index(r"\toprule") : text.index(r"\bottomrule")]
+    columns = len(re.findall(r"(?<!\\)&", body.splitlines()[3]))
+    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert all(len(re.findall(r"(?<!\\)&", line)) == columns for line in rows[1:])
+    assert text.count("{") == text.count("}")
+    assert r"\textbf{26.15} {\scriptsize $\pm$" in text
+    assert not re.search(r"[±†·∞↑↓]", text)
+
+
+def test_json_is_strict_and_whole() -> None:
+    infinite = [replace(r, values={"albedo.psnr@masked-srgb-raw": math.inf}) for r in inverse("ours")]
+    found = build_table(TABLES["inverse"], infinite, RUN, protocol="single-image")
+    data = json.loads(to_json([found]), parse_constant=pytest.fail)
+    cell = data[0]["rows"][0]["cells"][0]["measured"]
+    assert (cell["mean"], cell["low"], cell["n"]) == ("inf", None, 8)
+    assert "∞" in to_markdown(found)
+
+
+def test_terminal_output_keeps_its_width() -> None:
+    for width in (80, 200):
+        buffer = StringIO()
+        print_table(Console(file=buffer, width=width), table())
+        assert max(map(len, buffer.getvalue().splitlines())) <= width
+
+
+def test_a_column_that_nobody_was_asked_for_is_left_out() -> None:
+    relit = [
+        Record("relighting", "from-image-hdri", "ours", f"s{i}", f"o{i}", {"relit.psnr@masked-srgb-raw": 20.0 + i})
+        for i in range(3)
+    ]
+    (found,) = build_tables(relit, RUN)
+    assert {column.group for column in found.columns} == {"Relit"}
+
+
+def test_subsets_are_never_mixed() -> None:
+    textured = [replace(record, subset="textured") for record in inverse("ours")]
+    found = build_tables([*inverse("ours", 4), *textured], RUN)
+    assert [(t.subset, t.variant.mask, t.n) for t in found] == [
+        ("main", "whole", 4), ("main", "masked", 4), ("textured", "masked", 8)
+    ]  # fmt: skip
+
+
+def test_a_table_of_ones_own() -> None:
+    column = Column("Superposition", "superposition", METRICS["mse"], {"mask": "masked"}, published=False)
+    spec = TableSpec("physics", "Physics", (column,), ("physics",))
+    values: Mapping[str, float] = {"superposition.mse@masked": 0.01}
+    records = [Record("physics", "physics", "ours", f"s{i}", f"o{i}", values) for i in range(3)]
+    (found,) = build_tables(records, RUN, {"physics": spec})
+    assert found.rows[0].cells[0].measured is not None
+    with pytest.raises(UnirenderError, match="expected one of"):
+        build_table(spec, records, RUN, protocol="given")
+
+
+def test_verdicts_pair_by_sample() -> None:
+    chosen = Selection("inverse", "single-image").of(RECORDS)
+    key = metric_key("metallic", "mse")
+    found = compare(chosen, METRICS["mse"], key, "ours", "constant")
+    assert (found.verdict, found.difference.n) == ("beats", 8)  # lower is better
+    assert compare(chosen, METRICS["mse"], key, "constant", "ours").verdict == "is beaten by"
+    assert compare(chosen, METRICS["mse"], key, "ours", "ours").verdict == "is level with"
+    pairs = {(v.a, v.b, column.group) for column, v in verdicts(TABLES["inverse"], chosen, RUN)}
+    assert ("ours", "constant", "Metallic") in pairs
+    assert ("sample", "input", "Albedo") in pairs
+    with pytest.raises(UnirenderError, match="has no value"):
+        compare(chosen, METRICS["mse"], key, "input", "ours")
