@@ -40,7 +40,7 @@ bench: $(VENV)/.runtime
 	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) $(BENCH_ARGS)
 
 bench-full: $(VENV)/.runtime
-	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --sample-scenes 1000000 $(BENCH_ARGS)
+	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --full $(BENCH_ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

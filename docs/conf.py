@@ -1,0 +1,101 @@
+"""Sphinx configuration: furo, MyST notebooks, and an API reference taken from the docstrings."""
+
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+import unirender
+
+project = "unirender"
+author = "The unirender maintainers"
+version = release = unirender.__version__
+copyright = f"2026, {author}"
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build", "jupyter_execute", "**.ipynb_checkpoints"]
+templates_path = ["_templates"]
+html_theme = "furo"
+html_title = f"unirender {version}"
+html_static_path = ["_static"]
+
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 240
+nb_output_stderr = "remove"
+
+autosummary_generate = True
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+default_role = "literal"
+
+RESULTS = Path(__file__).parents[1] / "evaluation" / "results"
+
+_CODE = re.compile(r"(``.+?``|`[^`]+`)")
+_EMPHASIS = re.compile(r"(?<![\w*])\*(?=[^\s*])([^*]*[^\s*])\*(?![\w*])")
+
+
+def _escape(text: str) -> str:
+    """Escapes what reStructuredText would read as markup in a sentence that is none: `a * b`, `|x|`, `name_`."""
+    marked = _EMPHASIS.sub("\0\\1\1", text)
+    marked = re.sub(r"([*|])", r"\\\1", marked)
+    marked = re.sub(r"(\w)_(?!\w)", r"\1\\_", marked)
+    return marked.replace("\0", "*").replace("\1", "*")
+
+
+def _docstring(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Docstrings here are plain sentences with `code` in backticks and indented formulas: make that safe markup."""
+    out: list[str] = []
+    sentence: list[str] = []  # lines up to the next formula; code in backticks may run over a line end
+
+    def flush() -> None:
+        parts = _CODE.split("\n".join(sentence))
+        for i, part in enumerate(parts):
+            if i % 2 == 0:
+                parts[i] = _escape(part)
+            elif not parts[i - 1].endswith(":"):  # no role in front: code, with or without a letter behind ("`Array`s")
+                parts[i] = f"``{part.strip('`')}``" + ("\\ " if parts[i + 1][:1].isalnum() else "")
+        out.extend("".join(parts).split("\n"))
+        sentence.clear()
+
+    formula = False
+    for line in lines:
+        indented = line.startswith("    ") and bool(line.strip())
+        in_list = any(previous.startswith("- ") for previous in sentence[-3:])
+        if formula and line.strip() and not indented:
+            formula = False
+        elif what == "module" and indented and not formula and not in_list and sentence and not sentence[-1].strip():
+            flush()
+            out += ["::", ""]
+            formula = True
+        if formula:
+            out.append(line)
+        else:
+            sentence.append(line)
+    flush()
+    lines[:] = out
+
+
+def _results(app: Sphinx, docname: str, source: list[str]) -> None:
+    """Puts the committed result tables into the results page; without any, a sentence that says so."""
+    if docname == "results":
+        tables = sorted(RESULTS.glob("*.md"))
+        text = "\n\n".join(path.read_text(encoding="utf-8") for path in tables)
+        text = re.sub(r"^### ", "## ", text, flags=re.MULTILINE)  # the tables are made for a README
+        source[0] = source[0].replace("<!-- results -->", text or "No results are stored in this version.")
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("source-read", _results)
+    app.connect("autodoc-process-docstring", _docstring, priority=100)

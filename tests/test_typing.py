@@ -1,0 +1,69 @@
+"""Types: each package is typed, every suppression says why, and array shapes are checked while the tests run."""
+
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
+
+from unirender.color import luminance
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = [
+    path
+    for folder in ("src", "reference", "evaluation", "tests", "docs")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+    if "_build" not in path.parts
+]
+# A suppression, and what has to follow it: the rule in the tool's own syntax, then a separator and a reason.
+SUPPRESSION = re.compile(r"#\s*(noqa|type:\s*ignore|pyright:)(?P<rest>.*)$")
+REASONED = re.compile(r"^(:\s*[A-Z]+\d+(,\s*[A-Z]+\d+)*|\s*ignore\[[\w, ]+\]|\[[\w, -]+\])\s*(-|#|:|\()\s*\S.{2,}")
+
+
+def suppressions_without_reason(text: str) -> list[str]:
+    """Returns the lines of a source text that silence a checker without a rule or without a reason."""
+    found = []
+    for line in text.splitlines():
+        match = SUPPRESSION.search(line)
+        if match and not REASONED.match(match["rest"]):
+            found.append(line.strip())
+    return found
+
+
+@pytest.mark.parametrize("package", ["unirender", "unirender_reference", "unirender_evaluation"])
+def test_package_is_marked_as_typed(package: str) -> None:
+    assert (files(package) / "py.typed").is_file()
+
+
+def test_every_suppression_names_its_rule_and_its_reason() -> None:
+    bad = {
+        str(path.relative_to(ROOT)): lines
+        for path in SOURCES
+        if path != Path(__file__).resolve() and (lines := suppressions_without_reason(path.read_text()))
+    }
+    assert not bad, f"suppressions without a rule or a reason: {bad}"
+
+
+@pytest.mark.parametrize(
+    ("line", "found"),
+    [
+        ("import x  # noqa", 1),
+        ("import x  # noqa: E402", 1),
+        ("import x  # noqa: E402 - after the environment is set", 0),
+        ("y = f()  # type: ignore", 1),
+        ("y = f()  # type: ignore[arg-type]  # Mitsuba has no stubs", 0),
+        ("y = f()  # pyright: ignore[reportAttributeAccessIssue] - Mitsuba has no stubs", 0),
+        ("# pyright: basic", 1),
+    ],
+)
+def test_the_scan_for_suppressions_finds_what_it_should(line: str, found: int) -> None:
+    assert len(suppressions_without_reason(line)) == found
+
+
+def test_array_shapes_are_checked_while_the_tests_run() -> None:
+    """The twin of every shape annotation: without the import hook, a wrong type would pass in silence."""
+    with pytest.raises(TypeCheckError):
+        luminance("not an array")  # pyright: ignore[reportArgumentType] - the point of the test
+    assert np.isclose(luminance(np.ones((2, 2, 3), np.float32)), 1.0).all()
