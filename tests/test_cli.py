@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from synthetic_shards import write_dataset
 
 from unirender.cli import main
 from unirender.exr import image_channels, read_exr, write_exr
@@ -144,6 +145,10 @@ def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.C
     (tmp_path / "out" / "precious").write_text("1")
     assert run("decompose", ball, "--output", tmp_path / "out") == 1
     assert "--overwrite" in capsys.readouterr().err
+    assert run("decompose", ball, "--output", tmp_path / "out", "--overwrite") == 1
+    assert "meta.json" in capsys.readouterr().err
+    assert (tmp_path / "out" / "precious").exists()
+    (tmp_path / "out" / "meta.json").write_text("{}")
     assert run("decompose", ball, "--output", tmp_path / "out", "--overwrite") == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == DECOMPOSED
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -184,3 +189,29 @@ def test_help_loads_nothing_heavy() -> None:
         "assert not heavy, heavy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_train_writes_a_pipeline_that_decompose_loads(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("train", "--data", tmp_path / "nowhere", "--out", tmp_path / "run") == 1
+    assert "no such data folder" in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert run("train", "--data", tmp_path / "empty", "--out", tmp_path / "run") == 1
+    assert not (tmp_path / "run").exists()
+    write_dataset(tmp_path / "data", vary="basis", size=64)
+    assert (
+        run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", "--steps", "2", "--batch-size", "4") == 0
+    )
+    checkpoint = tmp_path / "run" / "pipeline"
+    assert run("decompose", ball, "--checkpoint", checkpoint, "--output", tmp_path / "out") == 0
+
+
+def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("--objects", "1", "--pairs", "3", "--resolution", "8", "--spp", "4", "--workers", "1")
+    assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
+    assert "3 pairs in 1 groups" in capsys.readouterr().out
+    assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
+    assert "complete" in capsys.readouterr().out
+    assert run("dataset", "--pairs", "5", "--out", tmp_path / "other") == 1
+    assert not (tmp_path / "other").exists()

@@ -14,6 +14,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import secrets
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -75,8 +76,9 @@ class BenchConfig:
         methods: groups of rows: ours, trivial, plugins.
         predictions: name -> folder of somebody's predictions.
         limit: scenes (evenly spaced); the tables are then watermarked.
-        seed: of sampling methods and of the truth check.
+        seed: of sampling methods.
         check_scenes: scenes that Mitsuba renders again on the spot.
+        check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
         jobs: worker processes, each with one thread; 0 = all in this one.
         device: of our model.
         sample_scenes: scenes of the sampling rows; 0 = leave them out.
@@ -90,6 +92,7 @@ class BenchConfig:
     limit: int | None = None
     seed: int = 0
     check_scenes: int = 4
+    check_seed: int | None = None
     jobs: int = 2
     device: str = "cpu"
     sample_scenes: int = 4
@@ -165,7 +168,8 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
         check = _truth_check(config, suite, store, version, backbones, progress)
         here = Run(suite, rows, scenes, version, backbones, config.out / "pictures")
         _work(here, config, store, progress)
-    records = [record for record in store.close() if record.values]
+    partial = config.limit is not None or set(config.methods) != set(GROUPS)
+    records = [record for record in store.close(keep_unused=partial) if record.values]
     info = _run_info(config, suite, scenes, rows, check, records, code, backbones)
     write_run(config.out / "run.json", info)
     specs = {**TABLES, "physics": PHYSICS_TABLE}
@@ -210,7 +214,7 @@ def _truth_check(
     """Renders a random part of the truth again unless this was done before; scores the renders as a row."""
     path = config.out / "truth_check.json"
     identity = hashlib.sha256(
-        json.dumps([suite.sha256, config.seed, config.check_scenes, version]).encode()
+        json.dumps([suite.sha256, config.check_seed, config.check_scenes, version]).encode()
     ).hexdigest()
     check: dict[str, Any] = {}
     if path.exists():
@@ -221,7 +225,8 @@ def _truth_check(
         return check
     bar = progress.add_task("Mitsuba: truth check", total=None)
     outcome: TruthCheck | None = None
-    for step in check_truth(suite, config.check_scenes, config.seed):
+    seed = secrets.randbits(31) if config.check_seed is None else config.check_seed
+    for step in check_truth(suite, config.check_scenes, seed):
         progress.advance(bar)
         if isinstance(step, TruthCheck):
             outcome = step

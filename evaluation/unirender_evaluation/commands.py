@@ -1,6 +1,7 @@
 """`unirender bench ...`: the benchmark's commands. Light to import; each command loads what it needs when it runs."""
 
 import json
+import secrets
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -27,9 +28,11 @@ class BenchRun:
     limit: int | None = None
     """Scenes; the tables of a partial run carry a watermark."""
     seed: int = 0
-    """Of sampling methods and of the truth check."""
+    """Of sampling methods."""
     check_scenes: int = 4
-    """Scenes that Mitsuba renders again on the spot."""
+    """Scenes that Mitsuba renders again on the spot; at least 1."""
+    check_seed: int | None = None
+    """Chooses them; None: drawn anew in a new folder, kept in one that is continued."""
     sample_scenes: int = 4
     """Scenes of the sampling rows; 0 leaves them out."""
     jobs: int = 2
@@ -59,6 +62,7 @@ class BenchRun:
                 limit=self.limit,
                 seed=self.seed,
                 check_scenes=self.check_scenes,
+                check_seed=self.check_seed,
                 jobs=self.jobs,
                 device=self.device,
                 sample_scenes=whole if self.full else self.sample_scenes,
@@ -80,8 +84,8 @@ class BenchCheck:
     """A bundled suite, or the path of a suite's TOML file."""
     scenes: int = 4
     """How many."""
-    seed: int = 0
-    """Chooses the scenes and the render seeds."""
+    seed: int | None = None
+    """Chooses the scenes and the render seeds; None: drawn anew and printed."""
 
     def run(self) -> int:
         """Returns 1 where a test fails."""
@@ -91,11 +95,13 @@ class BenchCheck:
         from unirender_evaluation.truth_check import TruthCheck, check_truth
 
         console = Console()
-        for step in check_truth(load_suite(self.suite), self.scenes, self.seed):
+        seed = secrets.randbits(31) if self.seed is None else self.seed
+        console.print(f"--seed {seed}", highlight=False)
+        for step in check_truth(load_suite(self.suite), self.scenes, seed):
             if isinstance(step, TruthCheck):
                 console.print_json(json.dumps(step.summary()))
                 return 0 if step.passed else 1
-            console.print(f"{step.name}: {step.test}", highlight=False)
+            console.print(f"{step.name}: {getattr(step, 'test', step)}", highlight=False)
         raise UnirenderError("truth check: nothing was rendered, expected at least one scene")
 
 

@@ -5,9 +5,10 @@ method, computes only what has no record. Records are appended as they are made,
 """
 
 import hashlib
+import importlib.metadata
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -23,22 +24,24 @@ from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 
 CODE = {
     "unirender": ("*.py", "models/*.py", "diffusion/*.py", "pipelines/*.py"),
-    "unirender_evaluation": (
-        "metrics.py",
-        "scoring.py",
-        "lpips.py",
-        "methods.py",
-        "predictions.py",
-        "tasks.py",
-        "physics.py",
-        "suites.py",
-        "ceiling.py",
-        "rows.py",
-        "bounds.py",
-        "truth_check.py",
-    ),
-    "unirender_reference": ("shade.py", "render.py", "passes.py", "materials.py", "scene.py", "statistics.py"),
+    "unirender_evaluation": ("*.py",),
+    "unirender_reference": ("*.py",),
 }
+PRESENTATION = (  # what changes how results look, not what they are
+    "cli.py",
+    "commands.py",
+    "gallery.py",
+    "pictures.py",
+    "protocol.py",
+    "readme.py",
+    "report.py",
+    "report_plots.py",
+    "strip.py",
+    "table_formats.py",
+    "tables.py",
+    "verdict.py",
+)
+LIBRARIES = ("torch", "mitsuba", "diffusers", "numpy", "scikit-image", "scipy")
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ class Keeper(Protocol):
 
 @cache
 def code_version() -> str:
-    """sha256 over the sources that results depend on: a change makes every stored record stale."""
+    """sha256 over the sources and libraries that results depend on: a change makes every stored record stale."""
     from importlib.util import find_spec
 
     digest = hashlib.sha256()
@@ -71,8 +74,10 @@ def code_version() -> str:
             raise UnirenderError(f"package {package!r} is not installed: `pip install -e .`")
         root = Path(found.submodule_search_locations[0])
         for path in sorted({p for pattern in patterns for p in root.glob(pattern)}):
-            if path.name != "cli.py":
+            if path.name not in PRESENTATION:
                 digest.update(f"{package}/{path.relative_to(root)}".encode() + path.read_bytes())
+    for library in LIBRARIES:
+        digest.update(f"{library} {importlib.metadata.version(library)}".encode())
     return digest.hexdigest()
 
 
@@ -161,11 +166,19 @@ class Store:
             append_record(self.path, record)
         self.used[record.key] = record
 
-    def close(self) -> list[Record]:
-        """Drops stale records, sorts the rest and writes them."""
-        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
-        write_records(self.path, records)
-        return records
+    def close(self, keep_unused: bool = False) -> list[Record]:
+        """Sorts the records of this run, writes and returns them.
+
+        Args:
+            keep_unused: also keep in the file what this run did not use (it was a part of a larger run); else such
+                records are stale, of older code or rows, and dropped.
+        """
+
+        def in_order(records: Iterable[Record]) -> list[Record]:
+            return sorted(records, key=lambda r: (r.table, r.protocol, r.method, r.sample))
+
+        write_records(self.path, in_order((self.known | self.used if keep_unused else self.used).values()))
+        return in_order(self.used.values())
 
 
 @dataclass(frozen=True)

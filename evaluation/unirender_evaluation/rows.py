@@ -114,6 +114,7 @@ class PipelineMethod:
         seed: of the generator; every call starts from it.
         weights: sha256 of the checkpoint.
         decompositions: shared with another row of the same pipeline and mode.
+        closed: albedo, s and d are changed so that their rendering is the picture.
     """
 
     def __init__(
@@ -127,8 +128,10 @@ class PipelineMethod:
         seed: int,
         weights: str,
         decompositions: dict[str, Any] | None = None,
+        closed: bool = True,
     ) -> None:
         self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
+        self.closed = closed
         self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
         self._decompositions: dict[str, Any] = {} if decompositions is None else decompositions
 
@@ -139,6 +142,7 @@ class PipelineMethod:
             "weights": self.weights,
             "mode": self.mode,
             "anchored": self.anchored,
+            "closed": self.closed,
             "steps": self.steps,
             "samples": self.samples,
             "seed": self.seed,
@@ -161,7 +165,8 @@ class PipelineMethod:
         """Of a picture, computed once: the rows that share it differ in what they do with it."""
         key = hashlib.sha256(image_srgb.tobytes() + mask.tobytes() + repr(camera).encode()).hexdigest()
         if key not in self._decompositions:
-            made = self.pipeline.decompose(image_srgb, mask=mask, camera=camera, **self._options())
+            options = {**self._options(), "closed": self.closed}
+            made = self.pipeline.decompose(image_srgb, mask=mask, camera=camera, **options)
             self._decompositions[key] = made
         return self._decompositions[key]
 
@@ -216,7 +221,7 @@ class LazyPipeline:
 
 
 def our_rows(pipeline: Any, weights: str, seed: int = 0, sample_scenes: int = SAMPLE_SCENES) -> list[Row]:
-    """Our rows: `mean` plain and anchored, the composites of its decomposition, and `sample` on a subset of the scenes.
+    """Our rows: `mean` plain, anchored and not closed, composites of its decomposition, `sample` on a subset of scenes.
 
     Args:
         pipeline: a `UniRenderPipeline`.
@@ -231,9 +236,12 @@ def our_rows(pipeline: Any, weights: str, seed: int = 0, sample_scenes: int = SA
     edited: dict[str, Intrinsics] = {}
     mean = PipelineMethod(pipeline, "Ours (mean)", "mean", False, 1, 1, seed, weights, shared)
     anchored = PipelineMethod(pipeline, "Ours (mean, anchored)", "mean", True, 1, 1, seed, weights, shared)
+    open_mean = PipelineMethod(pipeline, "Ours (mean, not closed)", "mean", False, 1, 1, seed, weights, closed=False)
+    decomposes = from_image | {("inverse", "single-image")}
     rows = [
         make_row(mean, "ours", published="Ours", steps=1, samples=1),
         make_row(anchored, "ours", steps=1, samples=1, protocols=from_image),
+        make_row(open_mean, "ours", steps=1, samples=1, protocols=decomposes, note="maps as the network predicts them"),
         make_row(CompositeOf(mean, anchored=False, edited=edited), "ours", steps=1, samples=1, protocols=from_image),
         make_row(CompositeOf(mean, anchored=True, edited=edited), "ours", steps=1, samples=1, protocols=from_image),
     ]
@@ -250,7 +258,9 @@ def prediction_rows(folders: Mapping[str, Path]) -> list[Row]:
     rows = []
     for name, folder in folders.items():
         predictions = PredictionFolder(Path(folder))
-        info = MethodInfo(slug(name), name, "external", config={"predictions": predictions.sha256()}, mask="pasted")
+        info = MethodInfo(
+            slug(name), name, "external", config={"name": name, "predictions": predictions.sha256()}, mask="pasted"
+        )
         rows.append(Row(info, None, predictions))
     return rows
 

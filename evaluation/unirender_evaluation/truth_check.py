@@ -18,6 +18,12 @@ from unirender_evaluation.truth import item_seed, object_hash
 
 HALF_ROUNDING = 5e-4  # relative rounding of half floats
 TWIN_FACTOR = 1.12
+FALSE_ALARM = 0.01  # chance that a sound truth fails the whole check; each member gets its share
+GEOMETRY_LIMITS = {
+    "mask": 0.01,
+    "albedo": 0.01,
+    "normal": 0.02,
+}  # root mean square: several times what two traces differ by
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,34 @@ class Check:
 
 
 @dataclass(frozen=True)
+class GeometryCheck:
+    """Mask, albedo and normal of an object, traced again with another seed.
+
+    Attributes:
+        object: its key.
+        rms: root mean square difference by map; mask over the frame, the others where both masks exceed 0.99.
+        twin_rms: the same of the normals with x flipped, which has to exceed the limit.
+    """
+
+    object: str
+    rms: dict[str, float]
+    twin_rms: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.object}.shared"
+
+    @property
+    def passed(self) -> bool:
+        sound = all(value <= GEOMETRY_LIMITS[name] for name, value in self.rms.items())
+        return sound and self.twin_rms > GEOMETRY_LIMITS["normal"]
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{name} {value:.4f} (limit {GEOMETRY_LIMITS[name]})" for name, value in self.rms.items())
+        return f"root mean square difference: {values}; twin {self.twin_rms:.2f}"
+
+
+@dataclass(frozen=True)
 class TruthCheck:
     """All re-renders of a run. `passed`: every member agrees with the shipped truth and the twin does not.
 
@@ -49,19 +83,23 @@ class TruthCheck:
     twin: Any
     seed: int
     other_objects: tuple[str, ...] = ()
+    geometry: tuple[GeometryCheck, ...] = ()
 
     @property
     def passed(self) -> bool:
-        return all(check.test.passed for check in self.checks) and not self.twin.passed
+        sound = all(check.test.passed for check in self.checks) and all(check.passed for check in self.geometry)
+        return sound and not self.twin.passed
 
     def summary(self) -> dict[str, Any]:
         """JSON: counts, worst member, twin."""
         worst = min(self.checks, key=lambda c: (c.test.passed, c.test.min_p / c.test.threshold))
         failed = [f"{c.name}: {c.test}" for c in self.checks if not c.test.passed]
+        failed += [f"{c.name}: {c}" for c in self.geometry if not c.passed]
         return {
             "passed": self.passed,
             "seed": self.seed,
-            "members": len(self.checks),
+            "members": len(self.checks) + len(self.geometry),
+            "geometry": {c.object: c.rms for c in self.geometry},
             "scenes": sorted({c.scene.key for c in self.checks}),
             "failed": failed,
             "other_objects": list(self.other_objects),
@@ -83,9 +121,9 @@ def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
     return order[: min(count, len(order))]
 
 
-def check_truth(suite: Suite, count: int = 4, seed: int = 0) -> Iterator[Check | TruthCheck]:
-    """Renders `count` random scenes again: the edited images, one stratified image, the image under the other light, s
-    and d.
+def check_truth(suite: Suite, count: int = 4, seed: int = 0) -> Iterator[Check | GeometryCheck | TruthCheck]:
+    """Renders `count` random scenes again: the maps, the edited images, one stratified image, the image under the other
+    light, s and d.
 
     Args:
         suite: the suite.
@@ -99,34 +137,64 @@ def check_truth(suite: Suite, count: int = 4, seed: int = 0) -> Iterator[Check |
     from unirender_reference.shapes import make_object
 
     checks: list[Check] = []
+    geometry: list[GeometryCheck] = []
     others: list[str] = []
     twin = None
     spec = suite.spec
-    for scene in chosen_scenes(suite, count, seed):
+    scenes = chosen_scenes(suite, count, seed)
+    alpha = FALSE_ALARM / (len(scenes) * (len(spec.edits) + 4))  # edits, stratified, other light, s, d
+    for scene in scenes:
         made = suite.provenance["objects"][scene.object]
         obj = make_object(int(made["seed"]), spec.split)
         if object_hash(obj) != made["sha256"]:
             others.append(scene.object)
         renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
+        if scene.object not in {check.object for check in geometry}:
+            geometry.append(_check_geometry(suite, renderer, scene, seed))
+            yield geometry[-1]
         other = suite.other_light(scene)
         stratified = scene.materials[seed % len(scene.materials)] if scene.materials else spec.base
         images = dict.fromkeys(
             [*((scene, material) for material in spec.edits), (scene, stratified), (other, spec.base)]
         )
         for lit, material in images:
-            checks.append(_check_image(suite, renderer, lit, material, material, seed))
+            checks.append(_check_image(suite, renderer, lit, material, material, seed, alpha))
             yield checks[-1]
         if twin is None:
             off = (spec.base[0], spec.base[1] * TWIN_FACTOR)
             twin = _check_image(suite, renderer, scene, spec.base, off, seed).test
         environment, mask = suite.environment(scene), suite.mask(scene)
         for kind in ("specular", "diffuse"):
-            checks.append(_check_light(suite, renderer, scene, kind, environment, mask, seed))
+            checks.append(_check_light(suite, renderer, scene, kind, environment, mask, seed, alpha))
             yield checks[-1]
-    yield TruthCheck(tuple(checks), twin, seed, tuple(others))
+    yield TruthCheck(tuple(checks), twin, seed, tuple(others), tuple(geometry))
 
 
-def _check_image(suite: Suite, renderer: Any, scene: Scene, stored: Material, rendered: Material, seed: int) -> Check:
+def _check_geometry(suite: Suite, renderer: Any, scene: Scene, seed: int) -> GeometryCheck:
+    again = renderer.geometry(suite.spec.geometry_spp, item_seed("check", seed, scene.object)).require(
+        "mask", "albedo", "normal"
+    )
+    stored = suite.intrinsics(scene, suite.spec.base).require("mask", "albedo", "normal")
+    inside = np.minimum(again["mask"], stored["mask"])[..., 0] > 0.99
+
+    def rms(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.square(a - b))))
+
+    differences = {name: rms(again[name][inside], stored[name][inside]) for name in ("albedo", "normal")}
+    flipped = again["normal"][inside] * np.array([-1, 1, 1], np.float32)
+    mask = {"mask": rms(again["mask"], stored["mask"])}
+    return GeometryCheck(scene.object, mask | differences, rms(flipped, stored["normal"][inside]))
+
+
+def _check_image(
+    suite: Suite,
+    renderer: Any,
+    scene: Scene,
+    stored: Material,
+    rendered: Material,
+    seed: int,
+    alpha: float = FALSE_ALARM,
+) -> Check:
     from unirender_reference.statistics import z_test
 
     member = f"{scene.key}.{material_key(stored)}.exr"
@@ -139,6 +207,7 @@ def _check_image(suite: Suite, renderer: Any, scene: Scene, stored: Material, re
         suite.image_variance(scene, stored),
         suite.mask(scene),
         rounding=HALF_ROUNDING,
+        alpha=alpha,
     )
     return Check(scene, "image", stored, again.mean[..., :3], test)
 
@@ -151,6 +220,7 @@ def _check_light(
     environment: Float[np.ndarray, "eh ew 3"],
     mask: Float[np.ndarray, "h w 1"],
     seed: int,
+    alpha: float,
 ) -> Check:
     from unirender_reference.statistics import z_test
 
@@ -167,5 +237,5 @@ def _check_light(
         spp = int(suite.provenance["quality"][member]["spp"])
         again = renderer.specular(environment, material[1], spp, item_seed("check", seed, member))
         stored = maps["specular"]
-    test = z_test(again.mean, again.variance, stored, variance, mask, rounding=HALF_ROUNDING)
+    test = z_test(again.mean, again.variance, stored, variance, mask, rounding=HALF_ROUNDING, alpha=alpha)
     return Check(scene, kind, material, again.mean, test)

@@ -1,9 +1,9 @@
 """The verdict: which claims about the rows hold on this run, by the paired bootstrap 95 % interval."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Comparison, Selection, compare
 from unirender_evaluation.metrics import METRICS, Variant, metric_key
 from unirender_evaluation.records import Record, RunInfo
@@ -120,12 +120,13 @@ def ceiling_breaches(
             limit = {r.sample: r.values[key] for r in bound if key in r.values}
             for method in sorted({r.method for r in chosen} - {ceiling, *exempt}):
                 values = {r.sample: r.values[key] for r in chosen if r.method == method and key in r.values}
-                if not values:
+                common = values.keys() & limit.keys()
+                if not common:
                     continue
-                try:
-                    difference = paired_difference(values, limit, clusters)
-                except UnirenderError:
-                    continue  # an identical picture: infinite PSNR, shown as such in the table
+                if any(math.isinf(values[sample]) and math.isfinite(limit[sample]) for sample in common):
+                    breaches.append(CeilingBreach(table, protocol, key, method, math.inf))  # the truth itself
+                    continue
+                difference = paired_difference(values, limit, clusters)
                 if difference.low > 0:
                     breaches.append(CeilingBreach(table, protocol, key, method, difference.low))
     return breaches

@@ -7,6 +7,7 @@ comes from the spread between passes (Mitsuba's `moment` integrator gives XYZ, n
 import hashlib
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,25 +60,43 @@ def render_passes(
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
     width, height = scene.sensors()[0].film().crop_size()
     count = pass_count(spp, batches, SAMPLES_PER_PASS // int(width * height))
-    passes, nan_pixels = [], 0
+    before, passes = counters.nan_pixels, []
     for index in range(count):
-        picture = _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, 0), counters)
+
+        def draw(attempt: int, index: int = index) -> Float[np.ndarray, "h w 4"]:
+            return _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
+
+        passes.append(finite_pass(draw, counters, "render"))
+    return np.stack(passes), counters.nan_pixels - before
+
+
+def finite_pass(
+    draw: Callable[[int], Float[np.ndarray, "*n c"]], counters: Counters, what: str
+) -> Float[np.ndarray, "*n c"]:
+    """A pass whose pixels are all finite: those that are NaN or infinite are counted and taken from other draws.
+
+    Args:
+        draw: makes the pass; attempt 0 is the pass itself, attempts 1, 2, ... have other seeds.
+        counters: the repaired pixels are added here.
+        what: stands in the error message.
+
+    Raises:
+        UnirenderError: a pixel is not finite in any of `NAN_ATTEMPTS` other draws.
+    """
+    picture = draw(0)
+    bad = ~np.isfinite(picture).all(axis=-1)
+    counters.nan_pixels += int(bad.sum())
+    for attempt in range(1, NAN_ATTEMPTS + 1):
+        if not bad.any():
+            return picture
+        picture[bad] = draw(attempt)[bad]
         bad = ~np.isfinite(picture).all(axis=-1)
-        nan_pixels += int(bad.sum())
-        for attempt in range(1, NAN_ATTEMPTS + 1):
-            if not bad.any():
-                break
-            again = _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
-            picture[bad] = again[bad]
-            bad = ~np.isfinite(picture).all(axis=-1)
-        if bad.any():
-            raise UnirenderError(
-                f"render: {int(bad.sum())} pixels stay NaN after {NAN_ATTEMPTS} seeds, expected finite radiance; "
-                "check the mesh's normals and the light"
-            )
-        passes.append(picture)
-    counters.nan_pixels += nan_pixels
-    return np.stack(passes), nan_pixels
+    if bad.any():
+        raise UnirenderError(
+            f"{what}: {int(bad.sum())} pixels stay NaN after {NAN_ATTEMPTS} seeds, expected finite radiance; "
+            "check the normals and the light"
+        )
+    return picture
 
 
 def mean_estimate(passes: Float[np.ndarray, "n h w c"], nan_pixels: int, batches: int) -> Estimate:

@@ -17,14 +17,18 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_reference.backend import mitsuba
-from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, pass_count
+from unirender_reference.passes import SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
 from unirender_reference.scene import envmap_data
 
 LEAST_FACING = 0.01  # cosine to which normals that face away from the viewer are bent
 
 
 def shade(
-    intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"] | None = None, spp: int = 256, seed: int = 0
+    intrinsics: Intrinsics,
+    environment: Float[np.ndarray, "eh ew 3"] | None = None,
+    spp: int = 256,
+    seed: int = 0,
+    counters: Counters | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """The image of given maps under a light: linear, premultiplied by the mask (all ones where the mask is None).
 
@@ -33,9 +37,11 @@ def shade(
         environment: lat-long radiance in camera axes, display units; the intrinsics' own if None.
         spp: samples per pixel (each one light sample and one BSDF sample).
         seed: equal seeds give equal images.
+        counters: if given, its `nan_pixels` grows by the points that came out NaN or infinite in some pass and were
+            shaded again with another seed.
 
     Raises:
-        UnirenderError: a map is missing, or the environment is not usable.
+        UnirenderError: a map is missing, the environment is not usable, or a point stays NaN.
     """
     maps = intrinsics.require("albedo", "normal", "roughness", "metallic")
     if environment is None:
@@ -49,7 +55,7 @@ def shade(
         view = intrinsics.camera.view_directions(height, width)[inside]
         normal = facing_normals(maps["normal"][inside], view)
         material = {name: maps[name][inside] for name in ("albedo", "roughness", "metallic")}
-        image[inside] = _radiance(normal, view, material, environment, spp, seed)
+        image[inside] = _radiance(normal, view, material, environment, spp, seed, counters or Counters())
     return image if intrinsics.mask is None else (image * intrinsics.mask).astype(np.float32)
 
 
@@ -68,6 +74,7 @@ def _radiance(
     environment: Float[np.ndarray, "eh ew 3"],
     spp: int,
     seed: int,
+    counters: Counters,
 ) -> Float[np.ndarray, "n 3"]:
     """Outgoing radiance of n points with the given normals and materials, per-point mean over `spp` samples."""
     mi = mitsuba()
@@ -79,7 +86,12 @@ def _radiance(
     passes = pass_count(spp, 1, max(1, SAMPLES_PER_PASS // count))
     total = np.zeros((count, 3), np.float64)
     for index in range(passes):
-        total += _pass(scene, bsdf, normal, view, spp // passes, derive_seed(seed, "shade", index))
+
+        def draw(attempt: int, index: int = index) -> Float[np.ndarray, "n 3"]:
+            parts = ("shade", index, attempt) if attempt else ("shade", index)
+            return _pass(scene, bsdf, normal, view, spp // passes, derive_seed(seed, *parts))
+
+        total += finite_pass(draw, counters, "shade")
     return (total / passes).astype(np.float32)
 
 

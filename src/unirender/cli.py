@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from unirender.files import Picture
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
+MAX_STOPS = 32
+
 Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 
@@ -51,10 +53,13 @@ class ModelOptions:
         Raises:
             UnirenderError: no such checkpoint, or the device is not there.
         """
+        import diffusers
+
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
         device = resolve_device(self.device)
+        diffusers.utils.logging.disable_progress_bar()  # of loading: two small files
         pipeline = UniRenderPipeline.from_pretrained(self.checkpoint, torch_dtype=resolve_dtype(self.dtype, device))
         pipeline.to(device)
         pipeline.set_progress_bar_config(disable=not self.progress or not sys.stderr.isatty())
@@ -65,7 +70,9 @@ class ModelOptions:
         import torch
 
         if self.samples < 1 or (self.steps is not None and self.steps < 1):
-            raise UnirenderError(f"--samples {self.samples} --steps {self.steps}: expected at least 1 of each")
+            raise UnirenderError(
+                f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each (or no --steps)"
+            )
         sampled = self.samples > 1 or (self.steps or 1) > 1
         return {
             "mode": "sample" if sampled else "mean",
@@ -176,16 +183,20 @@ class Decompose:
 
     input: tyro.conf.OmitArgPrefixes[InputOptions]
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
+    closed: bool = True
+    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
         from unirender.files import new_folder, write_png, write_result
 
-        picture, sampling, camera = self.input.read(), self.model.sampling(), self.model.camera()
+        picture, camera = self.input.read(), self.model.camera()
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
-            pipeline = self.model.load()
-            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **sampling)
-            meta = {"command": "decompose", "input": str(self.input.picture)} | self.model.meta(pipeline)
+            pipeline, sampling = self.model.load(), self.model.sampling()
+            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, closed=self.closed, **sampling)
+            meta = {"command": "decompose", "input": str(self.input.picture), "closed": self.closed} | self.model.meta(
+                pipeline
+            )
             meta |= {"roughness_mean": result.roughness, "metallic_mean": result.metallic}
             write_result(folder, result.intrinsics, meta)
             for name, spread in (result.std or {}).items():
@@ -203,22 +214,25 @@ class Render:
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     environment: Path | None = None
     """Lat-long HDR or EXR light, or a photograph, instead of the folder's; s and d are derived from it."""
+    exposure: float | None = None
+    """Stops to add to that light as it is in its file. None: it is scaled by the rule of the training data."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
         import dataclasses
 
         from unirender.files import new_folder, read_result, write_result
+        from unirender.pipelines.editing import under_light
 
-        intrinsics, sampling = read_result(self.folder), self.model.sampling()
+        intrinsics = read_result(self.folder)
         if self.model.fov is not None:
             intrinsics = intrinsics.replace(camera=dataclasses.replace(intrinsics.camera, fov_deg=self.model.fov))
-        if self.environment is not None:
-            light = read_light(self.environment)
-            intrinsics = intrinsics.replace(environment=light, specular=None, diffuse=None)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
+            if self.environment is not None:
+                light = read_light(self.environment, self.exposure)
+                intrinsics = under_light(intrinsics, light, "auto" if self.exposure is None else "keep")
             pipeline = self.model.load()
-            image = pipeline.render(intrinsics, **sampling)
+            image = pipeline.render(intrinsics, **self.model.sampling())
             meta = {"command": "render", "input": str(self.folder)} | self.model.meta(pipeline)
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
@@ -237,6 +251,8 @@ class Edit:
     """New metallic of the whole object, in [0, 1]."""
     anchored: bool = True
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
+    closed: bool = True
+    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
@@ -248,9 +264,9 @@ class Edit:
             value = getattr(self, name)
             if value is not None and not 0 <= value <= 1:
                 raise UnirenderError(f"--{name} {value}: expected a number in [0, 1]")
-        picture, sampling, camera = self.input.read(), self.model.sampling(), self.model.camera()
+        picture, camera = self.input.read(), self.model.camera()
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
-            pipeline = self.model.load()
+            pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(
                 picture.image_srgb,
                 picture.mask,
@@ -258,10 +274,16 @@ class Edit:
                 metallic=self.metallic,
                 anchored=self.anchored,
                 camera=camera,
+                closed=self.closed,
                 **sampling,
             )
             meta = {"command": "edit", "input": str(self.input.picture)} | self.model.meta(pipeline)
-            meta |= {"roughness": self.roughness, "metallic": self.metallic, "anchored": self.anchored}
+            meta |= {
+                "roughness": self.roughness,
+                "metallic": self.metallic,
+                "anchored": self.anchored,
+                "closed": self.closed,
+            }
             write_result(folder, result.intrinsics, meta, result.image_linear)
         print(f"{self.out.output}")
         return 0
@@ -277,21 +299,24 @@ class Relight:
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     exposure: float | None = None
     """Stops to add to the light as it is in the file. None: the light is scaled by the rule of the training data."""
+    closed: bool = True
+    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
         from unirender.files import new_folder, write_result
 
-        picture, sampling, camera = self.input.read(), self.model.sampling(), self.model.camera()
-        light = read_light(self.environment)
+        picture, camera = self.input.read(), self.model.camera()
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
-            pipeline = self.model.load()
+            light = read_light(self.environment, self.exposure)
+            pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.relight(
                 picture.image_srgb,
-                light if self.exposure is None else light * 2.0**self.exposure,
+                light,
                 picture.mask,
                 exposure="auto" if self.exposure is None else "keep",
                 camera=camera,
+                closed=self.closed,
                 **sampling,
             )
             meta = {"command": "relight", "input": str(self.input.picture), "environment": str(self.environment)}
@@ -300,11 +325,17 @@ class Relight:
         return 0
 
 
-def read_light(path: Path) -> Any:
-    """Radiance `[h w 3]` of a light file, by the reference's rules."""
+def read_light(path: Path, exposure: float | None) -> Any:
+    """Radiance `[h w 3]` of a light file as it stands there, times `2**exposure`.
+
+    Raises:
+        UnirenderError: an unreadable file, or an exposure that is no number of stops.
+    """
+    if exposure is not None and not abs(exposure) <= MAX_STOPS:
+        raise UnirenderError(f"--exposure {exposure}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
     from unirender_reference.lights import load_light
 
-    return load_light(path).environment
+    return load_light(path, normalise=False).environment * 2.0 ** (exposure or 0.0)
 
 
 @dataclass(frozen=True)
@@ -352,6 +383,11 @@ class Dataset:
         with Progress(*columns, console=Console(stderr=True)) as bar:
             task = bar.add_task("groups", total=None)
             report = generate(config, lambda done, total: bar.update(task, completed=done, total=total))
+        if report.groups == 0:
+            print(
+                f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"
+            )
+            return 0
         print(
             f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
             f"workers, {report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers); "

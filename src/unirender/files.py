@@ -20,7 +20,7 @@ from jaxtyping import Float
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from unirender.camera import Camera
-from unirender.color import image_srgb, srgb_decode
+from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.exr import (
     channels_rgb,
@@ -125,6 +125,10 @@ def _read_display_picture(path: Path) -> Picture:
 
 def _read_exr_picture(path: Path) -> Picture:
     channels, _ = read_exr(path)
+    if not set("RGB") <= set(channels):
+        raise UnirenderError(
+            f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A)"
+        )
     rgb = channels_rgb(channels)
     alpha = channels.get("A")
     bad = ~np.isfinite(rgb).all(axis=-1) | (~np.isfinite(alpha) if alpha is not None else False)
@@ -144,14 +148,22 @@ def _read_exr_picture(path: Path) -> Picture:
 def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
 
+    Only a result folder (one with `meta.json`) is ever replaced.
+
     Raises:
-        UnirenderError: `path` exists and is not empty, and `overwrite` is not given; or it cannot be made.
+        UnirenderError: `path` exists and is not empty, and `overwrite` is not given or it is no result folder; or it
+            cannot be made.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise UnirenderError(f"{path}: is a file, expected a folder to write to")
-    if path.is_dir() and any(path.iterdir()) and not overwrite:
-        raise UnirenderError(f"{path}: exists and is not empty; choose another --output or pass --overwrite")
+    if path.is_dir() and any(path.iterdir()):
+        if not overwrite:
+            raise UnirenderError(f"{path}: exists and is not empty; choose another --output or pass --overwrite")
+        if not (path / META_FILE).is_file():
+            raise UnirenderError(
+                f"{path}: has no {META_FILE}, expected an earlier result to overwrite; choose another --output"
+            )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
@@ -163,8 +175,13 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
         if path.is_dir():
             old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
             os.rename(path, old / "old")
-            os.rename(temporary, path)
-            shutil.rmtree(old)
+            try:
+                os.rename(temporary, path)
+            except BaseException:
+                os.rename(old / "old", path)
+                raise
+            finally:
+                shutil.rmtree(old)
         else:
             os.rename(temporary, path)
     except BaseException:
@@ -246,10 +263,7 @@ def read_result(folder: str | Path) -> Intrinsics:
             raise UnirenderError(
                 f"{folder / META_FILE}: not readable ({error}); delete it to use the default camera"
             ) from error
-    return intrinsics_from_channels(channels, environment, camera)
-
-
-def picture_linear(picture: Picture) -> Float[np.ndarray, "h w 3"]:
-    """The picture as a premultiplied linear image."""
-    linear = srgb_decode(picture.image_srgb)
-    return linear if picture.mask is None else linear * picture.mask
+    try:
+        return intrinsics_from_channels(channels, environment, camera)
+    except UnirenderError as error:
+        raise UnirenderError(f"{folder}: {error}") from error

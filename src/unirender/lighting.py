@@ -14,6 +14,7 @@ Notation: n normal, v view direction, l light direction, alpha = roughness^2, d 
 
 import functools
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +22,9 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 QUADRATURE_SHAPE = (32, 64)  # resolution at which wide lobes are integrated
 SHARP_ROUGHNESS = 0.35  # below it a lobe is narrower than a quadrature texel: lobe samples with filtered lookups
@@ -87,36 +91,59 @@ def resample_environment(
     environment: Float[np.ndarray, "h w 3"], shape: tuple[int, int]
 ) -> Float[np.ndarray, "h2 w2 3"]:
     """The environment at another resolution; energy-preserving where it shrinks, bilinear where it grows."""
-    rows, columns = resampling_operators(environment.shape[:2], shape)
-    return np.einsum("ih,jw,hwc->ijc", rows, columns, environment, optimize=True).astype(np.float32)
+    height, width = environment.shape[:2]
+    rows, columns = resampling_operators((height, width), shape)
+    mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
+    new = (columns @ mixed.reshape(width, -1)).reshape(shape[1], shape[0], 3).transpose(1, 0, 2)
+    return np.ascontiguousarray(new, dtype=np.float32)
 
 
 @functools.lru_cache(maxsize=64)
-def resampling_operators(
-    source: tuple[int, int], target: tuple[int, int]
-) -> tuple[Float[np.ndarray, "h2 h"], Float[np.ndarray, "w2 w"]]:
-    """Matrices of `resample_environment`: `new = rows @ old @ columns.T` for each channel.
+def resampling_operators(source: tuple[int, int], target: tuple[int, int]) -> tuple["csr_array", "csr_array"]:
+    """Sparse matrices `[h2 h]`, `[w2 w]` of `resample_environment`: `new = rows @ old @ columns.T` for each channel.
 
     A target texel of a smaller map is the integral of the bilinear radiance against the texel's own bilinear weight,
     divided by the integral of that weight; the weights are a partition of unity, so the total is kept.
     """
+    from scipy.sparse import csr_array
+
     (h, w), (h2, w2) = source, target
     _check_shape(source)
     _check_shape(target)
     if h2 < h:
         theta = (np.arange(64 * h) + 0.5) * np.pi / (64 * h)  # midpoint rule over the polar angle
-        old, new = _hat_weights(theta * (h - 1) / np.pi, h), _hat_weights(theta * (h2 - 1) / np.pi, h2)
-        mass = new * np.sin(theta)[:, None]
-        rows = mass.T @ old / mass.sum(axis=0)[:, None]
+        old, new = hat_weights(theta * (h - 1) / np.pi, h), hat_weights(theta * (h2 - 1) / np.pi, h2)
+        rows = weighted_means(new, np.sin(theta)) @ old
     else:
-        rows = _hat_weights(np.arange(h2) * (h - 1) / (h2 - 1), h)
+        rows = hat_weights(np.arange(h2) * (h - 1) / (h2 - 1), h)
     if w2 < w:
         u = (np.arange(64 * w) + 0.5) / (64 * w)
-        old, new = _hat_weights(u * w - 0.5, w, wrap=True), _hat_weights(u * w2 - 0.5, w2, wrap=True)
-        columns = new.T @ old / new.sum(axis=0)[:, None]
+        old, new = hat_weights(u * w - 0.5, w, wrap=True), hat_weights(u * w2 - 0.5, w2, wrap=True)
+        columns = weighted_means(new, np.ones(64 * w)) @ old
     else:
-        columns = _hat_weights((np.arange(w2) + 0.5) * w / w2 - 0.5, w, wrap=True)
-    return rows.astype(np.float32), columns.astype(np.float32)
+        columns = hat_weights((np.arange(w2) + 0.5) * w / w2 - 0.5, w, wrap=True)
+    return csr_array(rows, dtype=np.float32), csr_array(columns, dtype=np.float32)
+
+
+def hat_weights(position: Float[np.ndarray, " m"], n: int, wrap: bool = False) -> "csr_array":
+    """Weights `[m n]` of the n texels in the linear interpolant at fractional texel positions; two in a row."""
+    from scipy.sparse import csr_array
+
+    first = np.floor(position).astype(np.int64)
+    if not wrap:
+        first = np.clip(first, 0, n - 2)
+    fraction = position - first
+    columns = np.stack([first % n, (first + 1) % n], axis=1)
+    weights = np.stack([1 - fraction, fraction], axis=1)
+    return csr_array((weights.ravel(), columns.ravel(), 2 * np.arange(len(position) + 1)), shape=(len(position), n))
+
+
+def weighted_means(weights: "csr_array", measure: Float[np.ndarray, " m"]) -> "csr_array":
+    """The matrix `[n m]` that averages values at m points under each of n weights `[m n]`, points by their measure."""
+    from scipy.sparse import csr_array, diags_array
+
+    total = weights.T @ measure
+    return csr_array(diags_array(1 / total) @ weights.T @ diags_array(measure))
 
 
 def diffuse_light(
@@ -180,19 +207,6 @@ def with_derived_light(intrinsics: Intrinsics) -> Intrinsics:
 def _check_shape(shape: tuple[int, ...]) -> None:
     if len(shape) != 2 or shape[0] < 2 or shape[1] < 2:
         raise UnirenderError(f"environment: got size {shape}, expected a lat-long map of at least 2 x 2 texels")
-
-
-def _hat_weights(position: Float[np.ndarray, " m"], n: int, wrap: bool = False) -> Float[np.ndarray, "m n"]:
-    """Weights of the n texels in the linear interpolant at fractional texel positions."""
-    first = np.floor(position).astype(np.int64)
-    if not wrap:
-        first = np.clip(first, 0, n - 2)
-    fraction = position - first
-    weights = np.zeros((len(position), n))
-    index = np.arange(len(position))
-    np.add.at(weights, (index, first % n), 1 - fraction)
-    np.add.at(weights, (index, (first + 1) % n), fraction)
-    return weights
 
 
 def _chunks(pixels: int, per_pixel: int) -> list[slice]:

@@ -2,6 +2,7 @@
 verdict."""
 
 import json
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
-from unirender_evaluation.engine import Store, content_key
+from unirender_evaluation.engine import Prediction, Store, content_key, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.records import Record, RunInfo, read_records
@@ -146,14 +147,32 @@ def test_ceiling_holds_and_a_leaking_method_is_caught(suite: Suite, tmp_path: Pa
     records = evaluate(suite, trivial_rows(), tmp_path / "records.jsonl")
     # This suite's truth is noise-free composites with a claimed noise: its composite row is as good as a leak.
     assert ceiling_breaches(records, exempt=("composite",)) == []
-    leaking = []
+    leaking, better = [], []
+    for task in tasks(suite, "rendering", "given", list(suite.scenes)):
+        image = task.truth_image
+        values = score(task, Prediction(image=image), ())
+        assert values[f"{task.quantity}.psnr@masked-srgb-raw"] == inf
+        leaking.append(Record(task.table, task.protocol, "leak", task.sample, task.scene.object, values))
     for record in records:
         if record.method == "noise-ceiling" and record.table == "rendering":
             values = {key: value + 3 for key, value in record.values.items()}
-            leaking.append(Record(record.table, record.protocol, "leak", record.sample, record.object, values))
-    breaches = ceiling_breaches([*records, *leaking], exempt=("composite",))
-    assert {b.method for b in breaches} == {"leak"}
-    assert all(b.low_db == pytest.approx(3) for b in breaches)
+            better.append(Record(record.table, record.protocol, "better", record.sample, record.object, values))
+    breaches = ceiling_breaches([*records, *leaking, *better], exempt=("composite",))
+    assert {b.method for b in breaches} == {"leak", "better"}
+    assert all(b.low_db == (inf if b.method == "leak" else pytest.approx(3)) for b in breaches)
+
+
+def test_a_partial_run_keeps_the_records_of_the_whole_one(suite: Suite, tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl"
+    whole = evaluate(suite, trivial_rows(), path)
+    store = Store.open(path)
+    assert store.has(whole[0].key)
+    assert [record.key for record in store.close(keep_unused=True)] == [whole[0].key]
+    assert {record.key for record in read_records(path)} == {record.key for record in whole}
+    store = Store.open(path)
+    assert store.has(whole[0].key)
+    store.close()
+    assert [record.key for record in read_records(path)] == [whole[0].key]
 
 
 def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:

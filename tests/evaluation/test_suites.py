@@ -200,7 +200,7 @@ def test_shipped_truth_reaches_its_noise_ceiling() -> None:
 @pytest.mark.slow
 def test_shipped_truth_agrees_with_mitsuba_here() -> None:
     """One image and one roughness 12 % off, rendered here: the first passes the z-test, the second must not."""
-    from unirender_evaluation.truth_check import _check_image, chosen_scenes
+    from unirender_evaluation.truth_check import _check_geometry, _check_image, chosen_scenes
     from unirender_reference.render import Renderer
     from unirender_reference.shapes import make_object
 
@@ -214,3 +214,5 @@ def test_shipped_truth_agrees_with_mitsuba_here() -> None:
     wrong = _check_image(suite, renderer, scene, suite.spec.base, (0.5, 0.56), seed=5)
     assert good.test.passed, str(good.test)
     assert not wrong.test.passed, str(wrong.test)
+    geometry = _check_geometry(suite, renderer, scene, seed=5)
+    assert geometry.passed, str(geometry)

@@ -18,7 +18,10 @@ import webdataset
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr_bytes
 from unirender_reference.dataset import generate
+from unirender_reference.lights import make_light
 from unirender_reference.plan import GRID, DatasetConfig, basis_shape, plan_groups
+from unirender_reference.render import SceneSpec, scene_hash
+from unirender_reference.shapes import make_object
 from unirender_reference.shards import shard_name, write_shard
 
 SIZE = 8
@@ -155,6 +158,33 @@ def test_every_sample_is_read_back_through_webdataset(whole: Path) -> None:
                 pictures += 1
     assert pictures == manifest["samples"] == 12
     assert manifest["complete"]
+
+
+def test_every_file_says_how_it_was_made(whole: Path) -> None:
+    """The header attributes that the data contract promises; scene hashes are those of the scenes themselves."""
+    plan, first = plan_groups(config(whole, pairs=6))[0], read_back(whole)[0]
+    obj, scenes = make_object(plan.object_seed, "train"), set()
+    for i, light in enumerate(plan.lights):
+        for r, m in light.pairs:
+            _, attributes = read_exr_bytes(first[f"l{i}.m{m:03d}_r{r:03d}.exr"])
+            spec = SceneSpec(
+                obj,
+                make_light(light.seed, "train"),
+                r / 100,
+                m / 100,
+                resolution=SIZE,
+                exposure_seed=light.exposure_seed,
+            )
+            assert attributes["scene"] == scene_hash(spec)
+            scenes.add(attributes["scene"])
+    assert len(scenes) == plan.samples
+    promised = {"mitsuba", "variant", "spp", "seed", "scene", "camera"}
+    for sample in read_back(whole):
+        for name, data in sample.items():
+            if name.endswith(".exr"):
+                attributes = read_exr_bytes(data)[1]
+                assert promised <= set(attributes), name
+                assert ("exposure_factor" in attributes) == name.startswith("l"), name
 
 
 def test_exposure_maps_the_bright_end_of_d_into_the_stated_range(whole: Path) -> None:

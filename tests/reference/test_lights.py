@@ -1,8 +1,10 @@
 """Lights: normalisation, orientation, splits, the photograph rule, files."""
 
 import struct
+import tracemalloc
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -132,6 +134,75 @@ def test_exr_and_rgbe_maps_agree(tmp_path):
     assert exr.provenance["rule"] == "lat-long"
     assert hdr.environment == pytest.approx(exr.environment, abs=0.03)
     assert lights.load_light(tmp_path / "map.exr", shape=(8, 16)).environment.shape == (8, 16, 3)
+
+
+def test_area_resampling_of_a_large_picture_costs_little_memory():
+    picture = np.ones((1024, 2048, 3), np.float32)
+    tracemalloc.start()
+    same = area_resampled(picture, (1024, 2048))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
+    np.testing.assert_allclose(same, 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("photograph", [False, True])
+def test_scale_of_a_file_is_recorded_or_kept(tmp_path, photograph):
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(1, 7, (16, 32, 3)).astype(np.float32)
+    write_exr(tmp_path / "map.exr", image_channels(pixels), half=False)
+    kept = lights.load_light(tmp_path / "map.exr", photograph, normalise=False)
+    scaled = lights.load_light(tmp_path / "map.exr", photograph)
+    assert kept.provenance["scale"] == "1.0"
+    scale = float(scaled.provenance["scale"])
+    np.testing.assert_allclose(scaled.environment, kept.environment * scale, rtol=1e-6)
+    assert mean_luminance(scaled.environment) == pytest.approx(1, rel=1e-4)
+    assert scale == pytest.approx(1 / mean_luminance(kept.environment), rel=1e-6)
+    assert scale < 0.5
+
+
+def test_a_constant_file_keeps_its_radiance(tmp_path):
+    write_exr(tmp_path / "map.exr", image_channels(np.full((16, 32, 3), 2.5, np.float32)))
+    np.testing.assert_allclose(lights.load_light(tmp_path / "map.exr", normalise=False).environment, 2.5, rtol=1e-6)
+    Image.fromarray(np.full((90, 180, 3), 255, np.uint8)).save(tmp_path / "white.png")
+    assert lights.load_light(tmp_path / "white.png", normalise=False).environment.max() == pytest.approx(files.PEAK)
+
+
+def test_grey_exr_is_white_light_but_luminance_chroma_is_not(tmp_path):
+    grey = np.linspace(0.5, 1, 32, dtype=np.float32)[None].repeat(16, 0)
+    write_exr(tmp_path / "grey.exr", {"Y": grey})
+    e = lights.load_light(tmp_path / "grey.exr").environment
+    np.testing.assert_array_equal(e, e[..., :1].repeat(3, -1))
+    write_exr(tmp_path / "chroma.exr", {"Y": grey, "RY": grey, "BY": grey})
+    write_exr(tmp_path / "depth.exr", {"Z": grey})
+    for name in ("chroma", "depth"):
+        with pytest.raises(UnirenderError, match=f"{name}.exr: got EXR channels .*expected R, G, B, or Y alone"):
+            lights.load_light(tmp_path / f"{name}.exr")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_exr_that_is_not_finite_is_refused(tmp_path, value):
+    pixels = np.ones((16, 32), np.float32)
+    pixels[3, 4] = value
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, dict.fromkeys("RGB", pixels)).write(
+        str(tmp_path / "map.exr")
+    )  # our own writer refuses
+    with pytest.raises(UnirenderError, match=r"map\.exr: 3 values are NaN or infinite"):
+        lights.load_light(tmp_path / "map.exr")
+
+
+def test_the_brightest_floats_are_scaled(tmp_path):
+    write_exr(tmp_path / "map.exr", image_channels(np.full((16, 32, 3), 3e38, np.float32)), half=False)
+    light = lights.load_light(tmp_path / "map.exr")
+    np.testing.assert_allclose(light.environment, 1, rtol=1e-5)
+
+
+def test_negative_maps_are_refused(tmp_path):
+    pixels = np.ones((16, 32, 3), np.float32)
+    pixels[:, :8] = -1
+    write_exr(tmp_path / "map.exr", image_channels(pixels))
+    with pytest.raises(UnirenderError, match="24% of the radiance is negative"):
+        lights.load_light(tmp_path / "map.exr")
 
 
 def test_negative_lobes_are_counted(tmp_path):

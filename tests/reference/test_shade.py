@@ -1,5 +1,7 @@
 """`shade` against closed forms, a Mitsuba render of the same scene, and its own arguments."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import reference_scenes as scenes
@@ -8,6 +10,8 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
+from unirender_reference import shade as shading
+from unirender_reference.passes import Counters
 from unirender_reference.render import Renderer
 from unirender_reference.shade import facing_normals, shade
 
@@ -66,6 +70,41 @@ def test_equal_seeds_give_equal_images() -> None:
     light, intrinsics = scenes.environment(), maps()
     assert np.array_equal(shade(intrinsics, light, 16, 3), shade(intrinsics, light, 16, 3))
     assert not np.array_equal(shade(intrinsics, light, 16, 3), shade(intrinsics, light, 16, 4))
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, times: int, value: float) -> list[int]:
+    """The first `times` passes of `shade` get `value` in point 7; returns the seeds of all passes, as they come."""
+    genuine, seeds = shading._pass, []
+
+    def draw(*args: Any) -> np.ndarray:
+        points = genuine(*args)
+        seeds.append(args[-1])
+        if len(seeds) <= times:
+            points[7, 1] = value
+        return points
+
+    monkeypatch.setattr(shading, "_pass", draw)
+    return seeds
+
+
+@pytest.mark.parametrize(("times", "value"), [(1, np.nan), (3, np.inf)])
+def test_points_that_come_out_nan_are_shaded_again(monkeypatch: pytest.MonkeyPatch, times: int, value: float) -> None:
+    light, intrinsics, counters = scenes.environment(), maps().replace(mask=None), Counters()
+    clean = shade(intrinsics, light, 16)
+    seeds = spoil(monkeypatch, times, value)
+    repaired = shade(intrinsics, light, 16, counters=counters)
+    assert counters.nan_pixels == 1
+    assert len(set(seeds)) == times + 1
+    differs = np.argwhere((clean != repaired).any(axis=-1))
+    inside = np.argwhere(np.any(intrinsics.require("normal")["normal"] != 0, axis=-1))
+    assert differs.tolist() == [inside[7].tolist()]
+    assert np.isfinite(repaired).all()
+
+
+def test_points_that_stay_nan_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    spoil(monkeypatch, 100, np.nan)
+    with pytest.raises(UnirenderError, match="shade: 1 pixels stay NaN after 8 seeds"):
+        shade(maps(), scenes.environment(), 16)
 
 
 def test_image_is_premultiplied() -> None:

@@ -94,6 +94,7 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
     out = tmp_path / "out"
     with new_folder(out) as folder:
         (folder / "a").write_text("old")
+        (folder / "meta.json").write_text("{}")
 
     def fail_half_way() -> None:
         with new_folder(out, overwrite=True) as folder:
@@ -106,6 +107,9 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     with pytest.raises(UnirenderError, match="--overwrite"), new_folder(out):
         pass
+    (out / "meta.json").unlink()
+    with pytest.raises(UnirenderError, match=r"no meta\.json"), new_folder(out, overwrite=True):
+        pass  # a folder that is no result is never replaced
     (tmp_path / "file").write_text("")
     with pytest.raises(UnirenderError, match="is a file"), new_folder(tmp_path / "file"):
         pass

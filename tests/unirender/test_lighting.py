@@ -1,5 +1,7 @@
 """Environment maps: closed forms, invariants and Monte Carlo for the light that a surface receives."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -168,6 +170,27 @@ def test_sharp_and_wide_lobes_meet() -> None:
     inside = normal[..., 2] > 0.4
     a, b = (image_srgb(0.5 * specular_light(normal, r, environment))[inside] for r in (0.3499, 0.3501))
     assert -10 * np.log10(np.mean((a - b) ** 2)) > 35
+
+
+def test_a_large_map_costs_little_memory_and_gives_the_light_of_its_small_version() -> None:
+    """1024 x 2048 texels with a sun: dense resampling matrices alone would be 2 GB."""
+    normal, environment = sphere_normals(), smooth_environment(1024, 2048)
+    axis = np.array([0.48, 0.6, 0.64], dtype=np.float32)
+    environment += 5 * np.exp(300 * (environment_directions(1024, 2048) @ axis - 1))[..., None]
+
+    def lights(environment: np.ndarray) -> list[np.ndarray]:
+        rough = (specular_light(normal, r, environment) for r in (0.15, 0.3, 0.6))
+        return [image_srgb(0.5 * light) for light in (diffuse_light(normal, environment), *rough)]
+
+    tracemalloc.start()
+    large = lights(environment)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 400e6
+    small, twin = lights(resample_environment(environment, (256, 512))), lights(np.roll(environment, 100, axis=1))
+    for a, b, other in zip(large, small, twin, strict=True):
+        assert -10 * np.log10(np.mean((a - b) ** 2)) > 40
+        assert -10 * np.log10(np.mean((a - other) ** 2)) < 40
 
 
 def test_light_is_linear_and_needs_a_map() -> None:

@@ -22,15 +22,21 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
 from unirender_reference.backend import mitsuba
-from unirender_reference.lights.light import Light, area_resampled, normalized
+from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
 KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
 WINDOW_DEG, FADE_DEG = 45.0, 30.0
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
+NEGATIVE_MOST = 0.05  # share of the total up to which negative values pass as ringing
 
 
-def load_light(path: str | Path, photograph: bool | None = None, shape: tuple[int, int] | None = None) -> Light:
+def load_light(
+    path: str | Path,
+    photograph: bool | None = None,
+    shape: tuple[int, int] | None = None,
+    normalise: bool = True,
+) -> Light:
     """Loads a light from a file.
 
     Args:
@@ -38,13 +44,15 @@ def load_light(path: str | Path, photograph: bool | None = None, shape: tuple[in
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
             None: by suffix (HDR formats are lat-long, others are photographs).
         shape: rows and columns of the result; None: the file's own for lat-long maps, 128 x 256 for photographs.
+        normalise: scale to mean luminance 1; False keeps the radiance of the file (of a photograph: white is `PEAK`).
 
     Returns:
-        The light; negative values of resampled HDR files (ringing of their makers' filters) are set to 0 *after*
-        resampling, and their share of the total is in the provenance.
+        The light; `scale` in its provenance is the factor from the file's radiance to the light's. Negative values of
+        resampled HDR files (ringing of their makers' filters) are set to 0 *after* resampling, and their share of the
+        total is in the provenance.
 
     Raises:
-        UnirenderError: missing, unreadable, not finite, black, or no lat-long map.
+        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map.
     """
     path = Path(path)
     if not path.is_file():
@@ -53,7 +61,8 @@ def load_light(path: str | Path, photograph: bool | None = None, shape: tuple[in
     pixels = _read_hdr(path) if hdr else expand_range(srgb_decode(_read_ldr(path)))
     if not np.isfinite(pixels).all():
         raise UnirenderError(
-            f"light {path}: {(~np.isfinite(pixels)).sum()} values are NaN or infinite; repair the file"
+            f"light {path}: {(~np.isfinite(pixels)).sum()} values are NaN or infinite, expected finite radiance; "
+            "repair the file"
         )
     as_photograph = photograph if photograph is not None else not hdr
     provenance = {"source": "file", "file": path.name, "rule": "lat-long"}
@@ -68,10 +77,20 @@ def load_light(path: str | Path, photograph: bool | None = None, shape: tuple[in
                 "pass photograph=True for an ordinary picture"
             )
         environment = area_resampled(pixels, shape or (h, w))
-    negative = float(-np.minimum(environment, 0).sum() / max(np.abs(environment).sum(), 1e-30))
+    total = np.abs(environment).sum(dtype=np.float64)
+    negative = float(-np.minimum(environment, 0).sum(dtype=np.float64) / max(total, 1e-30))
+    if negative > NEGATIVE_MOST:
+        raise UnirenderError(
+            f"light {path}: {negative:.0%} of the radiance is negative, expected values >= 0 "
+            f"(up to {NEGATIVE_MOST:.0%} pass as ringing of a filter); repair the file"
+        )
     if negative > 0:
         provenance["negative_share"] = f"{negative:.2e}"
-    environment = normalized(np.maximum(environment, 0), f"light {path}")
+    environment = np.maximum(environment, 0)
+    mean = mean_luminance(environment, f"light {path}")
+    if normalise:
+        environment = (environment / mean).astype(np.float32)
+    provenance["scale"] = repr(1 / mean if normalise else 1.0)
     name = path.stem.replace(".", "-").replace("/", "-") or "light"
     return Light(name, environment, provenance)
 
@@ -123,8 +142,13 @@ def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
 def _read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
     if path.suffix.lower() == ".exr":
         channels, _ = read_exr(path)
-        if "R" not in channels and "Y" in channels:
+        if "R" not in channels and "Y" in channels and not {"RY", "BY"} & channels.keys():
             channels = dict.fromkeys("RGB", channels["Y"])
+        if not channels.keys() >= set("RGB"):
+            raise UnirenderError(
+                f"light {path}: got EXR channels {', '.join(sorted(channels))}, expected R, G, B, or Y alone (grey); "
+                "convert the file"
+            )
         return channels_rgb(channels)
     mi = mitsuba()
     try:

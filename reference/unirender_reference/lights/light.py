@@ -2,18 +2,22 @@
 
 Maps are linear Rec.709 radiance in camera axes, +y up, on the grid of `unirender.lighting` (rows at theta =
 pi i / (H - 1), columns at centres; the middle of the map is +z, behind the camera). A light has no exposure of its own:
-its luminance, averaged over the sphere by solid angle, is 1.
+its luminance, averaged over the sphere by solid angle, is 1 (but for files loaded with `normalise=False`).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.color import luminance
 from unirender.errors import UnirenderError
-from unirender.lighting import mean_radiance
+from unirender.lighting import hat_weights, mean_radiance, weighted_means
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 SHAPE = (64, 128)
 
@@ -24,7 +28,7 @@ class Light:
 
     Attributes:
         name: without dots.
-        environment: (h, w, 3) float32, >= 0, mean luminance 1.
+        environment: (h, w, 3) float32, >= 0, mean luminance 1 unless it was loaded as the file has it.
         provenance: how it was made, as text.
     """
 
@@ -43,7 +47,12 @@ class Light:
 
 
 def normalized(environment: Float[np.ndarray, "h w 3"], name: str = "light") -> Float[np.ndarray, "h w 3"]:
-    """The map scaled to mean luminance 1.
+    """The map scaled to mean luminance 1; errors as `mean_luminance`."""
+    return (environment / mean_luminance(environment, name)).astype(np.float32)
+
+
+def mean_luminance(environment: Float[np.ndarray, "h w 3"], name: str = "light") -> float:
+    """Luminance of the map, averaged over the sphere by solid angle.
 
     Raises:
         UnirenderError: the map is black.
@@ -51,7 +60,7 @@ def normalized(environment: Float[np.ndarray, "h w 3"], name: str = "light") -> 
     mean = float(luminance(mean_radiance(environment)[None])[0])
     if not mean > 1e-12:
         raise UnirenderError(f"{name}: mean luminance is {mean:g}, expected more than 0; give a map that is not black")
-    return (environment / mean).astype(np.float32)
+    return mean
 
 
 def turned(environment: Float[np.ndarray, "h w 3"], rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
@@ -68,11 +77,19 @@ def area_resampled(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -
     (h, w), (h2, w2) = pixels.shape[:2], shape
     fine = max(1, -(-4 * h2 // h))
     theta = (np.arange(h * fine) + 0.5) * np.pi / (h * fine)
-    rows = np.maximum(1 - np.abs(theta[None] * (h2 - 1) / np.pi - np.arange(h2)[:, None]), 0) * np.sin(theta)
-    rows = (rows / rows.sum(1, keepdims=True)).reshape(h2, h, fine).sum(2)
+    rows = weighted_means(hat_weights(theta * (h2 - 1) / np.pi, h2), np.sin(theta)) @ _pixel_of(h, fine)
     fine = max(1, -(-4 * w2 // w))
     phi = (np.arange(w * fine) + 0.5) / (w * fine) * w2 - 0.5
-    away = np.abs((phi[None] - np.arange(w2)[:, None] + w2 / 2) % w2 - w2 / 2)
-    columns = np.maximum(1 - away, 0)
-    columns = (columns / columns.sum(1, keepdims=True)).reshape(w2, w, fine).sum(2)
-    return np.einsum("ih,jw,hwc->ijc", rows, columns, pixels.astype(np.float64), optimize=True).astype(np.float32)
+    columns = weighted_means(hat_weights(phi, w2, wrap=True), np.ones(w * fine)) @ _pixel_of(w, fine)
+    out = np.empty((h2, w2, 3), np.float32)
+    for k in range(3):
+        out[..., k] = (columns @ (rows @ pixels[..., k].astype(np.float64)).T).T
+    return out
+
+
+def _pixel_of(count: int, fine: int) -> "csr_array":
+    """The matrix `[count*fine count]` that reads pixels at `fine` points in each."""
+    from scipy.sparse import csr_array
+
+    points = np.arange(count * fine)
+    return csr_array((np.ones(count * fine), (points, points // fine)), shape=(count * fine, count))

@@ -6,11 +6,14 @@ Notation: s specular light, I the input, R_0 and R_1 the renders of the decompos
 import numpy as np
 from jaxtyping import Float
 
+from unirender.errors import UnirenderError
+from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import specular_light
+from unirender.lighting import diffuse_light, specular_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
+RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
 ANCHOR_FLOOR = 0.02  # radiance added to both: where the old render is dark, the change is added as it is
 
@@ -51,6 +54,38 @@ def anchor(
     """
     gain = np.clip((image_linear + ANCHOR_FLOOR) / (before + ANCHOR_FLOOR), 1 / ANCHOR_GAIN, ANCHOR_GAIN)
     return np.maximum(image_linear + gain * (after - before), 0).astype(np.float32)
+
+
+def under_light(
+    intrinsics: Intrinsics,
+    environment: Float[np.ndarray, "eh ew 3"],
+    exposure: str,
+    specular: Float[np.ndarray, "h w 3"] | None = None,
+    diffuse: Float[np.ndarray, "h w 3"] | None = None,
+) -> Intrinsics:
+    """The intrinsics under another light: s and d from its own resolution (without shadows), unless they are given.
+
+    Args:
+        intrinsics: with normal, roughness and mask.
+        environment: lat-long radiance in camera axes.
+        exposure: `auto` scales the light by the rule of the training data, to the middle of its range; `keep` does not.
+        specular: s under that light, if known; not scaled.
+        diffuse: the same for d.
+
+    Raises:
+        UnirenderError: another exposure, a map is missing, or the object receives no light.
+    """
+    if exposure not in ("auto", "keep"):
+        raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
+    maps = intrinsics.require("normal", "roughness", "mask")
+    derived = diffuse_light(maps["normal"], environment)
+    factor = exposure_factor(derived, maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
+    environment = (environment * factor).astype(np.float32)
+    if specular is None:
+        specular = specular_light(maps["normal"], maps["roughness"], environment, intrinsics.camera)
+    return intrinsics.replace(
+        environment=environment, specular=specular, diffuse=derived * factor if diffuse is None else diffuse
+    )
 
 
 def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:

@@ -24,15 +24,15 @@ from unirender.color import srgb_decode
 from unirender.composite import composite_image
 from unirender.diffusion.sampling import NUM_SAMPLES, infer_attributes, infer_image, steps_of
 from unirender.errors import UnirenderError
-from unirender.exposure import exposure_factor
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.lighting import diffuse_light, resample_environment, specular_light
+from unirender.lighting import resample_environment
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import TRIPLETS, Conditioning, Maps
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.precision import resolve_device, resolve_dtype
-from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
-from unirender.pipelines.framing import Frame
+from unirender.pipelines.closure import close_decomposition
+from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, under_light
+from unirender.pipelines.framing import Frame, divide
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, unit_value
 from unirender.pipelines.results import Decomposition, EditResult, combine, predicted_intrinsics, unit_normal
 
@@ -46,9 +46,6 @@ __all__ = [
 ]
 
 SHIPPED_CHECKPOINT = Path(__file__).parent.parent / "checkpoints" / "tiny"
-RELIGHT_TARGET = (
-    0.75  # brightness of white under a light whose exposure is chosen here: the middle of the gauge's range
-)
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
@@ -115,6 +112,7 @@ class UniRenderPipeline(DiffusionPipeline):
         num_samples: int | None = None,
         generator: torch.Generator | None = None,
         material: str | None = None,
+        closed: bool = True,
     ) -> Decomposition:
         """Inverse rendering.
 
@@ -125,14 +123,18 @@ class UniRenderPipeline(DiffusionPipeline):
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
             num_inference_steps: of `sample`; 20 if None.
             num_samples: of `sample`; 5 if None.
-            generator: a CPU generator for the noise.
+            generator: a CPU generator for the noise; None: a fixed noise in mode `mean` (an expectation depends on no
+                draw), torch's global state in mode `sample`.
             material: one number per object or maps; None: as the checkpoint was trained.
+            closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`); False
+                gives what the network predicts.
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
         """
         picture, cover = as_picture(image_srgb, mask)
         steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
+        generator = generator or _fixed_noise(mode)
         camera, material = camera or Camera(), material or self.config["material"]
         if material not in ("scalar", "map"):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
@@ -152,7 +154,11 @@ class UniRenderPipeline(DiffusionPipeline):
         )
         arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
         rows = [{name: value[i] for name, value in arrays.items()} for i in range(count)]
-        return combine(tuple(predicted_intrinsics(row, frame, cover, camera, material) for row in rows))
+        samples = [predicted_intrinsics(row, frame, cover, camera, material) for row in rows]
+        if closed:
+            linear = srgb_decode(picture) * cover
+            samples = [close_decomposition(sample, linear, self.render) for sample in samples]
+        return combine(tuple(samples))
 
     def render(
         self,
@@ -177,6 +183,7 @@ class UniRenderPipeline(DiffusionPipeline):
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
         steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
+        generator = generator or _fixed_noise(mode)
         intrinsics = ready_to_render(intrinsics)
         frame = Frame(intrinsics.height, intrinsics.width, self.size)
         small = self._enter(intrinsics, frame)
@@ -194,11 +201,18 @@ class UniRenderPipeline(DiffusionPipeline):
         )
         rendered = image.mean(dim=0).permute(1, 2, 0).float().cpu().numpy()
         known = {"albedo", "specular", "diffuse"} <= set(intrinsics.present)
-        if frame.identity or not known:
-            return frame.leave(rendered)
+        mask = intrinsics.require("mask")["mask"]
+        if frame.identity:
+            return rendered * (mask > 0)
+        inside = small.require("mask")["mask"]
+        radiance = frame.leave_map(divide(rendered, inside), mask)
+        if not known:
+            return radiance * mask
         # The detail of a larger picture is in its composite; the model adds what it lacks, in display values.
-        change = frame.leave(encode_srgb(rendered) - encode_srgb(composite_image(small)))
-        return srgb_decode(np.clip(encode_srgb(composite_image(intrinsics)) + change, 0, 1))
+        small_composite = frame.leave_map(divide(composite_image(small), inside), mask)
+        change = encode_srgb(radiance) - encode_srgb(small_composite)
+        large_composite = divide(composite_image(intrinsics), mask)
+        return srgb_decode(np.clip(encode_srgb(large_composite) + change, 0, 1)) * mask
 
     def edit(
         self,
@@ -272,8 +286,6 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: as `decompose`; or neither a light nor both s and d are given.
         """
-        if exposure not in ("auto", "keep"):
-            raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
         picture, cover = as_picture(image_srgb, mask)
@@ -281,15 +293,10 @@ class UniRenderPipeline(DiffusionPipeline):
             environment = as_environment(environment)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
         before = decomposition.intrinsics
-        maps = before.require("normal", "roughness")
         if environment is not None:
-            derived = diffuse_light(maps["normal"], environment)
-            factor = exposure_factor(derived, cover, RELIGHT_TARGET) if exposure == "auto" else 1.0
-            environment = (environment * factor).astype(np.float32)
-            diffuse = derived * factor if diffuse is None else diffuse
-            if specular is None:
-                specular = specular_light(maps["normal"], maps["roughness"], environment, before.camera)
-        edited = before.replace(environment=environment, specular=specular, diffuse=diffuse)
+            edited = under_light(before, environment, exposure, specular, diffuse)
+        else:
+            edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
         image = self._rerender(picture, cover, before, edited, anchored, sampling)
         return EditResult(image, edited, decomposition)
 
@@ -305,7 +312,7 @@ class UniRenderPipeline(DiffusionPipeline):
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
         # Both renders see the same noise, so that it cancels in what changes.
-        seed = _draw_seed(sampling.get("generator"))
+        seed = _draw_seed(sampling.get("generator") or _fixed_noise(sampling.get("mode", "mean")))
         after = self.render(edited, generator=torch.Generator().manual_seed(seed), **settings)
         if not anchored:
             return after
@@ -343,6 +350,10 @@ class UniRenderPipeline(DiffusionPipeline):
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
         return self.progress_bar(steps)  # pyright: ignore[reportReturnType, reportCallIssue, reportArgumentType] - tqdm
+
+
+def _fixed_noise(mode: str) -> torch.Generator | None:
+    return torch.Generator().manual_seed(0) if mode == "mean" else None
 
 
 def _sample_count(mode: str, num_samples: int | None) -> int:

@@ -69,6 +69,7 @@ class TrainConfig:
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     batch_size: int = 16
+    steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
     p_render: float = 0.5  # share of rendering; the paper's p_direction
     p_t: float = 0.5  # share of random t instead of T
@@ -96,6 +97,7 @@ _SD = TrainConfig(
         learning_rate=1e-5, beta1=0.8, beta2=0.999, warmup_steps=0, final_lr=1.0, ema_decay=0.9999
     ),
     batch_size=4,
+    steps=150_000,
 )
 
 PRESETS: dict[str, TrainConfig] = {

@@ -31,7 +31,7 @@ def train(
         data: folder written by `unirender dataset`; default: `data/tiny-train` in the cache folder.
         out: folder of the run; default: `runs/PRESET` in the cache folder.
         minutes: length by the clock, over all resumes.
-        steps: length in optimiser steps.
+        steps: length in optimiser steps; the preset's where neither this nor minutes is given.
         batch_size: instead of the preset's.
         device: auto, cpu, cuda or mps.
         dtype: auto, float32 or bfloat16; weights stay fp32, this is the autocast format.
@@ -68,6 +68,7 @@ def _train(
     import torch
 
     from unirender.models.precision import resolve_device, resolve_dtype
+    from unirender.training.groups import list_shards
     from unirender.training.source import ShardSource
     from unirender.training.trainer import RunConfig, Trainer
 
@@ -75,7 +76,10 @@ def _train(
     parallel = parallel or (torch.get_num_threads() if where.type == "cpu" else 1)
     if parallel > 1:
         torch.set_num_threads(1)
+    if steps is None and minutes is None:
+        steps = config.steps
     run = RunConfig(out, steps, minutes, refresh_minutes=refresh_minutes, parallel=parallel)
+    list_shards(data)  # says what is wrong with the data before anything is built or written
     trainer = Trainer(config, run, where, resolve_dtype(dtype, where))
     source = ShardSource(data, config.batch_size, config.seed)
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6

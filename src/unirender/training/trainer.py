@@ -208,8 +208,8 @@ class Trainer:
         if state is None:
             return False
         config = self.state_dict()["config"]
-        if state["config"] != config:
-            differing = sorted(key for key in config if state["config"].get(key) != config[key])
+        differing = sorted(key for key in config if key != "steps" and state["config"].get(key) != config[key])
+        if differing:
             raise UnirenderError(
                 f"{self.run.out}: holds a run with another {', '.join(differing)}; pass another --out, or the preset"
             )
