@@ -168,8 +168,7 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
         check = _truth_check(config, suite, store, version, backbones, progress)
         here = Run(suite, rows, scenes, version, backbones, config.out / "pictures")
         _work(here, config, store, progress)
-    partial = config.limit is not None or set(config.methods) != set(GROUPS)
-    records = [record for record in store.close(keep_unused=partial) if record.values]
+    records = [record for record in store.close() if record.values]
     info = _run_info(config, suite, scenes, rows, check, records, code, backbones)
     write_run(config.out / "run.json", info)
     specs = {**TABLES, "physics": PHYSICS_TABLE}

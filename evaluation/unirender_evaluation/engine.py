@@ -8,7 +8,7 @@ import hashlib
 import importlib.metadata
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
@@ -41,6 +41,7 @@ PRESENTATION = (  # what changes how results look, not what they are
     "tables.py",
     "verdict.py",
 )
+KEY_PREFIX = 12
 LIBRARIES = ("torch", "mitsuba", "diffusers", "numpy", "scikit-image", "scipy")
 
 
@@ -82,9 +83,14 @@ def code_version() -> str:
 
 
 def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any], code: str) -> str:
-    """What a record depends on: the scene's truth, the question, the method's configuration, the code."""
+    """What a record depends on: the scene's truth, the question, the method's configuration, the code.
+
+    The first `KEY_PREFIX` digits are the code's alone, so that records of other code can be told.
+    """
     text = json.dumps([suite.scene_hash(scene), what, config, code], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return (
+        hashlib.sha256(code.encode()).hexdigest()[:KEY_PREFIX] + hashlib.sha256(text.encode()).hexdigest()[KEY_PREFIX:]
+    )
 
 
 def answer(row: Row, task: Task) -> Prediction:
@@ -138,21 +144,32 @@ def record_of(
 
 @dataclass
 class Store:
-    """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end."""
+    """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end.
+
+    `records.jsonl` holds what the last run measured; records of the same code that it did not ask for (it was a part of
+    a larger run) wait in `unused.jsonl` beside it.
+    """
 
     path: Path
     known: dict[str, Record] = field(default_factory=dict)
     used: dict[str, Record] = field(default_factory=dict)
 
+    @property
+    def unused_path(self) -> Path:
+        """Where the records that the last run did not ask for are."""
+        return self.path.with_name("unused.jsonl")
+
     @classmethod
     def open(cls, path: Path) -> "Store":
-        """Reads what an earlier run left: stale records too (of older code or rows), which `close` drops."""
-        text = path.read_text(encoding="utf-8") if path.exists() else ""
-        complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
-        known = {record.key: record for record in map(Record.from_json, complete.splitlines())}
-        if complete != text:
-            path.write_text(complete, encoding="utf-8")
-        return cls(path, known)
+        """Reads what earlier runs left, in both files."""
+        store = cls(path)
+        for file in (store.unused_path, path):
+            text = file.read_text(encoding="utf-8") if file.exists() else ""
+            complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
+            store.known |= {record.key: record for record in map(Record.from_json, complete.splitlines())}
+            if complete != text:
+                file.write_text(complete, encoding="utf-8")
+        return store
 
     def has(self, key: str) -> bool:
         """Whether a record is there; marks it as part of this run."""
@@ -166,19 +183,14 @@ class Store:
             append_record(self.path, record)
         self.used[record.key] = record
 
-    def close(self, keep_unused: bool = False) -> list[Record]:
-        """Sorts the records of this run, writes and returns them.
-
-        Args:
-            keep_unused: also keep in the file what this run did not use (it was a part of a larger run); else such
-                records are stale, of older code or rows, and dropped.
-        """
-
-        def in_order(records: Iterable[Record]) -> list[Record]:
-            return sorted(records, key=lambda r: (r.table, r.protocol, r.method, r.sample))
-
-        write_records(self.path, in_order((self.known | self.used if keep_unused else self.used).values()))
-        return in_order(self.used.values())
+    def close(self) -> list[Record]:
+        """Sorts this run's records, writes and returns them; keeps unused ones of the same code, drops the others."""
+        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+        code = {key[:KEY_PREFIX] for key in self.used}
+        unused = [r for key, r in self.known.items() if key not in self.used and key[:KEY_PREFIX] in code]
+        write_records(self.unused_path, unused)
+        write_records(self.path, records)
+        return records
 
 
 @dataclass(frozen=True)

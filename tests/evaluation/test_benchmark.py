@@ -17,7 +17,7 @@ from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
-from unirender_evaluation.engine import Prediction, Store, content_key, score
+from unirender_evaluation.engine import KEY_PREFIX, Prediction, Store, content_key, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.records import Record, RunInfo, read_records
@@ -167,12 +167,23 @@ def test_a_partial_run_keeps_the_records_of_the_whole_one(suite: Suite, tmp_path
     whole = evaluate(suite, trivial_rows(), path)
     store = Store.open(path)
     assert store.has(whole[0].key)
-    assert [record.key for record in store.close(keep_unused=True)] == [whole[0].key]
+    assert [record.key for record in store.close()] == [whole[0].key]
+    assert [record.key for record in read_records(path)] == [whole[0].key]  # the file is what this run measured
+    again = Store.open(path)
+    assert all([again.has(record.key) for record in whole])  # and nothing is lost to the next
+    again.close()
     assert {record.key for record in read_records(path)} == {record.key for record in whole}
+
+
+def test_records_of_other_code_are_dropped(suite: Suite, tmp_path: Path) -> None:
+    path = tmp_path / "records.jsonl"
+    whole = evaluate(suite, trivial_rows(), path)
+    other = content_key(suite, suite.scenes[0], "what", {}, "other code")
+    assert other[:KEY_PREFIX] != whole[0].key[:KEY_PREFIX]
     store = Store.open(path)
-    assert store.has(whole[0].key)
+    store.add(Record("inverse", "single-image", "new", "s", "o", {}, other))
     store.close()
-    assert [record.key for record in read_records(path)] == [whole[0].key]
+    assert not any(Store.open(path).has(record.key) for record in whole)
 
 
 def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
@@ -252,13 +263,15 @@ def test_verdict_states_claims_and_failures() -> None:
     records += [record("b", i, x) for i, x in enumerate(level)]
     claims = [Claim("inverse", "single-image", "albedo", "psnr", *pair) for pair in (("a", "b"), ("b", "a"))]
     found = findings(records, [*claims, Claim("inverse", "single-image", "albedo", "psnr", "a", "missing")])
-    assert [f.holds for f in found] == [True, False]
+    assert [f.holds for f in found] == [True, False, None]
     assert "HOLDS" in str(found[0])
     assert "FAILS" in str(found[1])
     check = {
         "passed": False,
         "members": 3,
         "smallest_pass_share": 0.5,
+        "seed": 7,
+        "geometries": 1,
         "twin_detected": True,
         "failed": ["x: z-test FAILED"],
         "other_objects": ["x"],
