@@ -66,10 +66,13 @@ def test_composite_explains_a_render(scenes: list[Scene]) -> None:
 
 @pytest.mark.parametrize("wrong", ["specular", "diffuse", "metallic"])
 def test_composite_twin_with_a_wrong_map_is_told_apart(scenes: list[Scene], wrong: str) -> None:
+    """Half the light, or metal for plastic. (The composite lacks interreflection: *more* light can bring it closer.)"""
+    losses = []
     for scene in scenes:
-        changed = np.clip(getattr(scene.truth, wrong) * 1.5, 0, 1 if wrong == "metallic" else None)
-        broken = scene.truth.replace(**{wrong: changed})
-        assert scene.psnr(composite_image(broken)) < scene.psnr(composite_image(scene.truth)) - 1
+        value = scene.truth.require(wrong)[wrong]
+        broken = scene.truth.replace(**{wrong: 1 - value if wrong == "metallic" else 0.5 * value})
+        losses.append(scene.psnr(composite_image(scene.truth)) - scene.psnr(composite_image(broken)))
+    assert np.mean(losses) > 1, losses
 
 
 def test_model_renders_true_maps(scenes: list[Scene], pipeline: UniRenderPipeline) -> None:
