@@ -21,7 +21,6 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -193,15 +192,6 @@ def specular_light(
         n = _facing_normal(normal[sharp], view[sharp])
         out[sharp] = _specular_samples(n, view[sharp], alpha[sharp], environment)
     return out
-
-
-def with_derived_light(intrinsics: Intrinsics) -> Intrinsics:
-    """The same intrinsics with s and d derived (unshadowed) from environment, normal and roughness."""
-    maps = intrinsics.require("normal", "roughness", "environment")
-    return intrinsics.replace(
-        diffuse=diffuse_light(maps["normal"], maps["environment"]),
-        specular=specular_light(maps["normal"], maps["roughness"], maps["environment"], intrinsics.camera),
-    )
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:
