@@ -26,7 +26,7 @@ from unirender_reference import backend, exposure
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
 from unirender_reference.plan import SHARD_GROUPS, DatasetConfig, GroupPlan, plan_groups
-from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hash
+from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hashes
 from unirender_reference.shapes import make_object
 from unirender_reference.shards import ShardRecord, finished_shards, shard_name, write_manifest, write_shard
 
@@ -140,13 +140,12 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
     covered = geometry.mask > 0
     header = {**renderer_provenance(renderer), "spp": str(config.spp), "seed": str(plan.render_seed)}
     drawn = [make_light(light_plan.seed, config.split) for light_plan in plan.lights]
-    scenes = {
-        (i, r, m): scene_hash(
-            SceneSpec(obj, light, r / 100, m / 100, renderer.camera, config.resolution, light_plan.exposure_seed)
-        )
+    specs = {
+        (i, r, m): SceneSpec(obj, light, r / 100, m / 100, renderer.camera, config.resolution, light_plan.exposure_seed)
         for i, (light, light_plan) in enumerate(zip(drawn, plan.lights, strict=True))
         for r, m in light_plan.pairs
     }
+    scenes = dict(zip(specs, scene_hashes(specs.values()), strict=True))
     shared = {**header, "spp": str(GEOMETRY_SPP), "scene": _shared_scene(scenes.values())}
     members = {"shared.exr": exr_bytes(intrinsics_channels(geometry), attributes=shared)}
     lights = []

@@ -9,9 +9,8 @@ estimate and its variance: `passes`.
 
 import functools
 import hashlib
-import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +18,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_reference import exposure, materials
+from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import Light
 from unirender_reference.passes import (
@@ -33,7 +32,7 @@ from unirender_reference.passes import (
     ratio_estimate,
     render_passes,
 )
-from unirender_reference.scene import LIGHT, envmap_data, load_scene
+from unirender_reference.scene import EditableScene
 from unirender_reference.shapes import MeshObject
 
 IMAGE_DEPTH = 4
@@ -65,7 +64,7 @@ class Sample:
 
 
 class Renderer:
-    """Renders one object under any light and material; scenes load once and only their parameters change.
+    """Renders one object under any light and material; its scene loads once, then surface and light change in place.
 
     Args:
         obj: the object.
@@ -80,8 +79,7 @@ class Renderer:
         self.camera = camera or Camera()
         self.resolution = resolution
         self.counters = Counters()
-        self._scenes: dict[str, tuple[Any, Any]] = {}
-        self._lit: dict[str, bytes] = {}
+        self._scene = EditableScene(obj, self.camera, resolution)
 
     def geometry(self, spp: int = GEOMETRY_SPP, seed: int = 0) -> Intrinsics:
         """Albedo, normal (camera axes) and mask; roughness and metallic are the caller's.
@@ -125,7 +123,7 @@ class Renderer:
         batches: int = TRUTH_BATCHES,
     ) -> Estimate:
         """The image: premultiplied linear RGBA."""
-        scene = self._prepare("principled", environment, {"roughness": roughness, "metallic": metallic})
+        scene = self._scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
         passes = render_passes(scene, depth, spp, derive_seed(seed, "image"), batches, self.counters)
         return mean_estimate(*passes, batches)
 
@@ -133,7 +131,7 @@ class Renderer:
         self, environment: Float[np.ndarray, "h w 3"], spp: int, seed: int = 0, batches: int = TRUTH_BATCHES
     ) -> Estimate:
         """d: the white Lambertian surface, direct light, divided by coverage."""
-        scene = self._prepare("white", environment, {})
+        scene = self._scene.show("white", {}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "diffuse"), batches, self.counters)
         return ratio_estimate(*passes, batches)
 
@@ -146,53 +144,16 @@ class Renderer:
         batches: int = TRUTH_BATCHES,
     ) -> Estimate:
         """s: the mirror-tinted reflector of the same roughness, direct light, divided by coverage."""
-        scene = self._prepare("mirror", environment, {"roughness": roughness})
+        scene = self._scene.show("mirror", {"roughness": roughness}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "specular"), batches, self.counters)
         return ratio_estimate(*passes, batches)
-
-    def _prepare(self, name: str, environment: Float[np.ndarray, "h w 3"], values: dict[str, float]) -> Any:
-        """The scene `name` under the light and with the material asked for; loads it on first use."""
-        for key, value in values.items():
-            if not 0.0 <= value <= 1.0:
-                raise UnirenderError(f"{key}: got {value}, expected a value in [0, 1]")
-        mi = mitsuba()
-        environment = np.ascontiguousarray(environment, dtype=np.float32)
-        if name not in self._scenes:
-            surface = {
-                "principled": lambda: materials.principled_bsdf(self.obj.albedo),
-                "mirror": materials.mirror_bsdf,
-                "white": materials.white_bsdf,
-            }[name]()
-            scene = load_scene(self.obj, surface, environment, self.camera, self.resolution)
-            self._scenes[name] = scene, mi.traverse(scene)
-            self._lit[name] = _fingerprint(environment)
-        scene, parameters = self._scenes[name]
-        for key, value in values.items():
-            parameters[self._key(parameters, f"{materials.INNER}.{key}.value")] = value
-        fingerprint = _fingerprint(environment)
-        if self._lit[name] != fingerprint:
-            parameters[self._key(parameters, f"{LIGHT}.data")] = mi.TensorXf(envmap_data(environment))
-            self._lit[name] = fingerprint
-        parameters.update()
-        return scene
-
-    @staticmethod
-    def _key(parameters: Any, suffix: str) -> str:
-        for key in parameters.keys():  # noqa: SIM118  (SceneParameters iterates over pairs)
-            if key == suffix or key.endswith("." + suffix):
-                return key
-        raise UnirenderError(f"Mitsuba scene: no parameter ending in {suffix!r}; an untested Mitsuba version?")
 
     def _trace_geometry(self, spp: int, seed: int) -> Float[np.ndarray, "h w 7"]:
         """Mean over `spp` camera rays of (hit, base colour, shading normal), per pixel."""
         mi = mitsuba()
         import drjit as dr
 
-        if "principled" in self._scenes:
-            scene, _ = self._scenes["principled"]
-        else:
-            scene = self._prepare("principled", np.ones((3, 4, 3), np.float32), {})  # any light: none is used
-        start = time.perf_counter()
+        scene = self._scene.show("principled")
         size, sensor = self.resolution, scene.sensors()[0]
         index = dr.arange(mi.UInt32, size * size * spp)
         pixel = index // spp
@@ -209,10 +170,7 @@ class Renderer:
         channels = [dr.select(valid, mi.Float(channel), 0.0) for channel in (valid, *base, *normal)]
         dr.eval(channels)  # one kernel; block_sum would trace again for every channel
         means = [dr.block_sum(channel, spp) / spp for channel in channels]
-        picture = np.stack([np.array(mean).reshape(size, size) for mean in means], axis=-1)
-        self.counters.render_seconds += time.perf_counter() - start
-        self.counters.renders += 1
-        return picture
+        return np.stack([np.array(mean).reshape(size, size) for mean in means], axis=-1)
 
 
 def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer | None = None) -> Sample:
@@ -284,13 +242,18 @@ def renderer_provenance(renderer: Renderer) -> dict[str, str]:
 
 def scene_hash(spec: SceneSpec) -> str:
     """sha256 over everything that defines a scene's radiance."""
-    digest = hashlib.sha256()
-    obj = spec.obj
-    for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo, spec.light.environment):
-        digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-    digest.update(repr((spec.roughness, spec.metallic, spec.camera, spec.resolution, spec.exposure_seed)).encode())
-    return digest.hexdigest()
+    return next(scene_hashes([spec]))
 
 
-def _fingerprint(array: Float[np.ndarray, "..."]) -> bytes:
-    return hashlib.sha256(repr(array.shape).encode() + array.tobytes()).digest()
+def scene_hashes(specs: Iterable[SceneSpec]) -> Iterator[str]:
+    """`scene_hash` of each spec; the arrays of an object under a light are read once while they stay the same."""
+    shared, obj, light = hashlib.sha256(), None, None
+    for spec in specs:
+        if spec.obj is not obj or spec.light is not light:
+            shared, obj, light = hashlib.sha256(), spec.obj, spec.light
+            for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo, light.environment):
+                shared.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+        digest = shared.copy()
+        values = (spec.roughness, spec.metallic, spec.camera, spec.resolution, spec.exposure_seed)
+        digest.update(repr(values).encode())
+        yield digest.hexdigest()

@@ -1,5 +1,8 @@
 """The renderer: framing, buffers, seeds, variance, repair of NaN pixels."""
 
+import dataclasses
+import time
+
 import numpy as np
 import pytest
 import reference_scenes as scenes
@@ -7,8 +10,16 @@ from scipy.stats import chi2
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference import backend, passes
-from unirender_reference.render import Renderer, SceneSpec, render_sample, scene_hash
+from unirender_reference import backend, materials, passes, scene
+from unirender_reference.render import (
+    DIRECT_DEPTH,
+    IMAGE_DEPTH,
+    Renderer,
+    SceneSpec,
+    render_sample,
+    scene_hash,
+    scene_hashes,
+)
 from unirender_reference.scene import envmap_data
 
 SIZE = 32
@@ -89,17 +100,100 @@ def test_equal_seeds_are_bit_identical_and_others_differ(renderer: Renderer) -> 
     assert not np.array_equal(first, renderer.image(light, 0.3, 0.2, 16, seed=7, batches=1).mean)
 
 
-def test_updated_scene_equals_a_loaded_one(renderer: Renderer) -> None:
-    """Parameters and lights of other sizes leave nothing behind."""
-    for shape in ((8, 16), (20, 40)):
+def test_edited_scene_equals_a_loaded_one(renderer: Renderer) -> None:
+    """Surfaces, parameters and lights of other sizes leave nothing behind."""
+    obj = renderer.obj
+    for shape, roughness, metallic in (((8, 16), 0.1, 0.9), ((20, 40), 0.7, 0.2)):
         light = scenes.environment(3, shape)
-        fresh = Renderer(scenes.sphere(), resolution=SIZE)
-        for render in (
-            lambda r, light=light: r.image(light, 0.0, 1.0, 16, batches=1),
-            lambda r, light=light: r.specular(light, 0.7, 16, batches=1),
-            lambda r, light=light: r.diffuse(light, 16, batches=1),
+        for bsdf, depth, part, render in (
+            (
+                materials.principled_bsdf(obj.albedo, roughness, metallic),
+                IMAGE_DEPTH,
+                "image",
+                lambda light=light, r=roughness, m=metallic: renderer.image(light, r, m, 16, batches=1),
+            ),
+            (
+                materials.mirror_bsdf(roughness),
+                DIRECT_DEPTH,
+                "specular",
+                lambda light=light, r=roughness: renderer.specular(light, r, 16, batches=1),
+            ),
+            (
+                materials.white_bsdf(),
+                DIRECT_DEPTH,
+                "diffuse",
+                lambda light=light: renderer.diffuse(light, 16, batches=1),
+            ),
         ):
-            assert np.array_equal(render(renderer).mean, render(fresh).mean)
+            loaded = scene.load_scene(obj, bsdf, light, renderer.camera, SIZE)
+            drawn = passes.render_passes(loaded, depth, 16, passes.derive_seed(0, part), 1, passes.Counters())
+            estimate = passes.mean_estimate if part == "image" else passes.ratio_estimate
+            expected = estimate(*drawn, 1).mean
+            assert np.array_equal(render().mean, expected), part
+            assert not np.array_equal(renderer.specular(light, 0.4, 16, batches=1).mean, expected)  # another scene
+
+
+def test_all_buffers_share_one_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loading builds an acceleration structure: once for an object, whatever is rendered of it."""
+    loaded = []
+    genuine = scene.load_scene
+    monkeypatch.setattr(scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
+    renderer, light = Renderer(scenes.sphere(), resolution=8), scenes.environment()
+    renderer.geometry(16)
+    for environment in (light, 2 * light):
+        renderer.diffuse(environment, 16, batches=1)
+        renderer.specular(environment, 0.5, 16, batches=1)
+        renderer.image(environment, 0.5, 0.5, 16, batches=1)
+    assert len(loaded) == 1
+    Renderer(scenes.sphere(), resolution=8).geometry(16)
+    assert len(loaded) == 2
+
+
+def test_geometry_reads_the_object_whatever_was_rendered_last(renderer: Renderer) -> None:
+    """Base colour is the principled surface's, although the mirror and the white one share its scene."""
+    albedo = Renderer(scenes.sphere(), resolution=SIZE).geometry(64, 3).albedo
+    for render in (
+        lambda: renderer.diffuse(scenes.environment(), 16, batches=1),
+        lambda: renderer.specular(scenes.environment(), 0.5, 16, batches=1),
+    ):
+        render()
+        np.testing.assert_array_equal(renderer.geometry(64, 3).albedo, albedo)
+
+
+def test_render_seconds_are_those_of_mitsuba_render(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `unirender dataset` divides by: neither loading nor tracing the geometry counts."""
+    mi = backend.mitsuba()
+    genuine, inside = mi.render, []
+
+    def render(*args: object, **options: object) -> object:
+        start = time.perf_counter()
+        picture = np.array(genuine(*args, **options))
+        inside.append(time.perf_counter() - start)
+        return picture
+
+    monkeypatch.setattr(mi, "render", render)
+    renderer, start = Renderer(scenes.sphere(), resolution=SIZE), time.perf_counter()
+    renderer.geometry(64)
+    assert (renderer.counters.render_seconds, renderer.counters.renders) == (0, 0)
+    for roughness in (0.2, 0.6):
+        renderer.image(scenes.environment(), roughness, 0.5, 16, batches=1)
+    assert renderer.counters.renders == 2
+    assert sum(inside) <= renderer.counters.render_seconds < sum(inside) + 0.05
+    assert renderer.counters.render_seconds < time.perf_counter() - start
+
+
+def test_scene_hashes_are_those_of_the_scenes_in_any_order() -> None:
+    objects, lights = (scenes.sphere(), scenes.sphere()), (scenes.light(1), scenes.light(2))
+    moved = dataclasses.replace(objects[1], vertices=objects[1].vertices[::-1].copy())
+    specs = [
+        SceneSpec(obj, light, roughness, 0.5)
+        for roughness in (0.1, 0.9)
+        for light in lights
+        for obj in (objects[0], moved)
+    ]
+    for order in (specs, specs[::-1], sorted(specs, key=lambda spec: spec.light is lights[0])):
+        assert list(scene_hashes(order)) == [scene_hash(spec) for spec in order]
+    assert len(set(scene_hashes(specs))) == len(specs)
 
 
 def test_envmap_parameter_is_what_mitsuba_makes_of_a_bitmap() -> None:
