@@ -1,4 +1,4 @@
-"""Pictures for the report: display versions of maps and images, FLIP error maps, and PNG data URIs.
+"""Pictures for the report: display versions of maps and images, FLIP error maps, PNG data URIs; the gallery's cards.
 
 All pictures are un-premultiplied sRGB display values in [0, 1], `[h, w, 3]`; the mask becomes the PNG's alpha, so that
 they sit on a light and on a dark page. FLIP (Andersson et al. 2020, its reference implementation at 67 pixels per
@@ -7,19 +7,22 @@ degree) compares the pictures over white with the true mask pasted on both.
 
 import base64
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
 
-from unirender.color import image_srgb, srgb_decode
+from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.scoring import over_white, unpremultiply
+from unirender_evaluation.records import RunInfo
+from unirender_evaluation.report_plots import LEADING, heading
+from unirender_evaluation.scoring import over_white
 
 Picture = Float[np.ndarray, "h w 3"]
 AnyPicture = Float[np.ndarray, "_ _ 3"]  # sizes are checked where they are put together
@@ -33,13 +36,18 @@ class GalleryItem:
         table: as in records.
         protocol: as in records.
         sample: as in records.
-        caption: for people: object, light, material.
+        caption: for people: object and light.
         mask: true coverage, [0, 1].
-        given: what the method saw, name -> picture.
+        given: what the method saw, name -> picture; a light may have a size of its own.
         truth: name -> picture.
         predictions: method key -> name -> picture; names are those of `truth`.
         scores: method key -> name -> text, e.g. "23.1 dB".
-        badness: larger is worse; the gallery begins with the worst.
+        question: what was asked, e.g. "roughness 0.5 → 0.1".
+        rank: why the sample was chosen: "worst", "median", "best".
+        place: in the ranking of its table and protocol; 1 = worst.
+        count: how many were ranked.
+        leader: key of the method whose score ranked them.
+        figure: that score, e.g. "PSNR 13.7 dB".
     """
 
     table: str
@@ -51,12 +59,16 @@ class GalleryItem:
     truth: Mapping[str, AnyPicture]
     predictions: Mapping[str, Mapping[str, AnyPicture]]
     scores: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    badness: float = 0.0
+    question: str = ""
+    rank: str = ""
+    place: int = 1
+    count: int = 1
+    leader: str = ""
+    figure: str = ""
 
     def __post_init__(self) -> None:
         size = self.mask.shape[:2]
-        groups = {"given": self.given, "truth": self.truth, **self.predictions}
-        for group, pictures in groups.items():
+        for group, pictures in {"truth": self.truth, **self.predictions}.items():
             for name, picture in pictures.items():
                 if picture.shape != (*size, 3):
                     raise UnirenderError(
@@ -127,3 +139,97 @@ def _magma(error: Float[np.ndarray, "h w"]) -> Picture:
     from matplotlib import colormaps
 
     return np.asarray(colormaps["magma"](np.clip(error, 0, 1)), dtype=np.float32)[..., :3]
+
+
+def hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
+    """What was given, and what the first row of ours made of it on the median sample: picked by rank, not by eye."""
+    kinds = [[info.key for info in run.methods if info.kind == kind] for kind in LEADING]
+    ours = set(next(filter(None, kinds), []))
+    candidates = [item for item in gallery if item.table == "inverse" and ours & item.predictions.keys()]
+    if not candidates:
+        return None
+    item = min(candidates, key=lambda item: abs(2 * item.place - item.count - 1))
+    method = next(key for key in item.predictions if key in ours)
+    return {
+        "given": [_named(name, picture, item) for name, picture in item.given.items()],
+        "pairs": [
+            {"name": name, "ours": _shown(picture, item), "truth": _shown(item.truth[name], item)}
+            for name, picture in item.predictions[method].items()
+        ],
+        "caption": f"{run.method(method).label} on the sample of {item.rank or 'median'} score: "
+        f"{item.caption} ({item.sample}).",
+    }
+
+
+def shelves(gallery: Sequence[GalleryItem], run: RunInfo, titles: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Cards by table and protocol, worst first in each; `titles` has the tables' names for people."""
+    groups: dict[tuple[str, str], list[GalleryItem]] = {}
+    for item in gallery:
+        groups.setdefault((item.table, item.protocol), []).append(item)
+    return [
+        {
+            "which": "-".join(which),
+            "title": heading(titles.get(which[0], which[0]), which[1]),
+            "by": " and ".join(dict.fromkeys(run.method(item.leader).label for item in items if item.leader)),
+            "cards": [_card(item, run) for item in sorted(items, key=lambda item: item.place)],
+        }
+        for which, items in groups.items()
+    ]
+
+
+def picture_rows(item: GalleryItem, run: RunInfo) -> list[tuple[str, dict[str, str]]]:
+    """(label, map -> method key): a row per method, but trivial methods for different maps share rows."""
+    rows: list[tuple[str, dict[str, str]]] = []
+    shared: list[dict[str, str]] = []
+    for method, made in item.predictions.items():
+        cells = {name: method for name in item.truth if name in made}
+        if run.method(method).kind != "trivial" or len(item.truth) == 1:
+            rows.append((run.method(method).label, cells))
+            continue
+        free = next((row for row in shared if not row.keys() & cells.keys()), None)
+        if free is None:
+            shared.append(cells)
+        else:
+            free.update(cells)
+    return rows + [("Trivial", cells) for cells in shared]
+
+
+def _card(item: GalleryItem, run: RunInfo) -> dict[str, Any]:
+    names = list(item.truth)
+    place = f"{item.rank} of {item.count}" if item.rank else f"{item.place} of {item.count}"
+    return {
+        "id": f"{item.table}-{item.protocol}-{item.place}",
+        "title": ": ".join(text for text in (place, item.figure) if text),
+        "question": item.question,
+        "sub": f"{item.caption} · {item.sample}",
+        "names": names,
+        "truth": [_shown(picture, item) for picture in item.truth.values()],
+        "given": [_named(name, picture, item) for name, picture in item.given.items()],
+        "rows": [
+            {"label": label, "cells": [_prediction(item, cells[n], n, run) if n in cells else None for n in names]}
+            for label, cells in picture_rows(item, run)
+        ],
+    }
+
+
+def _prediction(item: GalleryItem, method: str, name: str, run: RunInfo) -> dict[str, Any]:
+    picture, info = item.predictions[method][name], run.method(method)
+    error, mean = flip_map(picture, item.truth[name], item.mask)
+    alone = info.kind != "trivial" or len(item.truth) == 1
+    return {
+        "picture": _shown(picture, item),
+        "name": "" if alone else info.label,
+        "score": item.scores.get(method, {}).get(name, ""),
+        "flip": _shown(error, item),
+        "flip_mean": f"FLIP {mean:.3f}",
+    }
+
+
+def _named(name: str, picture: Picture, item: GalleryItem) -> dict[str, Any]:
+    return {"name": name, "picture": _shown(picture, item)}
+
+
+def _shown(picture: Picture, item: GalleryItem) -> dict[str, Any]:
+    """A picture for the template; those of the frame's size carry the mask."""
+    mask = item.mask if picture.shape[:2] == item.mask.shape[:2] else None
+    return {"uri": data_uri(picture, mask), "width": picture.shape[1], "height": picture.shape[0]}

@@ -1,156 +1,195 @@
-"""Keeps the predictions of a few samples of every protocol, and makes the report's gallery from them."""
+"""Keeps the predictions of a run as pictures, and makes the report's gallery from the worst, median and best sample.
+
+Which sample is the worst is known only when all are scored, so every prediction is kept: one PNG each, a few kilobytes
+at 64 pixels.
+"""
 
 import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from PIL import Image as PngImage
+from PIL.PngImagePlugin import PngInfo
 
-from unirender.errors import UnirenderError
+from unirender.color import image_srgb
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import GalleryItem, Picture, image_picture, map_pictures
-from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.records import Record
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites import Scene, Suite, material_key
+from unirender_evaluation.table_formats import format_number
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 
-SCENES = 6
-STORED_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
-QUANTITIES = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
+PRIMARY = {  # table -> quantities whose PSNR ranks its samples; a sample has one of them
+    "rendering": ("edit_metallic", "edit_roughness"),
+    "inverse": ("albedo",),
+    "relighting": ("relit",),
+}
+SCORES = (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}"))
 
 
 class Pictures:
-    """The kept predictions of a run: `<folder>/<hash of task and row key>.npz`, half floats.
+    """The kept predictions: `<folder>/<hash of task and row key>.png`, the pictures of one answer side by side.
+
+    The PNG's text chunks hold the record's content key and the pictures' names.
 
     Args:
         folder: where they are.
         suite: the suite.
-        scenes: of the run; `SCENES` of them, evenly spaced, are kept, one sample for each protocol.
+        scenes: of the run.
     """
 
     def __init__(self, folder: Path, suite: Suite, scenes: list[Scene]) -> None:
-        self.folder, self.suite = folder, suite
-        count = min(SCENES, len(scenes))
-        self.scenes = [scenes[i] for i in np.linspace(0, len(scenes) - 1, count).round().astype(int)]
+        self.folder, self.suite, self.scenes = folder, suite, scenes
         folder.mkdir(parents=True, exist_ok=True)
 
     def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None:
-        """Stores a prediction if its sample is in the gallery; `key` is the record's content key."""
-        if task.scene not in self.scenes or not self._chosen(task):
-            return
-        arrays = {} if prediction.image is None else {"image": prediction.image}
-        if prediction.maps is not None:
-            arrays |= {n: getattr(prediction.maps, n) for n in STORED_MAPS if getattr(prediction.maps, n) is not None}
-        half = {name: np.clip(value, -65504, 65504).astype(np.float16) for name, value in arrays.items()}
-        np.savez_compressed(self._path(task, method), key=np.array(key), **half)  # type: ignore[arg-type]  # arrays by name
+        """Stores what the gallery would show of a prediction; `key` is the record's content key."""
+        wanted = _pictures(task, task.truth_image, task.truth_maps)
+        made = {n: p for n, p in _pictures(task, prediction.image, prediction.maps).items() if n in wanted}
+        _write_sheet(self._path(task.identity, method), made, key)
 
     def has(self, task: Task, method: str, key: str) -> bool:
-        """Whether nothing is missing: the sample is not in the gallery, or its prediction is stored under this key."""
-        if task.scene not in self.scenes or not self._chosen(task):
-            return True
-        path = self._path(task, method)
+        """Whether a prediction is stored under this key."""
+        path = self._path(task.identity, method)
         if not path.is_file():
             return False
-        with np.load(path) as data:
-            return str(data["key"]) == key
+        with PngImage.open(path) as image:
+            return image.info.get("key") == key
 
-    def items(self, records: list[Record], main: str) -> list[GalleryItem]:
-        """The gallery; `main` is the row whose score decides what is a failure."""
-        found = {(r.table, r.protocol, r.sample, r.method): r for r in records}
-        items = []
+    def items(self, records: Sequence[Record], main: str) -> list[GalleryItem]:
+        """The gallery.
+
+        Args:
+            records: of the run.
+            main: key of the row whose scores choose the samples; where it has none, the first with pictures that has.
+
+        Returns:
+            Worst, median and best sample of every protocol, in this order; without those whose pictures are not there.
+        """
+        found = []
         for table, protocol in PROTOCOLS:
-            for task in tasks(self.suite, table, protocol, self.scenes):
-                if self._chosen(task):
-                    item = self._item(task, found, main)
-                    if item is not None:
-                        items.append(item)
-        return items
+            asked = [r for r in records if (r.table, r.protocol, r.subset) == (table, protocol, "main")]
+            pictured = {r.method for r in asked if self._path(f"{table}/{protocol}/{r.sample}", r.method).is_file()}
+            leader, ranked = ranking([r for r in asked if r.method in pictured], table, main)
+            for place, rank in chosen_places(len(ranked)).items():
+                sample, score = ranked[place]
+                scenes = [scene for scene in self.scenes if sample.startswith(f"{scene.key}_")]
+                task = next((t for t in tasks(self.suite, table, protocol, scenes) if t.sample == sample), None)
+                if task is None:
+                    continue
+                about = {"leader": leader, "rank": rank, "place": place + 1, "count": len(ranked)}
+                figure = f"PSNR {format_number(score, 1)} dB"
+                item = self._item(task, [r for r in asked if r.sample == sample], about | {"figure": figure})
+                found += [] if item is None else [item]
+        return found
 
-    def _chosen(self, task: Task) -> bool:
-        """One sample per scene and protocol; edits take turns."""
-        samples = {
-            "rendering": [f"{task.scene.key}_{self._edit(task.scene)}"],
-            "inverse": [f"{task.scene.key}_{_material(task.scene, 0)}"],
-        }
-        return task.table == "relighting" or task.sample in samples[task.table]
-
-    def _edit(self, scene: Scene) -> str:
-        edits = self.suite.spec.edits
-        metallic, roughness = edits[self.scenes.index(scene) % len(edits)]
-        return f"m{round(100 * metallic):03d}_r{round(100 * roughness):03d}"
-
-    def _path(self, task: Task, method: str) -> Path:
-        return self.folder / f"{hashlib.sha256(f'{task.identity}/{method}'.encode()).hexdigest()[:20]}.npz"
-
-    def _item(self, task: Task, found: dict[tuple[str, str, str, str], Record], main: str) -> GalleryItem | None:
+    def _item(self, task: Task, records: Sequence[Record], about: dict[str, Any]) -> GalleryItem | None:
         truth = _pictures(task, task.truth_image, task.truth_maps)
         predictions: dict[str, dict[str, Picture]] = {}
-        scores: dict[str, dict[str, str]] = {}
-        badness = 0.0
-        for (table, protocol, sample, method), record in found.items():
-            path = self._path(task, method)
-            if (table, protocol, sample) != (task.table, task.protocol, task.sample) or not path.is_file():
-                continue
-            with np.load(path) as data:
-                arrays = {name: data[name].astype(np.float32) for name in data.files if name != "key"}
-            image = arrays.pop("image", None)
-            try:
-                maps = Intrinsics(**arrays) if arrays else None
-            except UnirenderError:
-                continue
-            made = _pictures(task, image, maps)
-            predictions[method] = {name: picture for name, picture in made.items() if name in truth}
-            scores[method] = _scores(task, record)
-            value = next(iter(v for k, v in record.values.items() if ".psnr@masked-srgb-raw" in k), None)
-            if value is not None and (method == main or not badness):
-                badness = -value
+        for record in sorted(records, key=lambda record: record.method != about["leader"]):
+            path = self._path(task.identity, record.method)
+            made = _read_sheet(path, task.mask.shape[1]) if path.is_file() else {}
+            if made:
+                predictions[record.method] = made
         if not predictions:
             return None
-        order = sorted(predictions, key=lambda key: key != main)
-        given = {}
-        for inputs in task.inputs.values():
-            if "image_srgb" in inputs:
-                given = {"picture": inputs["image_srgb"]}
-        if not given:
-            given = {
-                n: p for n, p in map_pictures(task.inputs["render"]["intrinsics"]).items() if n in ("albedo", "normal")
-            }
         return GalleryItem(
             table=task.table,
             protocol=task.protocol,
             sample=task.sample,
             caption=f"{task.scene.object} ({task.scene.family}) under {task.scene.light}",
+            question=question(task, self.suite),
             mask=task.mask,
-            given=given,
+            given=_given(task),
             truth=truth,
-            predictions={key: predictions[key] for key in order},
-            scores=scores,
-            badness=badness,
+            predictions=predictions,
+            scores={record.method: _scores(task, record, truth) for record in records},
+            **about,
         )
 
-
-def _material(scene: Scene, index: int) -> str:
-    if not scene.materials:
-        return ""
-    metallic, roughness = scene.materials[index]
-    return f"m{round(100 * metallic):03d}_r{round(100 * roughness):03d}"
+    def _path(self, identity: str, method: str) -> Path:
+        return self.folder / f"{hashlib.sha256(f'{identity}/{method}'.encode()).hexdigest()[:20]}.png"
 
 
-def _pictures(task: Task, image: Picture | None, maps: Intrinsics | None) -> dict[str, Picture]:
+def ranking(records: Sequence[Record], table: str, main: str) -> tuple[str, list[tuple[str, float]]]:
+    """(row, its samples with their masked PSNR, worst first) for the records of one protocol."""
+    keys = [metric_key(quantity, METRICS["psnr"]) for quantity in PRIMARY.get(table, ())]
+    for method in dict.fromkeys([main, *(record.method for record in records)]):
+        scores = {r.sample: r.values[key] for r in records if r.method == method for key in keys if key in r.values}
+        if scores:
+            return method, sorted(scores.items(), key=lambda pair: (pair[1], pair[0]))
+    return main, []
+
+
+def chosen_places(count: int) -> dict[int, str]:
+    """Place in a ranking -> its name, for the worst, the median and the best of `count` samples."""
+    named = {count // 2: "median", count - 1: "best", 0: "worst"} if count else {}
+    return dict(sorted(named.items()))
+
+
+def question(task: Task, suite: Suite) -> str:
+    """What was asked, with the numbers: the edit, the material or the light."""
+    base, materials = suite.spec.base, [*suite.spec.edits, *task.scene.materials]
+    material = next((m for m in materials if task.sample == f"{task.scene.key}_{material_key(m)}"), base)
+    if "edit" in task.asks:
+        pairs = zip(("metallic", "roughness"), base, material, strict=True)
+        return ", ".join(f"{name} {old:.1f} → {new:.1f}" for name, old, new in pairs if old != new)
+    if "relight" in task.asks:
+        return f"relit by {suite.other_light(task.scene).light}"
+    asked = "render:" if "render" in task.asks else "decompose: true"
+    return f"{asked} metallic {material[0]:.1f}, roughness {material[1]:.1f}"
+
+
+def _given(task: Task) -> dict[str, Picture]:
+    """What the method saw."""
+    inputs = task.inputs[task.asks[0]]
+    given = {"input": inputs["image_srgb"]} if "image_srgb" in inputs else {}
+    maps: Intrinsics | None = inputs.get("intrinsics")
+    if maps is not None:
+        given |= map_pictures(maps)
+    light: dict[str, Any] = {f"target {name}": inputs.get(name) for name in ("specular", "diffuse")}
+    light["HDRI"] = inputs.get("environment") if maps is None else maps.environment
+    return given | {name: image_srgb(value) for name, value in light.items() if value is not None}
+
+
+def _pictures(task: Task, image: Float[np.ndarray, "h w 3"] | None, maps: Intrinsics | None) -> dict[str, Picture]:
     pictures = {} if image is None else {"image": image_picture(image, task.mask)}
     if maps is not None:
         pictures |= map_pictures(maps)
     return pictures
 
 
-def _scores(task: Task, record: Record) -> dict[str, str]:
+def _scores(task: Task, record: Record, names: Iterable[str]) -> dict[str, str]:
     """The headline number of every picture."""
     texts = {}
-    for name in ("image", *QUANTITIES):
+    for name in names:
         quantity = task.quantity if name == "image" else name
-        for metric, text in (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}")):
-            value = record.values.get(metric_key(quantity, metric))
-            if value is not None:
-                texts[name] = text.format(value)
-                break
+        values = [(record.values.get(metric_key(quantity, metric)), text) for metric, text in SCORES]
+        found = next(((value, text) for value, text in values if value is not None), None)
+        if found is not None:
+            texts[name] = found[1].format(found[0])
     return texts
+
+
+def _write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
+    levels = [np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in pictures.values()]
+    sheet = np.concatenate(levels, axis=1) if levels else np.zeros((1, 1, 3), np.uint8)
+    text = PngInfo()
+    text.add_text("key", key)
+    text.add_text("names", json.dumps(list(pictures)))
+    temporary = path.with_suffix(".tmp")
+    PngImage.fromarray(sheet).save(temporary, format="PNG", pnginfo=text)
+    os.replace(temporary, path)
+
+
+def _read_sheet(path: Path, width: int) -> dict[str, Picture]:
+    with PngImage.open(path) as image:
+        names, sheet = json.loads(image.info["names"]), np.asarray(image, dtype=np.float32) / 255
+    return {name: sheet[:, i * width : (i + 1) * width] for i, name in enumerate(names)}

@@ -19,11 +19,10 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.physics import PHYSICS_TABLE
-from unirender_evaluation.records import RunInfo, read_records, read_run
-from unirender_evaluation.specs import TABLES
+from unirender_evaluation.records import RunInfo
+from unirender_evaluation.report import read_results
 from unirender_evaluation.table_formats import to_markdown
-from unirender_evaluation.tables import Table, build_tables
+from unirender_evaluation.tables import Table
 
 SHIPPED = Path(str(resources.files("unirender"))) / "checkpoints" / "tiny"
 SHOWN = (  # table, protocol, subset
@@ -40,14 +39,12 @@ def run_tables(folder: Path) -> tuple[RunInfo, list[Table]]:
     Raises:
         UnirenderError: the folder holds no complete run.
     """
-    if not (folder / "run.json").is_file():
-        raise UnirenderError(f"{folder}: no run.json, expected the folder that `unirender bench run --out` wrote")
-    run = read_run(folder / "run.json")
+    run, _, tables = read_results(folder)
     if run.limit is not None:
         raise UnirenderError(
             f"{folder}: a partial run (--limit {run.limit}), expected a whole one; run it without --limit"
         )
-    return run, build_tables(read_records(folder / "records.jsonl"), run, {**TABLES, "physics": PHYSICS_TABLE})
+    return run, tables
 
 
 def fill(readme: str, name: str, text: str) -> str:

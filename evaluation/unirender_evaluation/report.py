@@ -3,10 +3,16 @@
 Tables with the published value beside the measured one and the protocol below, the standing of our rows between the
 trivial ones and the noise ceiling, one tick per sample, paired verdicts, and a gallery that begins with the failures.
 This module turns results into view models; `templates/` lays them out.
+
+    python -m unirender_evaluation.report RUN [--suite SUITE]
+
+writes the report of a finished run again, from its records and kept pictures.
 """
 
+import argparse
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,12 +20,14 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, verdicts
-from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map
+from unirender_evaluation.gallery import GalleryItem, hero, shelves
 from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
-from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.report_plots import strip_plots, tiles
-from unirender_evaluation.specs import PROTOCOLS, TABLES, TableSpec
+from unirender_evaluation.physics import PHYSICS_TABLE
+from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_records, read_run
+from unirender_evaluation.report_plots import heading, strip_plots, tiles
+from unirender_evaluation.specs import TABLES, TableSpec
 from unirender_evaluation.table_formats import (
     NOT_AVAILABLE,
     format_estimate,
@@ -29,11 +37,21 @@ from unirender_evaluation.table_formats import (
     row_label,
     to_json,
 )
-from unirender_evaluation.tables import Cell, Row, Table
+from unirender_evaluation.tables import Cell, Row, Table, build_tables
 
 TEMPLATES = Path(__file__).parent / "templates"
+ALL_TABLES = {**TABLES, PHYSICS_TABLE.name: PHYSICS_TABLE}
 HEADLINE = ("psnr", "mse", "cosine")  # metrics of the verdicts, the tiles and the distributions
-FLIP_TEXT = "FLIP {:.3f}"
+DENSE = 8  # columns: from here on the interval stands below its mean
+KIND_NAMES = {
+    "ours": "ours",
+    "paper": "published only",
+    "baseline": "closed form",
+    "external": "other systems",
+    "trivial": "trivial",
+    "ceiling": "bounds",
+    "reference": "bounds",
+}
 
 
 def write_report(
@@ -73,12 +91,13 @@ def write_report(
         lede=_lede(run, tables),
         watermark=next((table.watermark for table in tables if table.watermark), None),
         resolution=run.resolution,
-        hero=_hero(gallery, run),
+        hero=hero(gallery, run),
         tiles=tiles(tables, HEADLINE),
+        kinds=_kinds(tables),
         blocks=[_block(list(group)) for _, group in groupby(tables, key=_identity)],
         strips=strip_plots(specs, records, run, HEADLINE),
         verdicts=_verdicts(specs, records, run),
-        gallery=_gallery(gallery, run),
+        gallery=shelves(gallery, run, {name: spec.title for name, spec in specs.items()}),
         footer=f"{run.suite} {run.suite_hash[:12]} · code {run.code or '-'} · {run.date or 'no date'}.",
         json=Markup(to_json(tables).replace("</", "<\\/")),
     )
@@ -109,17 +128,20 @@ def _block(variants: Sequence[Table]) -> dict[str, Any]:
     first = variants[0]
     suffix = "" if first.subset == "main" else f" ({first.subset})"
     return {
-        "title": f"{first.title}: {first.protocol_label}{suffix}",
+        "title": heading(first.title, first.protocol_key) + suffix,
         "panels": [_panel(table) for table in variants],
     }
 
 
 def _panel(table: Table) -> dict[str, Any]:
+    metrics = {column.metric.name: column for column in table.columns}.values()
     return {
+        "dense": len(table.columns) >= DENSE,
+        "metrics": [f"{header(c)}: {c.metric.formula}; perfect {_perfect(c.metric.perfect)}" for c in metrics],
         "tab": _tab(table.variant, any(table.published_columns)),
         "groups": [(name, len(list(columns))) for name, columns in groupby(table.columns, key=lambda c: c.group)],
         "heads": [
-            {"text": header(column), "formula": f"{column.metric.formula} [{column.key(table.variant)}]"}
+            {"text": _unbroken(header(column)), "formula": f"{column.metric.formula} [{column.key(table.variant)}]"}
             for column in table.columns
         ],
         "sections": [
@@ -130,6 +152,22 @@ def _panel(table: Table) -> dict[str, Any]:
     }
 
 
+def _unbroken(text: str) -> str:
+    """Text that stays on one line, as a heading with its unit and arrow."""
+    return text.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def _perfect(value: float) -> str:
+    return f"{value:g}".replace("inf", "∞")
+
+
+def _kinds(tables: Sequence[Table]) -> list[tuple[str, str]]:
+    """(kind, name) of the rows' marks, for the legend."""
+    present = {row.kind for table in tables for row in table.rows}
+    named = {KIND_NAMES[kind]: kind for kind in METHOD_KINDS if kind in present}
+    return [(kind, name) for name, kind in named.items()]
+
+
 def _tab(variant: Variant, with_published: bool) -> str:
     text = {"whole": "whole frame", "masked": "inside the mask"}[variant.mask]
     other = [word for word in (variant.space, variant.scale) if word not in ("srgb", "raw")]
@@ -137,15 +175,18 @@ def _tab(variant: Variant, with_published: bool) -> str:
 
 
 def _row(row: Row, table: Table) -> dict[str, Any]:
-    pairs = zip(row.cells, table.columns, strict=True)
-    return {
-        "label": row_label(row, table),
-        "kind": row.kind,
-        "cells": [_cell(cell, column.metric.decimals) for cell, column in pairs],
-    }
+    cells = []
+    for i, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
+        counts = [cell.measured.n for cell in (r.cells[i] for r in table.rows) if cell.measured is not None]
+        everywhere = max(counts, default=0)
+        known = row.n if row.n < table.n else everywhere  # a row on a subset says so in its label
+        cells.append(_cell(cell, column.metric.decimals, known))
+    label = row_label(row, table).replace("n = ", _unbroken("n = "))
+    return {"label": label, "kind": row.kind, "cells": cells}
 
 
-def _cell(cell: Cell, decimals: int) -> dict[str, Any]:
+def _cell(cell: Cell, decimals: int, known: int) -> dict[str, Any]:
+    """One cell; its n is printed where it is below the `known` one."""
     view: dict[str, Any] = {"value": None, "sort": "", "missing": measured_text(cell), "published": None}
     if cell.published is not None:
         view["missing"] = NOT_AVAILABLE if cell.unavailable else ""
@@ -158,6 +199,7 @@ def _cell(cell: Cell, decimals: int) -> dict[str, Any]:
         view |= {
             "value": value,
             "spread": spread,
+            "n": f"n = {cell.measured.n}" if cell.measured.n < known else "",
             "sort": cell.measured.mean,
             "rank": {1: "best", 2: "second"}.get(cell.measured_rank or 0, ""),
             "title": f"95 % interval [{low}, {high}], n = {cell.measured.n}, {cell.measured.clusters} objects",
@@ -190,94 +232,66 @@ def _verdicts(specs: Mapping[str, TableSpec], records: Sequence[Record], run: Ru
                     }
                 )
             if rows:
-                groups.append({"title": f"{spec.title}: {PROTOCOLS[protocol].label}", "rows": rows})
+                groups.append({"title": heading(spec.title, protocol), "rows": rows})
     return groups
 
 
-def _which(item: GalleryItem) -> str:
-    return f"{item.table}-{item.protocol}"
+def read_results(folder: Path) -> tuple[RunInfo, list[Record], list[Table]]:
+    """What a finished run left: its description, its records, and the tables made from them.
+
+    Raises:
+        UnirenderError: no run in the folder.
+    """
+    if not (folder / "run.json").is_file():
+        raise UnirenderError(f"{folder}: no run.json, expected the folder that `unirender bench run --out` wrote")
+    run = read_run(folder / "run.json")
+    records = [record for record in read_records(folder / "records.jsonl") if record.values]
+    return run, records, build_tables(records, run, ALL_TABLES)
 
 
-def _which_label(item: GalleryItem) -> str:
-    protocol = PROTOCOLS[item.protocol].label if item.protocol in PROTOCOLS else item.protocol
-    return f"{item.table}, {protocol}"
+def rebuild(folder: Path, suite: str | None = None) -> Path:
+    """Writes `report.html` of a finished run again; nothing is measured.
+
+    Args:
+        folder: that `unirender bench run --out` wrote.
+        suite: name or TOML file; None = the name that the run recorded.
+
+    Raises:
+        UnirenderError: no run in the folder, or the suite is not the one that it scored.
+    """
+    from unirender_evaluation.pictures import Pictures  # what runs need, a report alone does not
+    from unirender_evaluation.suites import load_suite
+    from unirender_evaluation.tasks import scene_ids
+
+    run, records, tables = read_results(folder)
+    loaded = load_suite(suite or run.suite)
+    if loaded.sha256 != run.suite_hash:
+        raise UnirenderError(
+            f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
+            f"{folder} scored; name it with --suite"
+        )
+    pictures = Pictures(folder / "pictures", loaded, scene_ids(loaded, run.limit))
+    main_row = next((info.key for info in run.methods if info.kind == "ours"), "")
+    items = pictures.items(records, main_row)
+    return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES)
 
 
-def _hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
-    """What was given, and what the first row of ours made of it, on the median sample: picked by rank, not by eye."""
-    ours = {info.key for info in run.methods if info.kind == "ours"}
-    candidates = [item for item in gallery if item.table == "inverse" and ours & item.predictions.keys()]
-    if not candidates:
-        return None
-    item = sorted(candidates, key=lambda item: -item.badness)[len(candidates) // 2]
-    method = next(key for key in item.predictions if key in ours)
-    pictures = [*item.given.items(), *item.predictions[method].items()]
-    return {
-        "pictures": [(name, data_uri(picture, item.mask)) for name, picture in pictures],
-        "caption": f"{run.method(method).label} on the sample of median score: {item.caption} ({item.sample}).",
-    }
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; 0, or 1 with one line on standard error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m unirender_evaluation.report", description="Writes the report of a finished run again."
+    )
+    parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote")
+    parser.add_argument("--suite", help="name or TOML file; default: the name that the run recorded")
+    arguments = parser.parse_args(argv)
+    try:
+        path = rebuild(arguments.run, arguments.suite)
+    except (UnirenderError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    return 0
 
 
-def _gallery(gallery: Sequence[GalleryItem], run: RunInfo) -> list[dict[str, Any]]:
-    """Cards by table and protocol, worst first in each."""
-    groups = []
-    for which in dict.fromkeys(_which(item) for item in gallery):
-        items = sorted((item for item in gallery if _which(item) == which), key=lambda item: -item.badness)
-        cards = [_card(item, run, f"{which}-{rank}", f"{rank} of {len(items)}") for rank, item in enumerate(items, 1)]
-        groups.append({"which": which, "title": _which_label(items[0]), "cards": cards})
-    return groups
-
-
-def _card(item: GalleryItem, run: RunInfo, identity: str, rank: str) -> dict[str, Any]:
-    names = list(item.truth)
-    return {
-        "id": identity,
-        "caption": item.caption,
-        "sub": f"{rank} · {item.sample}",
-        "names": names,
-        "truth": [data_uri(picture, item.mask) for picture in item.truth.values()],
-        "given": [(f"given: {name}", data_uri(picture, item.mask)) for name, picture in item.given.items()],
-        "rows": [
-            {"label": label, "cells": [_prediction(item, cells[n], n, run) if n in cells else None for n in names]}
-            for label, cells in picture_rows(item, run)
-        ],
-    }
-
-
-def picture_rows(item: GalleryItem, run: RunInfo) -> list[tuple[str, dict[str, str]]]:
-    """(label, map -> method key): a row per method, but trivial methods for different maps share rows."""
-    rows: list[tuple[str, dict[str, str]]] = []
-    shared: list[dict[str, str]] = []
-    for method, made in item.predictions.items():
-        cells = {name: method for name in item.truth if name in made}
-        if run.method(method).kind != "trivial" or len(item.truth) == 1:
-            rows.append((run.method(method).label, cells))
-            continue
-        free = next((row for row in shared if not row.keys() & cells.keys()), None)
-        if free is None:
-            shared.append(cells)
-        else:
-            free.update(cells)
-    return rows + [("Trivial", cells) for cells in shared]
-
-
-def _prediction(item: GalleryItem, method: str, name: str, run: RunInfo) -> dict[str, str]:
-    picture = item.predictions[method][name]
-    error, mean = flip_map(picture, item.truth[name], item.mask)
-    score, label = item.scores.get(method, {}).get(name, ""), run.method(method)
-    alone = label.kind != "trivial" or len(item.truth) == 1
-    return {
-        "uri": data_uri(picture, item.mask),
-        "name": "" if alone else label.label,
-        "score": score,
-        "flip": data_uri(error, item.mask),
-        "flip_mean": FLIP_TEXT.format(mean),
-    }
-
-
-def worst_samples(records: Iterable[Record], key: str, method: str, *, higher_is_better: bool, count: int) -> list[str]:
-    """Samples on which a method scores worst by a metric key, worst first: what to hand to the gallery."""
-    values = {
-        record.sample: record.values[key] for record in records if record.method == method and key in record.values
-    }
-    return sorted(values, key=lambda sample: values[sample] if higher_is_better else -values[sample])[:count]
+if __name__ == "__main__":
+    sys.exit(main())

@@ -9,7 +9,7 @@ from safetensors.numpy import save_file
 
 from unirender.errors import UnirenderError
 from unirender_evaluation import readme
-from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
+from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
 
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
 README = f"# title\n\n{SLOT.format('results')}\n{SLOT.format('checkpoint')}\nend\n"
@@ -58,6 +58,15 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     assert "Protocol:" in text
     stored = [path.read_text() for path in (tmp_path / "stored").glob("*.md")]
     assert any("21.50" in table for table in stored)
+
+
+def test_a_method_without_values_gets_no_row(tmp_path: Path) -> None:
+    run = write_example(tmp_path / "run")
+    append_record(run / "records.jsonl", Record("inverse", "single-image", "silent", "s0", "object0", {}, key="k"))
+    _, tables = readme.run_tables(run)
+    rows = [row.key for table in tables for row in table.rows]
+    assert "mine" in rows
+    assert "silent" not in rows
 
 
 def test_a_partial_run_is_refused_and_the_readme_untouched(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

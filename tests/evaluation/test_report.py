@@ -1,8 +1,11 @@
 """The report: one file, nothing from the network, failures first, both themes; and the gallery's pictures."""
 
 import base64
+import html
 import io
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,13 +13,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map, image_picture, map_pictures
+from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map, image_picture, map_pictures, picture_rows
 from unirender_evaluation.metrics import Variant, metric_key
-from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.report import picture_rows, worst_samples, write_report
+from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
+from unirender_evaluation.report import main, write_report
+from unirender_evaluation.report_plots import Scale, heading, tiles
 from unirender_evaluation.tables import build_tables
 
 SIZE = 24
@@ -48,13 +53,14 @@ def records() -> list[Record]:
     return made
 
 
-def item(sample: str, badness: float) -> GalleryItem:
+def item(sample: str, place: int = 1, rank: str = "") -> GalleryItem:
     rng = np.random.default_rng(0)
     truth, other = rng.random((2, SIZE, SIZE, 3), dtype=np.float32)
     maps = {"albedo": truth, "normal": other}
     return GalleryItem(
         "inverse", "single-image", sample, f"caption {sample}", mask(), {"image": other}, maps,
-        {"ours": maps, "input": {"albedo": other}}, {"ours": {"albedo": "20.0 dB"}}, badness,
+        {"ours": maps, "input": {"albedo": other}}, {"ours": {"albedo": "20.0 dB"}},
+        question=f"question {sample}", rank=rank, place=place, count=6, leader="ours", figure=f"PSNR {place} dB",
     )  # fmt: skip
 
 
@@ -62,7 +68,7 @@ def item(sample: str, badness: float) -> GalleryItem:
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("report") / "report.html"
     made = records()
-    write_report(path, build_tables(made, RUN), [item("good", -30), item("bad", -10)], RUN, made)
+    write_report(path, build_tables(made, RUN), [item("good", 6, "best"), item("bad", 1, "worst")], RUN, made)
     assert [p.name for p in path.parent.iterdir()] == ["report.html"]
     return path.read_text(encoding="utf-8")
 
@@ -98,7 +104,7 @@ def test_it_is_one_well_formed_file_without_a_network(page: str) -> None:
 def test_it_shows_the_protocol_the_watermark_and_both_values(page: str) -> None:
     assert "--limit 2: a partial run" in page
     assert "resolution</b> 24 x 24" in page
-    assert "paper <b>23.20</b>" in page
+    assert "paper </span><b>23.20</b>" in page
     assert "22.50" in page  # measured whole-frame mean of ours
     assert "prefers-color-scheme: dark" in page
 
@@ -108,14 +114,23 @@ def test_labels_are_escaped(page: str) -> None:
     assert "Ours <mean>" not in page.split('id="tables-json"')[0]
 
 
-def test_failures_come_first(page: str) -> None:
-    assert page.index("caption bad</h4>") < page.index("caption good</h4>")
+def test_failures_come_first_and_are_named_with_their_figures_and_questions(page: str) -> None:
+    cards = re.findall(r'<h4><span class="rank">(.*?)</span>(.*?)</h4>', page)
+    assert cards == [("worst of 6: PSNR 1 dB", "question bad"), ("best of 6: PSNR 6 dB", "question good")]
+    assert "ranked by Ours &lt;mean&gt;" in page
+
+
+def test_every_prediction_has_its_error_map_and_every_card_its_truth_and_input(page: str) -> None:
+    predictions = sum(len(maps) for maps in item("x").predictions.values())
+    assert page.count('alt="FLIP error"') == page.count('class="compare"') == 2 * predictions
+    assert page.count('alt="truth"') == 2 * len(item("x").truth)
+    assert page.count('<figure class="given"><figcaption>image</figcaption>') == 2
 
 
 def test_trivial_rows_for_different_maps_share_a_picture_row() -> None:
-    made = {"constant": {"normal": item("x", 0).truth["normal"]}, **item("x", 0).predictions}
+    made = {"constant": {"normal": item("x").truth["normal"]}, **item("x").predictions}
     run = replace(RUN, methods=(*RUN.methods, MethodInfo("constant", "Constant", "trivial")))
-    rows = picture_rows(replace(item("x", 0), predictions=made), run)
+    rows = picture_rows(replace(item("x"), predictions=made), run)
     assert rows == [
         ("Ours <mean>", {"albedo": "ours", "normal": "ours"}),
         ("Trivial", {"normal": "constant", "albedo": "input"}),
@@ -161,15 +176,122 @@ def test_flip_is_zero_for_equal_pictures_and_grows_with_the_error() -> None:
     assert means[0] < means[1] < means[2]
 
 
-def test_worst_samples_follow_the_direction_of_the_metric() -> None:
-    key = metric_key("albedo", "psnr")
-    assert worst_samples(records(), key, "ours", higher_is_better=True, count=2) == ["s0", "s1"]
-    assert worst_samples(records(), key, "ours", higher_is_better=False, count=2) == ["s5", "s4"]
-
-
 def test_a_picture_of_another_size_is_refused() -> None:
-    good = item("x", 0)
-    with pytest.raises(UnirenderError, match="gallery x, given image"):
-        GalleryItem(
-            good.table, good.protocol, "x", "", mask(), {"image": np.zeros((2, 2, 3), np.float32)}, good.truth, {}
-        )
+    good = item("x")
+    with pytest.raises(UnirenderError, match="gallery x, ours albedo"):
+        replace(good, predictions={"ours": {"albedo": np.zeros((2, 2, 3), np.float32)}})
+    replace(good, given={"HDRI": np.zeros((2, 4, 3), np.float32)})  # a light has a size of its own
+
+
+def tile_of(column: str, values: dict[str, list[float]], quantity: str, metric: str) -> dict:
+    """The tile of one column of the inverse table, from values per row and sample."""
+    key = metric_key(quantity, metric)
+    made = [
+        Record("inverse", "single-image", method, f"s{i}", f"o{i}", {key: value})
+        for method, found in values.items()
+        for i, value in enumerate(found)
+    ]
+    run = replace(RUN, limit=None)
+    (tile,) = [tile for tile in tiles(build_tables(made, run), ("psnr", "mse", "cosine")) if column in tile["what"]]
+    return tile
+
+
+@pytest.mark.parametrize(
+    ("quantity", "metric", "trivial", "ours", "end", "at"),
+    [
+        ("metallic", "mse", 0.10, 0.05, "perfect: 0", "50.0"),
+        ("normal", "cosine", 0.6, 0.9, "perfect: 1", "75.0"),
+        ("albedo", "psnr", 20.0, 26.0206, "perfect: no error (scale of RMS error)", "50.0"),  # half the RMS error
+        ("albedo", "psnr", 26.0206, 20.0, "perfect: no error (scale of RMS error)", "0.0"),  # worse than trivial
+    ],
+)
+def test_a_scale_without_a_ceiling_ends_at_a_perfect_value_and_says_so(
+    quantity: str, metric: str, trivial: float, ours: float, end: str, at: str
+) -> None:
+    tile = tile_of(quantity.capitalize(), {"input": [trivial] * 3, "ours": [ours] * 3}, quantity, metric)
+    assert (tile["end"], tile["end_kind"]) == (end, "perfect")
+    assert tile["start"].startswith("Input as albedo")
+    assert [(mark["kind"], mark["at"]) for mark in tile["marks"]] == [("ours", at)]
+
+
+def test_a_scale_with_a_ceiling_ends_there_and_prints_its_n() -> None:
+    tile = tile_of("Albedo", {"input": [10.0] * 3, "ours": [20.0] * 3, "ceiling": [50.0]}, "albedo", "psnr")
+    assert (tile["end"], tile["end_kind"]) == ("Noise ceiling 50.00 (n\xa0=\xa01)", "ceiling")
+    assert [mark["at"] for mark in tile["marks"]] == ["25.0"]
+
+
+def test_a_scale_is_clamped_and_an_infinite_psnr_is_its_end() -> None:
+    scale = Scale(20.0, float("inf"))
+    assert [scale.at(x) for x in (0.0, 20.0, 40.0, float("inf"))] == pytest.approx([0, 0, 0.9, 1])
+    assert Scale(0.1, 0.0).at(0.1) == 0
+    assert Scale(0.0, 0.0).at(0.0) == 1
+
+
+def test_cells_on_fewer_samples_than_their_row_print_their_n(tmp_path: Path) -> None:
+    """A ceiling with PSNR everywhere and SSIM on a subset."""
+    ssim = {metric_key("albedo", "ssim"): 0.9}
+    made = [
+        r if r.method == "ceiling" and r.sample > "s1" else replace(r, values={**r.values, **ssim}) for r in records()
+    ]
+    page = write_report(tmp_path / "r.html", build_tables(made, RUN), [], RUN).read_text(encoding="utf-8")
+    assert page.count('<span class="few">n = 2</span>') == 1
+    whole = write_report(tmp_path / "r.html", build_tables(records(), RUN), [], RUN).read_text(encoding="utf-8")
+    assert "few" not in whole.split("</style>")[1]
+
+
+def test_a_heading_names_the_protocol_only_where_it_says_more() -> None:
+    assert heading("Physics", "physics") == "Physics"
+    assert heading("Inverse rendering", "single-image") == "Inverse rendering: from the image"
+
+
+def test_the_legend_names_the_kinds_that_are_there(page: str) -> None:
+    legend = page.split('<p class="legend">')[1].split("</p>")[0]
+    assert re.findall(r'k-(\w+)">([^<]+)', legend) == [
+        ("ours", "ours"), ("paper", "published only"), ("trivial", "trivial"), ("ceiling", "bounds"),
+    ]  # fmt: skip
+
+
+def test_a_report_is_made_again_from_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    suite = make_suite(tmp_path / "suite")
+    run = replace(RUN, suite=suite.spec.name, suite_hash=suite.sha256)
+    assert main([str(tmp_path / "nothing")]) == 1
+    write_run(tmp_path / "run.json", run)
+    write_records(tmp_path / "records.jsonl", records())
+    options = ["--suite", str(suite.spec.path)]
+    assert main([str(tmp_path), *options]) == 0
+    assert "<table class" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    write_run(tmp_path / "run.json", replace(run, suite_hash="of another suite"))
+    (tmp_path / "report.html").unlink()
+    assert main([str(tmp_path), *options]) == 1
+    assert not (tmp_path / "report.html").exists()
+    errors = capsys.readouterr().err.splitlines()
+    assert [("no run.json" in errors[0]), ("name it with --suite" in errors[1])] == [True, True]
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+PROBE = """<iframe id="f" style="width:{width}px;height:800px;border:0" srcdoc="{page}"></iframe><script>
+f.onload = () => {{ const d = f.contentDocument.documentElement; document.title = d.scrollWidth + " of " + {width}; }}
+</script>"""
+
+
+def in_chromium(page: str, folder: Path, width: int) -> tuple[str, list[str]]:
+    """("scroll width of frame width", console messages) of a page in a frame of that width."""
+    path = folder / "probe.html"
+    path.write_text(PROBE.format(width=width, page=html.escape(page)), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr"]
+    command = [str(CHROMIUM), *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    title = re.search("<title>(.*?)</title>", done.stdout)
+    assert title is not None, done.stdout[:500]
+    return title[1], [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
+
+
+@pytest.mark.report
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_in_a_browser_nothing_fails_and_a_phone_does_not_scroll_sideways(page: str, tmp_path: Path) -> None:
+    assert in_chromium(page, tmp_path, 390) == ("390 of 390", [])
+    wide = page.replace("</main>", '<p style="width:500px">wide</p><script>no_such_function()</script></main>')
+    title, messages = in_chromium(wide, tmp_path, 390)
+    assert int(title.split()[0]) > 390
+    assert "no_such_function is not defined" in messages[0]
