@@ -13,7 +13,19 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"src": "unirender", "reference": "unirender_reference", "evaluation": "unirender_evaluation"}
 VOCABULARY = {
     f"unirender.{name}"
-    for name in ("camera", "color", "composite", "errors", "exposure", "exr", "intrinsics", "lighting", "paths")
+    for name in (
+        "camera",
+        "color",
+        "composite",
+        "errors",
+        "exposure",
+        "exr",
+        "intrinsics",
+        "lighting",
+        "paths",
+        "score",
+        "symmetries",
+    )
 }
 HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage")
 

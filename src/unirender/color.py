@@ -1,4 +1,4 @@
-"""Colour: linear Rec.709 <-> sRGB display values, and the tone curve that brings HDR maps into [0, 1].
+"""Colour: linear Rec.709 <-> sRGB display values, coverage, and the tone curve that brings HDR maps into [0, 1].
 
 Notation: names end in `_linear` for scene-referred linear Rec.709 and in `_srgb` for display values encoded with the
 sRGB transfer function (IEC 61966-2-1). `colour-science` has the same functions; it takes 2 s to import, so these ten
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 LUMINANCE_REC709 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+MIN_MASK = 1e-6  # a coverage that is divided by; less than half precision stores
 
 
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
@@ -30,6 +31,13 @@ def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
     return srgb_encode(np.clip(image_linear, 0.0, 1.0))
+
+
+def unpremultiply(
+    image_linear: Float[np.ndarray, "*batch h w c"], mask: Float[np.ndarray, "*batch h w 1"]
+) -> Float[np.ndarray, "*batch h w c"]:
+    """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0."""
+    return np.where(mask > 0, image_linear / np.maximum(mask, MIN_MASK), 0).astype(np.float32)
 
 
 def luminance(rgb_linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:

@@ -88,6 +88,11 @@ class Intrinsics:
         return tuple(name for name in MAPS if getattr(self, name) is not None)
 
     @property
+    def maps(self) -> dict[str, np.ndarray]:
+        """The maps that are known, by name; no copies."""
+        return {name: getattr(self, name) for name in self.present}
+
+    @property
     def height(self) -> int:
         return self._size()[0]
 

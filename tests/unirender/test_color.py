@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unirender.color import HdrCurve, image_srgb, luminance, srgb_decode, srgb_encode
+from unirender.color import HdrCurve, image_srgb, luminance, srgb_decode, srgb_encode, unpremultiply
 
 
 def test_srgb_agrees_with_colour_science() -> None:
@@ -46,3 +46,13 @@ def test_hdr_curve_ends_and_overflow() -> None:
 
 def test_image_srgb_clips_to_the_display() -> None:
     assert image_srgb(np.array([-1.0, 0.0, 1.0, 7.0])) == pytest.approx([0, 0, 1, 1])
+
+
+def test_unpremultiply_undoes_coverage_and_leaves_the_background_black() -> None:
+    rng = np.random.default_rng(0)
+    colour_linear, mask = rng.random((4, 4, 3)).astype(np.float32), rng.random((4, 4, 1)).astype(np.float32)
+    mask[:2] = 0
+    straight = unpremultiply(colour_linear * mask, mask)
+    np.testing.assert_allclose(straight[2:], colour_linear[2:], rtol=1e-6)
+    assert not straight[:2].any()
+    assert np.abs(colour_linear * mask - colour_linear)[2:].max() > 0.1  # twin: left premultiplied

@@ -16,13 +16,13 @@ from unirender.errors import UnirenderError
 from unirender.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
 from unirender.lighting import diffuse_light, mean_radiance, resample_environment, rotate_environment
 from unirender.paths import cache_dir
+from unirender.symmetries import turn_rotation
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
     NO_AUGMENTATION,
     Augmentation,
     Draw,
     draw,
-    turn_rotation,
 )
 from unirender.training.data import BATCH_MAPS, GroupDataset, iterate_batches
 from unirender.training.environments import turned_environments

@@ -1,9 +1,9 @@
 """Exact augmentations: each turns one scene's buffers into those of another scene that could be rendered.
 
-`Maps` is a dict of arrays `[..., H, W, C]`: the maps of `Intrinsics` and `image`, the premultiplied linear picture.
 Light is additive (`mix_lights`), radiance is a quadratic in metallic at depth 4 (`interpolate_metallic`), and the
-renderer treats the colour channels alike (`permute_channels`), mirror images (`mirror`) and turns about the view axis
-(`quarter_turn`). tests/physics/test_augmentation.py holds each against a Mitsuba render of the augmented scene.
+renderer treats the colour channels alike (`permute_channels`), mirror images and turns about the view axis (`mirror`
+and `quarter_turn` of `unirender.symmetries`, where `Maps` is explained). tests/physics/test_augmentation.py holds each
+against a Mitsuba render of the augmented scene.
 """
 
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exposure import draw_target
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import mirror_environment, rotate_environment
+from unirender.symmetries import LIGHT_MAPS, Maps
+from unirender.symmetries import mirror as mirror
+from unirender.symmetries import quarter_turn as quarter_turn
+from unirender.symmetries import turn_rotation as turn_rotation
 
-Maps = dict[str, np.ndarray]
-
-LIGHT_MAPS = ("image", "specular", "diffuse", "environment")  # linear in the light
 COLOUR_MAPS = ("image", "albedo", "specular", "diffuse", "environment")
 METALLIC_NODES = (0.0, 0.5, 1.0)
 
 
 def to_maps(image_linear: Float[np.ndarray, "*batch h w 3"], intrinsics: Intrinsics) -> Maps:
     """The picture and the known maps of `intrinsics` in one dict (no copies)."""
-    return {"image": image_linear} | {name: getattr(intrinsics, name) for name in intrinsics.present}
+    return {"image": image_linear} | intrinsics.maps
 
 
 def from_maps(maps: Maps) -> tuple[Float[np.ndarray, "*batch h w 3"], Intrinsics]:
@@ -75,11 +75,6 @@ def interpolate_metallic(
     return nodes[0] * np.float32(low) + nodes[1] * np.float32(middle) + nodes[2] * np.float32(high)
 
 
-def scale_light(maps: Maps, factor: float) -> Maps:
-    """Multiplies the light, and all that is linear in it, by `factor`: how the gauge is applied."""
-    return {name: value * np.float32(factor) if name in LIGHT_MAPS else value for name, value in maps.items()}
-
-
 def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
     """Channel c of the result is channel `order[c]` of every colour map."""
     if sorted(order) != [0, 1, 2]:
@@ -87,62 +82,6 @@ def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
     if tuple(order) == (0, 1, 2):
         return dict(maps)
     return {name: value[..., list(order)] if name in COLOUR_MAPS else value for name, value in maps.items()}
-
-
-def mirror(maps: Maps) -> Maps:
-    """The scene reflected in x -> -x: left and right change places."""
-    flipped: Maps = {}
-    for name, value in maps.items():
-        if name == "environment":
-            flipped[name] = mirror_environment(value)
-        else:
-            flipped[name] = value[..., ::-1, :]
-    if "normal" in maps:
-        flipped["normal"] = flipped["normal"] * np.array([-1, 1, 1], dtype=np.float32)
-    return flipped
-
-
-def quarter_turn(maps: Maps, turns: int) -> Maps:
-    """The scene turned counter-clockwise about the view axis by `turns` * 90 degrees, as the viewer sees it.
-
-    Frames are square. The environment is resampled (`turn_environment`); everything else is exact to the bit.
-    """
-    turns %= 4
-    if turns == 0:
-        return dict(maps)
-    turned: Maps = {}
-    for name, value in maps.items():
-        if name == "environment":
-            turned[name] = turn_environment(value, turns)
-            continue
-        if value.shape[-3] != value.shape[-2]:
-            raise UnirenderError(f"{name}: got {value.shape[-3]}x{value.shape[-2]}, expected a square frame to turn")
-        turned[name] = np.rot90(value, turns, axes=(-3, -2))
-    if "normal" in turned:
-        normal = turned["normal"]
-        cosine, sine = _COSINE[turns], _COSINE[turns - 1]
-        x, y = normal[..., 0], normal[..., 1]
-        turned["normal"] = np.stack([cosine * x - sine * y, sine * x + cosine * y, normal[..., 2]], axis=-1)
-    return turned
-
-
-_COSINE = (
-    np.float32(1),
-    np.float32(0),
-    np.float32(-1),
-    np.float32(0),
-)  # of 0, 90, 180, 270 degrees; sin(a) = cos(a - 90)
-
-
-def turn_rotation(turns: int) -> Float[np.ndarray, "3 3"]:
-    """The rotation about +z (towards the viewer) by `turns` * 90 degrees: +x goes to +y."""
-    cosine, sine = _COSINE[turns % 4], _COSINE[turns % 4 - 1]
-    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]], dtype=np.float32)
-
-
-def turn_environment(environment: Float[np.ndarray, "h w 3"], turns: int) -> Float[np.ndarray, "h w 3"]:
-    """The environment under `quarter_turn`, at its own resolution."""
-    return environment if turns % 4 == 0 else rotate_environment(environment, turn_rotation(turns))
 
 
 @dataclass(frozen=True)

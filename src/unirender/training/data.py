@@ -22,21 +22,18 @@ from torch import Tensor
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
+from unirender.symmetries import Maps, mirror, quarter_turn, scale_light
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
     METALLIC_NODES,
     NO_AUGMENTATION,
     Augmentation,
     Draw,
-    Maps,
     draw,
     from_maps,
     interpolate_metallic,
-    mirror,
     mix_lights,
     permute_channels,
-    quarter_turn,
-    scale_light,
 )
 from unirender.training.groups import Group, Pair, Shard, list_shards, open_packed
 
