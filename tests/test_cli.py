@@ -13,8 +13,11 @@ from PIL import Image
 from synthetic_shards import write_dataset
 
 from unirender.cli import main
-from unirender.exr import image_channels, read_exr, write_exr
+from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
+from unirender_evaluation.pipeline_method import weights_hash
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
     f"{name}.png"
@@ -55,7 +58,14 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
     length = np.linalg.norm(intrinsics.normal, axis=-1)
     np.testing.assert_allclose(length[inside], 1, rtol=0, atol=5e-3)
     assert (length[~inside] == 0).all()
-    assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 36
+    meta = json.loads((tmp_path / "out" / "meta.json").read_text())
+    assert (meta["fov_deg"], meta["mode"], meta["steps"], meta["seed"]) == (36, "mean", 1, 0)
+    assert 0 < meta["clipped"] < 0.05  # the highlight
+    for name in ("intrinsics.exr", "environment.exr"):
+        _, header = read_exr(tmp_path / "out" / name)
+        expected = {"input": "ball.png", "mode": "mean", "seed": "0", "camera": "fov_deg=36 principal=0.5,0.5"}
+        assert expected.items() <= header.items()
+        assert header["checkpoint_sha256"] == meta["checkpoint_sha256"] == weights_hash(SHIPPED_CHECKPOINT)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -71,6 +81,42 @@ def test_render_takes_what_decompose_wrote(ball: Path, tmp_path: Path) -> None:
     constant = np.mean((original[inside, :3].mean(axis=0) - original[inside, :3]) ** 2)
     assert error < constant  # the cycle explains the picture better than its mean colour
     assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 30
+
+
+def test_render_takes_one_file_and_the_camera_in_its_header(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("decompose", ball, "--output", tmp_path / "maps", "--fov", "30") == 0
+    (tmp_path / "maps" / "meta.json").unlink()
+    capsys.readouterr()
+    for name in ("maps", "maps/intrinsics.exr"):
+        assert run("render", tmp_path / name, "--output", tmp_path / "out", "--overwrite") == 0
+        assert "assumed" not in capsys.readouterr().err
+        assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 30
+    assert not (tmp_path / "out" / "environment.exr").exists()  # one file is that file
+
+
+def test_what_lies_outside_the_models_range_is_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], ball: Path
+) -> None:
+    rgb = np.array(Image.open(ball).convert("RGBA"))
+    rgb[30:70, 50:100, :3] = 255
+    Image.fromarray(rgb).save(tmp_path / "bright.png")
+    light = np.full((16, 32, 3), 0.2, dtype=np.float32)
+    light[8, 20] = 3e4
+    write_exr(tmp_path / "sun.exr", image_channels(light), half=False)
+    arguments = ("--environment", tmp_path / "sun.exr", "--exposure", "0", "--output", tmp_path / "out")
+    assert run("relight", tmp_path / "bright.png", *arguments) == 0
+    lines = capsys.readouterr().err
+    assert "of the object's pixels are clipped" in lines
+    assert lines.count("environment: values above 200") == 1
+    meta = json.loads((tmp_path / "out" / "meta.json").read_text())
+    assert 0.2 < meta["clipped"] < 0.6
+    over = meta["above_x_max"]["environment"]
+    assert over["count"] >= 3  # one texel in 16 x 32, three channels
+    assert (over["share"], over["x_max"]) == (over["count"] / (3 * 16 * 32), 200.0)
+    assert run("relight", ball, *arguments[:2], "--output", tmp_path / "dim") == 0  # scaled to the gauge
+    assert "clipped" not in capsys.readouterr().err
 
 
 def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:
@@ -104,6 +150,7 @@ def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], 
 
     values[3, 3] = np.nan
     OpenEXR.File({}, {"RGB": values}).write(str(folder / "nan.exr"))
+    Image.new("RGB", (8, 7), (9, 9, 9)).save(folder / "small.png")
     Image.new("L", (8, 8), 255).save(folder / "mask.png")
     Image.new("L", (150, 100), 0).save(folder / "black.png")
     Image.new("RGBA", (8, 8), (9, 9, 9, 0)).save(folder / "clear.png")
@@ -116,15 +163,14 @@ def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], 
         "mask size": ([ball, "--mask", folder / "mask.png"], "expected 150 x 100"),
         "empty mask": ([ball, "--mask", folder / "black.png"], "empty"),
         "clear": ([folder / "clear.png"], "empty"),
-        "fov": ([ball, "--fov", "190"], "field of view"),
-        "samples": ([ball, "--samples", "0"], "at least 1"),
+        "small": ([folder / "small.png"], "at least 8"),
         "checkpoint": ([ball, "--checkpoint", folder / "nowhere"], "nowhere"),
     }
 
 
 @pytest.mark.parametrize(
     "case",
-    ["text", "cut", "nan", "missing", "folder", "mask-size", "empty-mask", "clear", "fov", "samples", "checkpoint"],
+    ["text", "cut", "nan", "missing", "folder", "mask-size", "empty-mask", "clear", "small", "checkpoint"],
 )
 def test_bad_input_gives_one_line_and_no_output(
     case: str, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -154,23 +200,59 @@ def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.C
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_edit_needs_something_to_change(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("edit", ball, "--output", tmp_path / "out") == 1
-    assert run("edit", ball, "--output", tmp_path / "out", "--roughness", "1.5") == 1
-    lines = capsys.readouterr().err
-    assert "nothing to change" in lines
-    assert "[0, 1]" in lines
+USAGE = {
+    "no argument": (["decompose"], "required"),
+    "no such command": (["bake"], "bake"),
+    "nothing to change": (["edit", "PICTURE", "--output", "OUT"], "nothing to change"),
+    "roughness": (["edit", "PICTURE", "--output", "OUT", "--roughness", "1.5"], "[0, 1]"),
+    "metallic": (["edit", "PICTURE", "--output", "OUT", "--metallic", "nan"], "[0, 1]"),
+    "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "field of view"),
+    "samples": (["decompose", "PICTURE", "--output", "OUT", "--samples", "0"], "at least 1"),
+    "steps": (["render", "FOLDER", "--output", "OUT", "--steps", "0"], "at least 1"),
+    "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),
+    "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
+    "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
+    "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
+    "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
+    "minutes": (["train", "--data", "FOLDER", "--minutes", "0"], "more than 0"),
+    "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
+    "pairs": (["dataset", "--pairs", "5", "--out", "OUT"], "expected 3 x lights"),
+}
+FAILURES = {
+    "picture": (["edit", "MISSING", "--output", "OUT", "--roughness", "0.5"], "no such file"),
+    "light": (["relight", "PICTURE", "--environment", "MISSING", "--output", "OUT"], "missing"),
+    "maps": (["render", "FOLDER", "--output", "OUT"], "intrinsics.exr"),
+    "no maps": (["render", "PICTURE", "--output", "OUT"], "no EXR file"),
+    "checkpoint": (["render", "MAPS", "--output", "OUT", "--checkpoint", "FOLDER"], "model_index.json"),
+    "data": (["train", "--data", "MISSING", "--out", "OUT"], "no such data folder"),
+}
 
 
-def test_wrong_usage_exits_with_2(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("decompose") == 2
-    assert run("no-such-command") == 2
-    capsys.readouterr()
+def run_case(arguments: list[str], ball: Path, tmp_path: Path) -> int:
+    """Exit status of a command line with its placeholders filled in."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "maps").mkdir()
+    mask = np.ones((8, 8, 1), dtype=np.float32)
+    write_exr(tmp_path / "maps" / "intrinsics.exr", intrinsics_channels(Intrinsics(mask=mask)))
+    paths = {name.upper(): tmp_path / name for name in ("folder", "maps", "missing", "out")} | {"PICTURE": ball}
+    return run(*(paths.get(argument, argument) for argument in arguments))
 
 
-def test_render_refuses_a_folder_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("render", tmp_path, "--output", tmp_path / "out") == 1
-    assert "intrinsics.exr" in capsys.readouterr().err
+@pytest.mark.parametrize("case", USAGE)
+def test_wrong_usage_exits_with_2(case: str, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, words = USAGE[case]
+    assert run_case(arguments, ball, tmp_path) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_a_failure_exits_with_1(case: str, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, words = FAILURES[case]
+    assert run_case(arguments, ball, tmp_path) == 1
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert words in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_doctor_finds_a_working_backend(capsys: pytest.CaptureFixture[str]) -> None:
@@ -194,17 +276,25 @@ def test_help_loads_nothing_heavy() -> None:
 def test_train_writes_a_pipeline_that_decompose_loads(
     ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("train", "--data", tmp_path / "nowhere", "--out", tmp_path / "run") == 1
-    assert "no such data folder" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert run("train", "--data", tmp_path / "empty", "--out", tmp_path / "run") == 1
     assert not (tmp_path / "run").exists()
     write_dataset(tmp_path / "data", vary="basis", size=64)
-    assert (
-        run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", "--steps", "2", "--batch-size", "4") == 0
-    )
+    length = ("--steps", "2", "--batch-size", "4")
+    scored = ("--validate", "1", "--keep-best", "albedo.psnr")
+    assert run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", *length, *scored) == 0
+    assert "albedo.psnr" in capsys.readouterr().out
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    scores = [line["validation"] for line in log if "validation" in line]
+    assert len(scores) == 2  # before the first step and after the last
+    best = json.loads((tmp_path / "run" / "best" / "validation.json").read_text())
+    assert best["scores"]["albedo.psnr"] == {
+        "value": max(s["albedo.psnr"] for s in scores),
+        "higher_is_better": True,
+    }
     checkpoint = tmp_path / "run" / "pipeline"
     assert run("decompose", ball, "--checkpoint", checkpoint, "--output", tmp_path / "out") == 0
+    assert read_exr(tmp_path / "out" / "intrinsics.exr")[1]["checkpoint"] == "pipeline"
 
 
 def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -213,5 +303,3 @@ def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "3 pairs in 1 groups" in capsys.readouterr().out
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
     assert "complete" in capsys.readouterr().out
-    assert run("dataset", "--pairs", "5", "--out", tmp_path / "other") == 1
-    assert not (tmp_path / "other").exists()

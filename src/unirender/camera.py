@@ -4,6 +4,7 @@ Camera axes: +x right, +y up, +z towards the viewer; the camera sits at the orig
 """
 
 import math
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,8 @@ from unirender.errors import UnirenderError
 
 DEFAULT_FOV_DEG = 36.0
 DEFAULT_FILL = 0.9
+_NUMBER = r"(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)"
+_DESCRIPTION = re.compile(f"fov_deg={_NUMBER} principal={_NUMBER},{_NUMBER}")
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,24 @@ class Camera:
         if len(self.principal) != 2 or not all(math.isfinite(p) for p in self.principal):
             raise UnirenderError(f"principal point: got {self.principal}, expected two finite fractions of the frame")
 
+    def describe(self) -> str:
+        """`fov_deg=36 principal=0.5,0.5`: as it stands in the header attribute `unirender:camera` of a file."""
+        x, y = (_number(p) for p in self.principal)
+        return f"fov_deg={_number(self.fov_deg)} principal={x},{y}"
+
+    @classmethod
+    def parse(cls, text: str) -> "Camera":
+        """The camera that `describe` wrote.
+
+        Raises:
+            UnirenderError: the text is no such camera.
+        """
+        found = _DESCRIPTION.fullmatch(text.strip())
+        if found is None:
+            raise UnirenderError(f"camera: got {text!r}, expected a text like {cls().describe()!r}; pass --fov")
+        fov_deg, x, y = (float(number) for number in found.groups())
+        return cls(fov_deg, (x, y))
+
     def rays(self, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
         """Unit directions from the camera into the scene through the pixel centres, in camera axes (z < 0)."""
         half_height = math.tan(math.radians(self.fov_deg) / 2)  # of the image plane at distance 1
@@ -56,3 +77,8 @@ class Camera:
         """
         tangent = fill * math.tan(math.radians(self.fov_deg) / 2)
         return radius * math.sqrt(1 + 1 / tangent**2)
+
+
+def _number(value: float) -> str:
+    """The shortest text that reads back as the same number."""
+    return short if float(short := f"{value:g}") == value else repr(float(value))

@@ -1,26 +1,28 @@
-"""Pictures and result folders on disk.
+"""Result folders on disk.
 
 A *result folder* holds `intrinsics.exr` (all image-aligned maps), `environment.exr` (float32), one PNG a map for the
-eye and `meta.json`; it appears complete or not at all. `read_result` takes it back.
+eye and `meta.json`; it appears complete or not at all. `read_result` takes it back, or one such EXR by itself: every
+EXR says in its header attributes `unirender:*` where it comes from and through which camera it is seen.
 """
 
 import contextlib
+import dataclasses
+import hashlib
 import json
+import logging
 import os
 import shutil
 import tempfile
-import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image
 
-from unirender.camera import Camera
-from unirender.color import image_srgb
+from unirender.camera import DEFAULT_FOV_DEG, Camera
+from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import (
     channels_rgb,
@@ -32,116 +34,11 @@ from unirender.exr import (
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 
-MAX_PIXELS = 100_000_000
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 
+CAMERA_ATTRIBUTE = "camera"
 
-@dataclass(frozen=True)
-class Picture:
-    """A picture as a method sees it.
-
-    Attributes:
-        image_srgb: display values in [0, 1], not premultiplied.
-        mask: coverage from an alpha channel, or None where the file has none.
-        clipped: share of the values that lay above display white (EXR only).
-        name: what to call it in messages.
-    """
-
-    image_srgb: Float[np.ndarray, "h w 3"]
-    mask: Float[np.ndarray, "h w 1"] | None
-    clipped: float
-    name: str
-
-
-def read_picture(path: str | Path) -> Picture:
-    """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied).
-
-    Raises:
-        UnirenderError: the file is missing, no picture, broken, too large, or an EXR with NaN or infinite values.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise UnirenderError(f"{path}: no such file, expected a PNG, JPG or EXR picture")
-    if path.is_dir():
-        raise UnirenderError(f"{path}: is a folder, expected a PNG, JPG or EXR picture")
-    return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path)
-
-
-def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
-    """Coverage from a picture file: its alpha channel if it varies, else its luminance.
-
-    Raises:
-        UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty.
-    """
-    picture = read_picture(path)
-    has_alpha = picture.mask is not None and picture.mask.min() < 1
-    mask = picture.mask if has_alpha and picture.mask is not None else picture.image_srgb.mean(axis=-1, keepdims=True)
-    if mask.shape[:2] != size:
-        raise UnirenderError(
-            f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
-            "like the picture"
-        )
-    return check_mask(mask, str(path))
-
-
-def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray, "h w 1"]:
-    """Returns the mask.
-
-    Raises:
-        UnirenderError: no pixel is covered by at least one half.
-    """
-    if not (mask >= 0.5).any():
-        raise UnirenderError(f"{name}: the mask is empty, expected white (or opaque) pixels on the object")
-    return np.clip(mask, 0, 1).astype(np.float32)
-
-
-def _read_display_picture(path: Path) -> Picture:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as file:
-                width, height = file.size
-                if width * height > MAX_PIXELS:
-                    raise UnirenderError(
-                        f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
-                    )
-                file.load()
-                image = ImageOps.exif_transpose(file)
-    except UnirenderError:
-        raise
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"{path}: not a readable picture ({error}), expected PNG, JPG or EXR") from error
-    has_alpha = "A" in image.getbands() or "transparency" in image.info
-    if image.mode.startswith("I;16") or image.mode in ("I", "F"):  # 16-bit grey
-        values = np.asarray(image, dtype=np.float32)
-        if image.mode == "F" or values.max(initial=0) > 65535:
-            raise UnirenderError(f"{path}: a {image.mode} picture has no display values; save linear radiance as EXR")
-        rgb = np.repeat(values[..., None] / 65535, 3, axis=-1)
-        return Picture(rgb.astype(np.float32), None, 0.0, path.name)
-    pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
-    mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if has_alpha else None
-    return Picture(np.ascontiguousarray(pixels[..., :3]), mask, 0.0, path.name)
-
-
-def _read_exr_picture(path: Path) -> Picture:
-    channels, _ = read_exr(path)
-    if not set("RGB") <= set(channels):
-        raise UnirenderError(
-            f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A)"
-        )
-    rgb = channels_rgb(channels)
-    alpha = channels.get("A")
-    bad = ~np.isfinite(rgb).all(axis=-1) | (~np.isfinite(alpha) if alpha is not None else False)
-    if bad.any():
-        raise UnirenderError(
-            f"{path}: {int(bad.sum())} of {bad.size} pixels are NaN or infinite, expected finite radiance; "
-            "repair them first"
-        )
-    mask = None
-    if alpha is not None:
-        mask = check_mask(alpha[..., None], f"{path} (A)")
-        rgb = np.where(mask > 0, rgb / np.maximum(mask, 1e-6), 0)
-    return Picture(image_srgb(rgb), mask, float(np.mean(rgb > 1)), path.name)
+logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
@@ -213,57 +110,103 @@ def write_result(
     Args:
         folder: where.
         intrinsics: maps to write, or None.
-        meta: JSON-serialisable facts: input, checkpoint, settings. The camera is added.
+        meta: facts for `meta.json`: input, checkpoint, settings; text, numbers, paths, and dicts of them. The camera is
+            added.
         image_linear: a rendered image, premultiplied; written as `image.exr` and `image.png` (with alpha if the mask is
             known).
     """
-    attributes = {key: str(value) for key, value in meta.items() if isinstance(value, str | int | float)}
     record = dict(meta)
+    attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
-        camera = intrinsics.camera
-        record |= {"fov_deg": camera.fov_deg, "principal": list(camera.principal)}
+        record |= {"fov_deg": intrinsics.camera.fov_deg, "principal": list(intrinsics.camera.principal)}
         if any(name in IMAGE_MAPS for name in intrinsics.present):
             write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=attributes)
         if intrinsics.environment is not None:
             environment = image_channels(intrinsics.environment)
             write_exr(folder / ENVIRONMENT_FILE, environment, half=False, attributes=attributes)
-        for name in intrinsics.present:
-            write_png(folder / f"{name}.png", map_picture(name, getattr(intrinsics, name)))
+        for name, value in intrinsics.maps.items():
+            write_png(folder / f"{name}.png", map_picture(name, value))
     if image_linear is not None:
         mask = None if intrinsics is None else intrinsics.mask
         rgba = image_linear if mask is None else np.concatenate([image_linear, mask], axis=-1)
         write_exr(folder / IMAGE_FILE, image_channels(rgba), attributes=attributes)
-        straight = image_linear if mask is None else np.where(mask > 0, image_linear / np.maximum(mask, 1e-6), 0)
-        picture = image_srgb(straight)
+        picture = image_srgb(image_linear if mask is None else unpremultiply(image_linear, mask))
         write_png(folder / "image.png", picture if mask is None else np.concatenate([picture, mask], axis=-1))
-    (folder / META_FILE).write_text(json.dumps(record, indent=2, sort_keys=True) + "\n")
+    (folder / META_FILE).write_text(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
 
 
-def read_result(folder: str | Path) -> Intrinsics:
-    """The maps of a result folder.
+def header_attributes(meta: Mapping[str, Any], camera: Camera | None) -> dict[str, str]:
+    """The text and numbers of `meta` as header attributes; of a path the name only, since files travel."""
+    attributes = {key: str(value) for key, value in meta.items() if isinstance(value, str | int | float)}
+    attributes |= {key: value.resolve().name for key, value in meta.items() if isinstance(value, Path)}
+    return attributes if camera is None else attributes | {CAMERA_ATTRIBUTE: camera.describe()}
+
+
+def checkpoint_sha256(folder: Path) -> str:
+    """sha256 over the weights and configurations of a checkpoint folder, not over the account of its training."""
+    digest = hashlib.sha256()
+    files = (p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
+    for path in sorted(files):
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
+    """The maps of a result folder, or those of one EXR file, which then come without the environment.
+
+    The camera is that of the folder's `meta.json`, else that of the EXR header, else the contract's default, which is
+    logged.
+
+    Args:
+        path: the folder or the EXR file.
+        fov_deg: instead of the field of view that is stored.
 
     Raises:
-        UnirenderError: there is no such folder, or it lacks `intrinsics.exr`, or a file is broken.
+        UnirenderError: there is nothing of the kind, or a file is broken.
     """
-    folder = Path(folder)
-    if not (folder / INTRINSICS_FILE).is_file():
-        what = "has no intrinsics.exr" if folder.is_dir() else "is not a folder"
-        raise UnirenderError(f"{folder}: {what}, expected the output folder of `unirender decompose`")
-    channels, _ = read_exr(folder / INTRINSICS_FILE)
-    environment = None
-    if (folder / ENVIRONMENT_FILE).is_file():
-        environment = channels_rgb(read_exr(folder / ENVIRONMENT_FILE)[0])
-    camera = Camera()
-    if (folder / META_FILE).is_file():
-        try:
-            meta = json.loads((folder / META_FILE).read_text())
-            x, y = meta.get("principal", camera.principal)
-            camera = Camera(fov_deg=float(meta.get("fov_deg", camera.fov_deg)), principal=(float(x), float(y)))
-        except (ValueError, TypeError, AttributeError) as error:
-            raise UnirenderError(
-                f"{folder / META_FILE}: not readable ({error}); delete it to use the default camera"
-            ) from error
+    path = Path(path)
+    file = path / INTRINSICS_FILE if path.is_dir() else path
+    if path.is_dir() and not file.is_file():
+        raise UnirenderError(f"{path}: has no {INTRINSICS_FILE}, expected the output folder of `unirender decompose`")
+    if not file.is_file() or file.suffix.lower() != ".exr":
+        raise UnirenderError(f"{path}: no folder and no EXR file, expected the output of `unirender decompose`")
+    channels, attributes = read_exr(file)
+    environment, camera = None, None
+    if path.is_dir():
+        camera = _camera_of_meta(path / META_FILE)
+        if (path / ENVIRONMENT_FILE).is_file():
+            environment = channels_rgb(read_exr(path / ENVIRONMENT_FILE)[0])
     try:
-        return intrinsics_from_channels(channels, environment, camera)
+        if camera is None and CAMERA_ATTRIBUTE in attributes:
+            camera = Camera.parse(attributes[CAMERA_ATTRIBUTE])
+        if camera is None and fov_deg is None:
+            logger.warning(
+                "%s says nothing of its camera: a field of view of %g degrees is assumed (--fov)", path, DEFAULT_FOV_DEG
+            )
+        camera = camera or Camera()
+        if fov_deg is not None:
+            camera = dataclasses.replace(camera, fov_deg=fov_deg)
+        intrinsics = intrinsics_from_channels(channels, environment, camera)
     except UnirenderError as error:
-        raise UnirenderError(f"{folder}: {error}") from error
+        raise UnirenderError(f"{path}: {error}") from error
+    if not intrinsics.present:
+        raise UnirenderError(f"{path}: has the channels {', '.join(sorted(channels))}, expected maps like albedo.R")
+    return intrinsics
+
+
+def _camera_of_meta(path: Path) -> Camera | None:
+    """The camera of a `meta.json`; None where there is no file, or none in it.
+
+    Raises:
+        UnirenderError: the file is broken.
+    """
+    if not path.is_file():
+        return None
+    try:
+        meta = json.loads(path.read_text())
+        if "fov_deg" not in meta:
+            return None
+        x, y = meta.get("principal", Camera().principal)
+        return Camera(fov_deg=float(meta["fov_deg"]), principal=(float(x), float(y)))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UnirenderError(f"{path}: not readable ({error}); delete it to use the camera of the EXR file") from error

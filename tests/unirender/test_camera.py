@@ -47,3 +47,18 @@ def test_sphere_fills_the_stated_share_of_the_frame(fov: float, fill: float) -> 
 def test_impossible_field_of_view(fov: float) -> None:
     with pytest.raises(UnirenderError, match="field of view"):
         Camera(fov_deg=fov)
+
+
+@pytest.mark.parametrize("camera", [Camera(), Camera(1 / 3 * 100, (-1e-7, 2 / 3)), Camera(50, (0.4, 0.6))])
+def test_a_described_camera_reads_back(camera: Camera) -> None:
+    assert Camera.parse(camera.describe()) == camera
+
+
+def test_the_description_is_that_of_rendered_files() -> None:
+    assert Camera().describe() == "fov_deg=36 principal=0.5,0.5"
+
+
+@pytest.mark.parametrize("text", ["", "36", "fov_deg=36", "fov_deg=x principal=0.5,0.5", "fov_deg=190 principal=0,0"])
+def test_what_is_no_camera_is_refused(text: str) -> None:
+    with pytest.raises(UnirenderError, match=r"camera|field of view"):
+        Camera.parse(text)

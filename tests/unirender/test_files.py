@@ -1,75 +1,18 @@
-"""Pictures in, result folders out; what goes wrong leaves nothing behind."""
+"""Result folders: what is written reads back, and what goes wrong leaves nothing behind."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from unirender.camera import Camera
-from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
-from unirender.exr import image_channels, write_exr
-from unirender.files import MAX_PIXELS, new_folder, read_mask, read_picture, read_result, write_result
+from unirender.exr import intrinsics_channels, read_exr, write_exr
+from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
 
 RNG = np.random.default_rng(0)
-
-
-def test_display_picture_keeps_its_values(tmp_path: Path) -> None:
-    pixels = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    picture = read_picture(tmp_path / "a.png")
-    assert picture.mask is None
-    np.testing.assert_array_equal(np.round(picture.image_srgb * 255), pixels)
-
-
-def test_alpha_becomes_the_mask_and_palettes_are_understood(tmp_path: Path) -> None:
-    rgba = RNG.integers(0, 256, (4, 4, 4), dtype=np.uint8)
-    rgba[0, 0, 3] = 255
-    Image.fromarray(rgba).save(tmp_path / "a.png")
-    mask = read_picture(tmp_path / "a.png").mask
-    assert mask is not None
-    np.testing.assert_array_equal(np.round(mask[..., 0] * 255), rgba[..., 3])
-    Image.fromarray(rgba[..., :3]).convert("P").save(tmp_path / "p.png")
-    assert read_picture(tmp_path / "p.png").image_srgb.shape == (4, 4, 3)
-
-
-def test_sixteen_bit_grey(tmp_path: Path) -> None:
-    values = np.array([[0, 32768, 65535]], dtype=np.uint16)
-    Image.fromarray(values).save(tmp_path / "a.png")
-    np.testing.assert_allclose(read_picture(tmp_path / "a.png").image_srgb[0, :, 1], [0, 0.5, 1], atol=1e-4)
-
-
-def test_exif_orientation_is_applied(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # a quarter turn
-    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
-    assert read_picture(tmp_path / "a.jpg").image_srgb.shape == (8, 4, 3)
-
-
-def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
-    alpha = np.array([[1.0, 0.5, 0.0]], dtype=np.float32)
-    rgb = np.array([[0.2, 0.2, 0.2]], dtype=np.float32) * alpha
-    write_exr(tmp_path / "a.exr", image_channels(np.stack([rgb, rgb, rgb * 9, alpha], axis=-1)))
-    picture = read_picture(tmp_path / "a.exr")
-    np.testing.assert_allclose(picture.image_srgb[0, :2, 0], srgb_encode(np.full(2, 0.2)), atol=1e-3)
-    assert picture.image_srgb[0, 0, 2] == pytest.approx(1)
-    assert picture.clipped == pytest.approx(2 / 9)
-
-
-def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
-    side = int(MAX_PIXELS**0.5) + 10
-    Image.new("1", (side, side)).save(tmp_path / "bomb.png")
-    with pytest.raises(UnirenderError, match="scale it down"):
-        read_picture(tmp_path / "bomb.png")
-
-
-def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:
-    Image.fromarray(np.array([[0, 255]], dtype=np.uint8)).save(tmp_path / "m.png")
-    np.testing.assert_allclose(read_mask(tmp_path / "m.png", (1, 2))[..., 0], [[0, 1]])
-    Image.fromarray(np.array([[[9, 9, 9, 255], [9, 9, 9, 0]]], dtype=np.uint8)).save(tmp_path / "a.png")
-    np.testing.assert_allclose(read_mask(tmp_path / "a.png", (1, 2))[..., 0], [[1, 0]])
 
 
 def test_result_round_trip(tmp_path: Path) -> None:
@@ -115,12 +58,61 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
         pass
 
 
-def test_damaged_results_are_named(tmp_path: Path) -> None:
+def test_headers_say_where_a_file_comes_from(tmp_path: Path) -> None:
+    mask = np.ones((4, 4, 1), dtype=np.float32)
+    intrinsics = Intrinsics(mask=mask, environment=np.ones((2, 4, 3), dtype=np.float32), camera=Camera(40))
+    meta = {"input": Path("private/mug.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
     with new_folder(tmp_path / "out") as folder:
-        write_result(folder, Intrinsics(mask=np.ones((4, 4, 1), dtype=np.float32)), {})
+        write_result(folder, intrinsics, meta, image_linear=np.ones((4, 4, 3), dtype=np.float32))
+    for name in ("intrinsics.exr", "environment.exr", "image.exr"):
+        _, attributes = read_exr(tmp_path / "out" / name)
+        expected = {"input": "mug.png", "seed": "3", "mode": "mean", "camera": "fov_deg=40 principal=0.5,0.5"}
+        assert expected.items() <= attributes.items(), name
+    record = json.loads((tmp_path / "out" / "meta.json").read_text())
+    assert record["input"] == str(Path("private/mug.png"))
+    assert record["above_x_max"] == {"specular": {"count": 1}}
+
+
+def test_the_camera_is_that_of_meta_json_else_of_the_header_else_the_default(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mask, camera = np.ones((4, 6, 1), dtype=np.float32), Camera(100 / 3, (0.25, 2 / 3))
+    with new_folder(tmp_path / "out") as folder:
+        write_result(folder, Intrinsics(mask=mask, environment=mask[:2, :4].repeat(3, axis=-1), camera=camera), {})
+    alone = read_result(tmp_path / "out" / "intrinsics.exr")
+    assert alone.camera == camera
+    assert alone.environment is None
+    assert read_result(tmp_path / "out", fov_deg=50).camera == Camera(50, camera.principal)
+    (tmp_path / "out" / "meta.json").write_text('{"fov_deg": 20}')
+    assert read_result(tmp_path / "out").camera == Camera(20)
+    (tmp_path / "out" / "meta.json").unlink()
+    assert read_result(tmp_path / "out").camera == camera
+    assert not caplog.records
+    write_exr(tmp_path / "bare.exr", intrinsics_channels(Intrinsics(mask=mask)))
+    assert read_result(tmp_path / "bare.exr", fov_deg=36).camera == Camera()
+    assert not caplog.records
+    assert read_result(tmp_path / "bare.exr").camera == Camera()
+    assert "36 degrees is assumed" in caplog.text
+
+
+def test_damaged_results_are_named(tmp_path: Path) -> None:
+    mask = np.ones((4, 4, 1), dtype=np.float32)
+    with new_folder(tmp_path / "out") as folder:
+        write_result(folder, Intrinsics(mask=mask), {})
     (tmp_path / "out" / "meta.json").write_text("{")
-    with pytest.raises(UnirenderError, match="default camera"):
+    with pytest.raises(UnirenderError, match="camera of the EXR file"):
         read_result(tmp_path / "out")
     (tmp_path / "out" / "intrinsics.exr").write_bytes(b"nothing")
+    (tmp_path / "out" / "meta.json").unlink()
     with pytest.raises(UnirenderError, match="not a readable OpenEXR"):
         read_result(tmp_path / "out")
+    for attributes, channels, words in (
+        ({"camera": "wide"}, intrinsics_channels(Intrinsics(mask=mask)), "camera: got 'wide'"),
+        ({}, {"depth.Y": mask[..., 0]}, "has the channels depth.Y"),
+    ):
+        write_exr(tmp_path / "a.exr", channels, attributes=attributes)
+        with pytest.raises(UnirenderError, match=words):
+            read_result(tmp_path / "a.exr")
+    for path, words in ((tmp_path / "none", "no folder and no EXR"), (tmp_path, r"has no intrinsics\.exr")):
+        with pytest.raises(UnirenderError, match=words):
+            read_result(path)

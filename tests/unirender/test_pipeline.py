@@ -15,6 +15,7 @@ from unirender.composite import composite_image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import specular_light
+from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -104,6 +105,38 @@ def test_samples_have_a_mean_and_a_spread(pipeline: UniRenderPipeline) -> None:
     sampling["generator"] = seeded()
     alone = pipeline.decompose(image, mask, num_samples=1, **sampling)
     np.testing.assert_allclose(get(alone.intrinsics, "albedo"), albedos[0], atol=1e-5)  # whatever the batch
+
+
+def test_each_sample_is_closed_with_the_same_noise(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    sampling: dict[str, Any] = {"mode": "sample", "num_inference_steps": 2, "num_samples": 2}
+    closed, plain = (
+        pipeline.decompose(image, mask, generator=seeded(), closed=on, **sampling).samples for on in (True, False)
+    )
+    for sample, own in zip(closed, plain, strict=True):
+        again = close_decomposition(own, srgb_decode(image) * mask, pipeline.render)
+        assert np.array_equal(get(sample, "albedo"), get(again, "albedo"))
+
+
+def test_light_beyond_the_networks_range_is_kept_counted_and_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    pipeline, given = make_pipeline(), scene()
+    assert pipeline.overflow(given) == {}
+    pipeline.render(given)
+    assert not caplog.records
+    specular = get(given, "specular").copy()
+    specular[16, 16] = 25.0
+    bright = given.replace(specular=specular)
+    over = pipeline.overflow(bright)
+    assert set(over) == {"specular"}
+    assert (over["specular"].count, over["specular"].x_max) == (3, 20.0)
+    assert over["specular"].share == pytest.approx(3 / specular.size)
+    images = [pipeline.render(x) for x in (bright, bright, given.replace(specular=np.minimum(specular, 20)))]
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["specular"]
+    assert np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])  # not clipped
+    light = np.full((64, 128, 3), 0.5, dtype=np.float32)
+    light[20:28, 40:52] = 1e4  # a sun, counted at the size at which the network sees it
+    assert set(pipeline.overflow(given.replace(environment=light))) == {"environment"}
 
 
 def test_pil_pictures_bring_their_alpha(pipeline: UniRenderPipeline) -> None:

@@ -1,13 +1,16 @@
 """The trainer: exact resume, averaged weights, overfitting one sample, and a run on shards."""
 
 import dataclasses
+import io
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from rich.console import Console
 from synthetic_shards import write_dataset
 from tiny_models import TRAIN, make_batch
 from torch import Tensor, nn
@@ -16,12 +19,15 @@ from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.score import Score
 from unirender.training.checkpoint import STATE_FILE, load_state, save_state
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline
+from unirender.training.live import live_report
 from unirender.training.presets import PRESETS, OptimizerConfig, TrainConfig, get_preset
 from unirender.training.source import ShardSource
 from unirender.training.trainer import RunConfig, Trainer, learning_rate
+from unirender.training.validation import Validate
 
 CPU = torch.device("cpu")
 OVERFIT_STEPS = 150
@@ -189,6 +195,142 @@ def test_run_on_shards_writes_what_it_says(tmp_path: Path) -> None:
     assert pipeline.dtype == torch.float32
     weight = trainer.ema.average["image_unet.conv_in.weight"].half().float()
     assert torch.equal(pipeline.dual_stream.image_unet.conv_in.weight, weight)
+
+
+def scores_in_turn(values: list[float], higher_is_better: bool) -> tuple[Validate, list[UniRenderPipeline]]:
+    """A validation that answers with the next value, and the pipelines that it was shown."""
+    shown: list[UniRenderPipeline] = []
+
+    def validate(pipeline: UniRenderPipeline) -> dict[str, Score]:
+        shown.append(pipeline)
+        return {"error": Score(values[len(shown) - 1], higher_is_better), "other": Score(0.0, True)}
+
+    return validate, shown
+
+
+def fit(
+    folder: Path, steps: int, validate: Validate | None = None, parallel: int = 1, keep_best: str | None = None
+) -> list[dict[str, Any]]:
+    """Runs, or resumes, with a log line at every step and a look (picture, validation) after every step."""
+    run = RunConfig(folder, steps=steps, log_every=1, picture_minutes=0.0, parallel=parallel, keep_best=keep_best)
+    lines: list[dict[str, Any]] = []
+    Trainer(TRAIN, run, CPU, torch.float32).fit(SyntheticSource(), lines.append, validate)
+    return lines
+
+
+def test_validation_sees_the_averaged_weights(tmp_path: Path) -> None:
+    validate, shown = scores_in_turn([3.0, 1.0, 2.0], higher_is_better=False)
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=1, picture_minutes=0.0), CPU, torch.float32)
+    lines: list[dict[str, Any]] = []
+    trainer.fit(SyntheticSource(), lines.append, validate)
+    assert [line["validation"]["error"] for line in lines if "validation" in line] == [3.0, 1.0, 2.0]
+    weight = shown[-1].dual_stream.image_unet.conv_in.weight
+    assert torch.equal(weight, trainer.ema.average["image_unet.conv_in.weight"])
+    assert not torch.equal(weight, trainer.model.image_unet.conv_in.weight)  # the twin: not the trained ones
+    image, mask = np.full((32, 32, 3), 0.5, np.float32), np.ones((32, 32, 1), np.float32)
+    assert np.isfinite(shown[0].decompose(image, mask).intrinsics.require("albedo")["albedo"]).all()
+    assert not (tmp_path / "best").exists()
+
+
+@pytest.mark.parametrize(("higher_is_better", "step"), [(True, 2), (False, 1)])
+def test_the_best_pipeline_is_kept_by_the_scores_own_direction(
+    tmp_path: Path, higher_is_better: bool, step: int
+) -> None:
+    validate, _ = scores_in_turn([2.0, 1.0, 3.0, 2.5], higher_is_better)  # at steps 0, 1, 2, and at the end
+    fit(tmp_path, 2, validate, keep_best="error")
+    best = json.loads((tmp_path / "best" / "validation.json").read_text())
+    assert best["step"] == step
+    assert json.loads((tmp_path / "best" / "training.json").read_text())["steps"] == step
+    resumed, _ = scores_in_turn([2.9, float("nan"), 1.5], higher_is_better)  # neither better, whichever way
+    fit(tmp_path, 3, resumed, keep_best="error")
+    assert json.loads((tmp_path / "best" / "validation.json").read_text()) == best
+    assert UniRenderPipeline.from_pretrained(tmp_path / "best").size == 32
+    assert not (tmp_path / "best.partial").exists()
+
+
+def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:
+    validate, _ = scores_in_turn([1.0], higher_is_better=True)
+    with pytest.raises(UnirenderError, match="expected one of: error, other"):
+        fit(tmp_path, 2, validate, keep_best="errors")
+    assert load_state(tmp_path) is None
+
+
+def test_scores_know_their_direction() -> None:
+    assert Score(2, True).better_than(Score(1, True))
+    assert Score(1, False).better_than(Score(2, False))
+    assert not Score(1, True).better_than(Score(1, True))
+    nan = float("nan")
+    assert Score(1, False).better_than(Score(nan, False))
+    assert not Score(nan, True).better_than(Score(1, True))
+    with pytest.raises(ValueError, match="different directions"):
+        Score(1, True).better_than(Score(1, False))
+
+
+def test_a_resume_says_where_another_number_of_passes_changes_it(tmp_path: Path) -> None:
+    fit(tmp_path, 1, parallel=2)
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["parallel"] == 2
+    assert json.loads((tmp_path / "config.json").read_text())["run"]["parallel"] == 2
+    assert not [line for line in fit(tmp_path, 2, parallel=2) if "parallel" in line]
+    (line,) = (line for line in fit(tmp_path, 3) if "parallel" in line)
+    assert line["parallel"].startswith("2 -> 1")
+    assert line in [json.loads(text) for text in (tmp_path / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_state_without_the_number_of_passes_resumes(tmp_path: Path) -> None:
+    """As version 0.1.0 wrote them."""
+    fit(tmp_path, 1)
+    state = load_state(tmp_path)
+    assert state is not None
+    save_state(tmp_path, {name: value for name, value in state.items() if name != "parallel"})
+    assert [line["step"] for line in fit(tmp_path, 2)] == [2]
+
+
+def test_radiance_above_the_curves_is_trained_on_and_counted(tmp_path: Path) -> None:
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=1, log_every=1), CPU, torch.float32)
+    batch = make_batch()
+    assert set(trainer.overflow(batch).values()) == {0.0}
+    batch["specular"][:, :, 10, 10:12] = 30.0
+    expected = pytest.approx(6 / batch["specular"][0].numel())
+    assert trainer.overflow(batch) == {
+        "above_x_max_specular": expected,
+        "above_x_max_diffuse": 0.0,
+        "above_x_max_environment": 0.0,
+    }
+    source, lines = SyntheticSource(), list[dict[str, Any]]()
+    source.next = lambda: batch
+    trainer.fit(source, lines.append)
+    assert [name for name in lines[0] if name.startswith("above")] == ["above_x_max_specular"]
+    plain = Trainer(TRAIN, RunConfig(tmp_path / "plain", steps=1), CPU, torch.float32)
+    clipped = plain.train_step(batch | {"specular": batch["specular"].clamp(max=20.0)})
+    assert clipped["grad_norm"] != lines[0]["grad_norm"]  # kept, not clipped
+
+
+def show(lines: list[dict[str, Any]], terminal: bool) -> str:
+    console = Console(file=io.StringIO(), force_terminal=terminal, width=100)
+    with live_report(100, 10.0, console) as report:
+        for line in lines:
+            report(line)
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_a_terminal_sees_one_live_line_and_a_file_all_of_them() -> None:
+    losses = [{"step": k, "minutes": 0.5 * k, "samples_per_s": 90.0, "albedo": 0.25 / k} for k in (1, 2)]
+    lines = [losses[0], {"step": 1, "validation": {"albedo.psnr": 20.0}}, losses[1]]
+    plain = show(lines, terminal=False).splitlines()
+    assert plain == [
+        "step 1  minutes 0.5  samples_per_s 90  albedo 0.25",
+        "step 1  validation: albedo.psnr 20",
+        "step 2  minutes 1  samples_per_s 90  albedo 0.125",
+    ]
+    live = show(lines, terminal=True)
+    assert "step 2 of 100" in live
+    assert "1.0 of 10 min" in live
+    assert "90.0 samples/s" in live
+    assert "validation: albedo.psnr 20" in live
+    assert "\x1b[" in live  # redrawn in place
 
 
 def test_growing_folder(tmp_path: Path) -> None:

@@ -13,7 +13,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import resample_environment
 
+MIN_NORMAL = 1e-3  # length below which a mean of normals has no direction
 MIN_COVERAGE = 1e-3  # below it a resampled pixel carries no colour
 
 
@@ -83,6 +86,19 @@ class Frame:
             value = divide(self.leave(value * inside), self.leave(inside))
         return np.where(mask > 0, value, 0).astype(np.float32)
 
+    def enter_intrinsics(self, intrinsics: Intrinsics, environment_size: tuple[int, int]) -> Intrinsics:
+        """All maps and the camera -> square, the environment at its own size; the mask has to be known."""
+        mask = intrinsics.require("mask")["mask"]
+        maps = {name: value for name, value in intrinsics.maps.items() if name not in ("mask", "environment")}
+        changes = {name: self.enter_map(value, mask) for name, value in maps.items()}
+        if "normal" in changes:
+            changes["normal"] = unit_normal(changes["normal"])
+        environment = intrinsics.environment
+        if environment is not None and environment.shape[:2] != environment_size:
+            environment = resample_environment(environment, environment_size)
+        mask, camera = np.clip(self.enter(mask), 0, 1), self.camera(intrinsics.camera)
+        return Intrinsics(mask=mask, environment=environment, camera=camera).replace(**changes)
+
 
 def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 c"]:
     """Bilinear, with an antialiasing support where it shrinks."""
@@ -93,3 +109,9 @@ def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[
 def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
     """Undoes a premultiplication; 0 where there is no coverage."""
     return np.where(mask > MIN_COVERAGE, premultiplied / np.maximum(mask, MIN_COVERAGE), 0).astype(np.float32)
+
+
+def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Normals of length 1; 0 stays 0."""
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.where(length > MIN_NORMAL, normal / np.maximum(length, MIN_NORMAL), 0).astype(np.float32)

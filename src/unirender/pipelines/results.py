@@ -8,10 +8,9 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import constant_map, masked_mean
-from unirender.pipelines.framing import Frame
+from unirender.pipelines.framing import Frame, unit_normal
 
 PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")
-MIN_NORMAL = 1e-3  # length below which a mean of normals has no direction
 
 
 @dataclass(frozen=True)
@@ -74,9 +73,3 @@ def combine(samples: tuple[Intrinsics, ...]) -> Decomposition:
     maps = mean.require("roughness", "metallic", "mask")
     roughness, metallic = (masked_mean(maps[name], maps["mask"]) for name in ("roughness", "metallic"))
     return Decomposition(mean, roughness, metallic, std, samples if len(samples) > 1 else ())
-
-
-def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Normals of length 1; 0 stays 0."""
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.where(length > MIN_NORMAL, normal / np.maximum(length, MIN_NORMAL), 0).astype(np.float32)

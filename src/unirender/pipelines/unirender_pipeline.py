@@ -6,6 +6,7 @@ comes back is premultiplied. Any size: pictures are brought to the model's squar
 (`unirender.pipelines.framing`).
 """
 
+import logging
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,35 +20,26 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
-from unirender.color import image_srgb as encode_srgb
 from unirender.color import srgb_decode
-from unirender.composite import composite_image
-from unirender.diffusion.sampling import NUM_SAMPLES, infer_attributes, infer_image, steps_of
 from unirender.errors import UnirenderError
-from unirender.intrinsics import MAPS, Intrinsics
-from unirender.lighting import resample_environment
+from unirender.intrinsics import Intrinsics
 from unirender.models.codec import make_codec
-from unirender.models.conditioning import TRIPLETS, Conditioning, Maps
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.precision import resolve_device, resolve_dtype
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, under_light
-from unirender.pipelines.framing import Frame, divide
+from unirender.pipelines.framing import Frame
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, unit_value
-from unirender.pipelines.results import Decomposition, EditResult, combine, predicted_intrinsics, unit_normal
-
-__all__ = [
-    "SHIPPED_CHECKPOINT",
-    "Decomposition",
-    "EditResult",
-    "UniRenderPipeline",
-    "resolve_device",
-    "resolve_dtype",
-]
+from unirender.pipelines.network import Network, Overflow
+from unirender.pipelines.rendering import enter, render_any_size
+from unirender.pipelines.results import Decomposition, EditResult, combine, predicted_intrinsics
+from unirender.pipelines.settings import Sampling
 
 SHIPPED_CHECKPOINT = Path(__file__).parent.parent / "checkpoints" / "tiny"
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
+
+logger = logging.getLogger(__name__)
 
 
 class UniRenderPipeline(DiffusionPipeline):
@@ -78,6 +70,7 @@ class UniRenderPipeline(DiffusionPipeline):
         codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
         self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
         self.size = dual_stream.config["sample_size"] * codec.factor
+        self._reported: set[str] = set()  # maps whose overflow was logged
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
@@ -133,31 +126,19 @@ class UniRenderPipeline(DiffusionPipeline):
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
         """
         picture, cover = as_picture(image_srgb, mask)
-        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
-        generator = generator or _fixed_noise(mode)
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         camera, material = camera or Camera(), material or self.config["material"]
         if material not in ("scalar", "map"):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
-        frame = Frame(picture.shape[0], picture.shape[1], self.size)
-        inside = frame.enter(cover)
-        image = self._tensor(frame.enter(srgb_decode(picture) * cover)).expand(count, -1, -1, -1)
-        maps = infer_attributes(
-            self.dual_stream,
-            self.conditioning,
-            self.scheduler,
-            image,
-            self._tensor(inside).expand(count, -1, -1, -1),
-            steps=steps,
-            generator=generator,
-            camera=frame.camera(camera),
-            progress=self._progress,
-        )
-        arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
-        rows = [{name: value[i] for name, value in arrays.items()} for i in range(count)]
-        samples = [predicted_intrinsics(row, frame, cover, camera, material) for row in rows]
+        frame, image_linear = Frame(picture.shape[0], picture.shape[1], self.size), srgb_decode(picture) * cover
+        found = self._network.attributes(frame.enter(image_linear), frame.enter(cover), frame.camera(camera), how)
+        samples = [predicted_intrinsics(maps, frame, cover, camera, material) for maps in found]
         if closed:
-            linear = srgb_decode(picture) * cover
-            samples = [close_decomposition(sample, linear, self.render) for sample in samples]
+
+            def render(maps: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+                return render_any_size(self._network, maps, Sampling.of())
+
+            samples = [close_decomposition(sample, image_linear, render) for sample in samples]
         return combine(tuple(samples))
 
     def render(
@@ -182,37 +163,19 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
-        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
-        generator = generator or _fixed_noise(mode)
-        intrinsics = ready_to_render(intrinsics)
-        frame = Frame(intrinsics.height, intrinsics.width, self.size)
-        small = self._enter(intrinsics, frame)
-        maps, given = self._maps(small)
-        image = infer_image(
-            self.dual_stream,
-            self.conditioning,
-            self.scheduler,
-            {name: value.expand(count, -1, -1, -1) for name, value in maps.items()},
-            given.expand(count, -1),
-            steps=steps,
-            generator=generator,
-            camera=small.camera,
-            progress=self._progress,
-        )
-        rendered = image.mean(dim=0).permute(1, 2, 0).float().cpu().numpy()
-        known = {"albedo", "specular", "diffuse"} <= set(intrinsics.present)
-        mask = intrinsics.require("mask")["mask"]
-        if frame.identity:
-            return rendered * (mask > 0)
-        inside = small.require("mask")["mask"]
-        radiance = frame.leave_map(divide(rendered, inside), mask)
-        if not known:
-            return radiance * mask
-        # The detail of a larger picture is in its composite; the model adds what it lacks, in display values.
-        small_composite = frame.leave_map(divide(composite_image(small), inside), mask)
-        change = encode_srgb(radiance) - encode_srgb(small_composite)
-        large_composite = divide(composite_image(intrinsics), mask)
-        return srgb_decode(np.clip(encode_srgb(large_composite) + change, 0, 1)) * mask
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
+        return render_any_size(self._network, intrinsics, how, self._report_overflow)
+
+    def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
+        """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
+
+        Such values are not clipped: they enter above the range of the training data. `render` logs them, once a map.
+
+        Returns:
+            By name of the map; {} where nothing does.
+        """
+        network = self._network
+        return network.overflow(enter(network, ready_to_render(intrinsics))[1])
 
     def edit(
         self,
@@ -312,58 +275,22 @@ class UniRenderPipeline(DiffusionPipeline):
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
         # Both renders see the same noise, so that it cancels in what changes.
-        seed = _draw_seed(sampling.get("generator") or _fixed_noise(sampling.get("mode", "mean")))
+        seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
         after = self.render(edited, generator=torch.Generator().manual_seed(seed), **settings)
         if not anchored:
             return after
-        plain = self.render(before, generator=torch.Generator().manual_seed(seed), **settings)
-        return anchor(srgb_decode(picture) * cover, plain, after)
+        again = Sampling.of(**settings, generator=torch.Generator().manual_seed(seed))
+        return anchor(srgb_decode(picture) * cover, render_any_size(self._network, before, again), after)
 
-    def _enter(self, intrinsics: Intrinsics, frame: Frame) -> Intrinsics:
-        """The intrinsics at the model's size, the light at the size that it predicts."""
-        mask = intrinsics.require("mask")["mask"]
-        names = [name for name in intrinsics.present if name not in ("mask", "environment")]
-        changes = {name: frame.enter_map(getattr(intrinsics, name), mask) for name in names}
-        if "normal" in changes:
-            changes["normal"] = unit_normal(changes["normal"])
-        size = self.conditioning.packing.environment_size
-        if intrinsics.environment is not None and intrinsics.environment.shape[:2] != size:
-            changes["environment"] = resample_environment(intrinsics.environment, size)
-        entered = {"environment": intrinsics.environment} | changes
-        return Intrinsics(**entered, mask=np.clip(frame.enter(mask), 0, 1), camera=frame.camera(intrinsics.camera))
-
-    def _maps(self, small: Intrinsics) -> tuple[Maps, torch.Tensor]:
-        """Tensors of all maps (zeros for the unknown) and which of the six pictures are given."""
-        size = (self.size, self.size)
-        shapes = {"environment": (*self.conditioning.packing.environment_size, 3)}
-        maps: Maps = {}
-        for name, channels in MAPS.items():
-            value = getattr(small, name)
-            unknown = np.zeros(shapes.get(name, (*size, channels)), np.float32)
-            maps[name] = self._tensor(unknown if value is None else value)
-        given = [name == "material" or getattr(small, name) is not None for name in TRIPLETS]
-        return maps, torch.tensor([given], device=self.dual_stream.device)
-
-    def _tensor(self, array: Float[np.ndarray, "h w c"]) -> torch.Tensor:
-        contiguous = np.ascontiguousarray(np.moveaxis(array, -1, 0), dtype=np.float32)
-        return torch.from_numpy(contiguous)[None].to(self.dual_stream.device)
+    @property
+    def _network(self) -> Network:
+        return Network(self.dual_stream, self.conditioning, self.scheduler, self.size, self._progress)
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
         return self.progress_bar(steps)  # pyright: ignore[reportReturnType, reportCallIssue, reportArgumentType] - tqdm
 
-
-def _fixed_noise(mode: str) -> torch.Generator | None:
-    return torch.Generator().manual_seed(0) if mode == "mean" else None
-
-
-def _sample_count(mode: str, num_samples: int | None) -> int:
-    if num_samples is not None and num_samples < 1:
-        raise UnirenderError(f"num_samples: got {num_samples}, expected at least 1")
-    if mode == "mean" and num_samples not in (None, 1):
-        raise UnirenderError(f"mode mean gives 1 sample, got num_samples {num_samples}; use mode 'sample'")
-    return 1 if mode == "mean" else num_samples or NUM_SAMPLES
-
-
-def _draw_seed(generator: torch.Generator | None) -> int:
-    device = generator.device if generator is not None else "cpu"
-    return int(torch.randint(0, 2**62, (), generator=generator, device=device))
+    def _report_overflow(self, overflow: dict[str, Overflow]) -> None:
+        for name, over in overflow.items():
+            if name not in self._reported:
+                self._reported.add(name)
+                logger.warning("%s: %s; they are kept, but what it makes of them is a guess", name, over)

@@ -16,15 +16,24 @@ if TYPE_CHECKING:
 TRAINING_FILE = "training.json"
 
 
+def averaged_pipeline(
+    trainer: "Trainer", dtype: torch.dtype = torch.float32, device: torch.device | None = None
+) -> UniRenderPipeline:
+    """A pipeline of the averaged weights as they are now, a copy; on the trainer's device without another one."""
+    model, _ = build_model(trainer.config.model)
+    trainer.ema.copy_to(model)
+    nn.Module.to(model.eval(), device or trainer.device, dtype)  # in place
+    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler)
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
 def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch.float16) -> Path:
     """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes, presets.
 
     Weights are stored as `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
     """
-    model, _ = build_model(trainer.config.model)
-    trainer.ema.copy_to(model)
-    nn.Module.to(model, dtype)  # in place
-    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler)
+    pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
     pipeline.save_pretrained(folder, safe_serialization=True)
     for path in folder.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
         path.chmod(0o644)

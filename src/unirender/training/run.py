@@ -1,109 +1,124 @@
-"""`python -m unirender.training.run --preset tiny --data DIR --out DIR --minutes 70`: train, or resume.
+"""`unirender train`: its options, and the run that they describe. Torch is imported only when training begins."""
 
-The command line's `unirender train` calls `train` here. Torch is imported only when training begins.
-"""
-
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
+from unirender.options import Device, DType, usage
 from unirender.paths import cache_dir
 from unirender.training.presets import TrainConfig, get_preset
 
+if TYPE_CHECKING:
+    from unirender.training.validation import Validate
 
-def train(
-    preset: str = "tiny",
-    data: Path | None = None,
-    out: Path | None = None,
-    minutes: float | None = None,
-    steps: int | None = None,
-    batch_size: int | None = None,
-    device: str = "auto",
-    dtype: str = "auto",
-    seed: int = 0,
-    parallel: int | None = None,
-    refresh_minutes: float | None = None,
-) -> Path:
-    """Trains a preset; the same command again resumes.
-
-    Args:
-        preset: a row of `unirender.training.presets.PRESETS`.
-        data: folder written by `unirender dataset`; default: `data/tiny-train` in the cache folder.
-        out: folder of the run; default: `runs/PRESET` in the cache folder.
-        minutes: length by the clock, over all resumes.
-        steps: length in optimiser steps; the preset's where neither this nor minutes is given.
-        batch_size: instead of the preset's.
-        device: auto, cpu, cuda or mps.
-        dtype: auto, float32 or bfloat16; weights stay fp32, this is the autocast format.
-        seed: of the weights, the data order and the noise.
-        parallel: parts of a batch that run side by side on a CPU, one thread each; default: PyTorch's thread count.
-        refresh_minutes: look for new shards this often (a data folder that is still being written).
-
-    Returns:
-        The folder with the trained pipeline, `out/pipeline`.
-    """
-    import dataclasses
-
-    config = dataclasses.replace(get_preset(preset), seed=seed)
-    if batch_size is not None:
-        config = dataclasses.replace(config, batch_size=batch_size)
-    data = data or cache_dir() / "data" / "tiny-train"
-    if not data.is_dir():
-        raise UnirenderError(f"{data}: no such data folder, expected one written by `unirender dataset`; pass --data")
-    out = out or cache_dir() / "runs" / preset
-    return _train(config, data, out, minutes, steps, device, dtype, parallel, refresh_minutes)
+MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
 
 
-def _train(
-    config: TrainConfig,
-    data: Path,
-    out: Path,
-    minutes: float | None,
-    steps: int | None,
-    device: str,
-    dtype: str,
-    parallel: int | None,
-    refresh_minutes: float | None,
-) -> Path:
+@dataclass(frozen=True)
+class Train:
+    """Train a preset on shards; resumes by running the same command again."""
+
+    data: Path
+    """Folder that `unirender dataset` wrote."""
+    preset: str = "tiny"
+    """Row of `unirender.training.presets.PRESETS`."""
+    out: Path | None = None
+    """Run folder. None: `${UNIRENDER_CACHE}/runs/<preset>`."""
+    minutes: float | None = None
+    """Stop, with the learning rate decayed, after this many minutes of training over all resumes."""
+    steps: int | None = None
+    """Stop after this many steps instead of the preset's."""
+    batch_size: int | None = None
+    """Instead of the preset's."""
+    device: Device = "auto"
+    """auto: cuda, then mps, then cpu, whichever is there."""
+    dtype: DType = "auto"
+    """Of the autocast; weights stay float32. auto: bfloat16 only on hardware that computes in it."""
+    seed: int = 0
+    """Of the weights, the data order and the noise."""
+    parallel: int | None = None
+    """Parts of a batch that run side by side on a CPU, one thread each. None: PyTorch's thread count."""
+    refresh_minutes: float | None = None
+    """Look for new shards this often, in a data folder that is still being written. None: never."""
+    validate: int = 0
+    """Score this many scenes of a suite with every picture (every 5 minutes). 0: none. At 64 px a scene costs about
+    half a second of one CPU core."""
+    validate_suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    keep_best: str | None = None
+    """Keep in `best/` the pipeline that had the best of these scores, such as albedo.psnr. It was then chosen by scenes
+    of that suite: its scores there flatter it."""
+
+    def check(self) -> TrainConfig:
+        """Looks at the values; the resolved configuration.
+
+        Raises:
+            UsageError: an unknown preset, a value outside its range, or options that contradict each other.
+        """
+        for name in ("minutes", "steps", "batch_size", "parallel", "refresh_minutes"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: expected more than 0")
+        if self.validate < 0:
+            raise UsageError(f"--validate {self.validate}: expected a number of scenes, or 0 for none")
+        if self.keep_best is not None and not self.validate:
+            raise UsageError(f"--keep-best {self.keep_best}: nothing is scored, expected --validate beside it")
+        with usage():
+            config = dataclasses.replace(get_preset(self.preset), seed=self.seed)
+        return config if self.batch_size is None else dataclasses.replace(config, batch_size=self.batch_size)
+
+    def run(self, make_validation: MakeValidation) -> int:
+        """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status."""
+        config = self.check()
+        if not self.data.is_dir():
+            raise UnirenderError(
+                f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
+            )
+        validate = make_validation(self.validate_suite, self.validate) if self.validate else None
+        train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
+        return 0
+
+
+def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path:
+    """Runs the training; returns the folder with the trained pipeline."""
     import torch
+    from rich.console import Console
 
     from unirender.models.precision import resolve_device, resolve_dtype
+    from unirender.training.export import export_pipeline
     from unirender.training.groups import list_shards
+    from unirender.training.live import live_report
     from unirender.training.source import ShardSource
     from unirender.training.trainer import RunConfig, Trainer
 
-    where = resolve_device(device)
-    parallel = parallel or (torch.get_num_threads() if where.type == "cpu" else 1)
+    device = resolve_device(options.device)
+    dtype = resolve_dtype(options.dtype, device)
+    parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
         torch.set_num_threads(1)
-    if steps is None and minutes is None:
-        steps = config.steps
-    run = RunConfig(out, steps, minutes, refresh_minutes=refresh_minutes, parallel=parallel)
-    list_shards(data)  # says what is wrong with the data before anything is built or written
-    trainer = Trainer(config, run, where, resolve_dtype(dtype, where))
-    source = ShardSource(data, config.batch_size, config.seed)
+    run = RunConfig(
+        out,
+        steps=config.steps if options.steps is None and options.minutes is None else options.steps,
+        minutes=options.minutes,
+        refresh_minutes=options.refresh_minutes,
+        parallel=parallel,
+        keep_best=options.keep_best,
+    )
+    list_shards(options.data)  # says what is wrong with the data before anything is built or written
+    trainer = Trainer(config, run, device, dtype)
+    source = ShardSource(options.data, config.batch_size, config.seed)
+    console = Console()
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
-    print(f"{out}: {parameters:.2f} M parameters, {where}, {trainer.dtype}, {parallel} passes side by side", flush=True)
-    trainer.fit(source, _report)
+    console.print(
+        f"{out}: {parameters:.2f} M parameters, {device}, {dtype}, {parallel} passes side by side",
+        soft_wrap=True,
+        highlight=False,
+        markup=False,
+    )
+    with live_report(run.steps, run.minutes, console) as report:
+        trainer.fit(source, report, validate)
     source.close()
-
-    from unirender.training.export import export_pipeline
-
     return export_pipeline(trainer, out / "pipeline")
-
-
-def _report(line: dict[str, Any]) -> None:
-    words = [f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}" for name, value in line.items()]
-    print("  ".join(words), flush=True)
-
-
-if __name__ == "__main__":
-    import sys
-
-    import tyro
-
-    try:
-        tyro.cli(train)
-    except UnirenderError as error:
-        print(f"unirender train: {error}", file=sys.stderr)
-        sys.exit(1)

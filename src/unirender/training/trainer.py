@@ -8,33 +8,32 @@ the clock.
 
 import contextlib
 import dataclasses
-import functools
 import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from unirender.diffusion.schedule import last_timestep, make_scheduler
-from unirender.diffusion.timesteps import Timesteps, draw_timesteps
+from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.conditioning import Maps
 from unirender.training.checkpoint import load_state, save_state
 from unirender.training.ema import Ema
-from unirender.training.losses import LossFunction, LossTerms
+from unirender.training.live import Report
+from unirender.training.losses import LossFunction
+from unirender.training.passes import BatchGradient
 from unirender.training.pictures import save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.source import BatchSource
+from unirender.training.validation import Validate, Validation
 
-Report = Callable[[dict[str, Any]], None]
-Validate = Callable[["Trainer"], dict[str, float]]
+OVERFLOW = "above_x_max_"  # prefix of log entries
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +48,7 @@ class RunConfig:
     picture_minutes: float = 5.0
     refresh_minutes: float | None = None  # look for new shards; None: never
     parallel: int = 1  # parts of a batch that run side by side, each on one CPU thread; changes the noise drawn
+    keep_best: str | None = None  # the score by which a validated run keeps its best pipeline in `best/`; None: none
 
 
 def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
@@ -56,14 +56,6 @@ def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
     warmup = min(1.0, (step + 1) / (config.warmup_steps + 1))
     decay = config.final_lr + (1 - config.final_lr) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
     return config.learning_rate * warmup * decay
-
-
-@dataclasses.dataclass(frozen=True)
-class Pass:
-    """A forward pass: its share of the batch, and the function that gives its loss terms."""
-
-    share: float
-    terms: Callable[[], LossTerms]
 
 
 class Trainer:
@@ -87,9 +79,7 @@ class Trainer:
             self.model.parameters(), o.learning_rate, betas=(o.beta1, o.beta2), weight_decay=o.weight_decay
         )
         self.ema = Ema(self.model, o.ema_decay)
-        # On a CPU that others use too, two passes on one thread each are far faster than one pass on two threads, which
-        # wait for each other at every operation (measured: 10 against 0.5 samples/s under load).
-        self.pool = ThreadPoolExecutor(run.parallel, "unirender-pass") if run.parallel > 1 else None
+        self.gradient = BatchGradient(self.loss, config, run.parallel, self.generator, dtype)
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
 
@@ -107,7 +97,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.loss.cycle_scale = float(self.progress >= self.config.loss.cycle_warmup)
-        terms = self._backward(list(self._passes(batch)))
+        terms = self.gradient(batch)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.optimizer.clip_norm)
         if not torch.isfinite(norm):
             raise UnirenderError(
@@ -119,12 +109,28 @@ class Trainer:
         return terms | {"grad_norm": float(norm), "lr": rate}
 
     def fit(self, source: BatchSource, report: Report = lambda line: None, validate: Validate | None = None) -> None:
-        """Trains to the end of the run, resuming where the folder's state stands."""
-        self.resume(source)
+        """Trains to the end of the run, resuming where the folder's state stands.
+
+        Args:
+            source: of the batches.
+            report: is told every line of the log.
+            validate: scores a pipeline of the averaged weights, at the start, with every picture and at the end.
+        """
+        self.resume(source, report)
         self._write_config()
+        validation = Validation(validate, self.run.keep_best) if validate else None
         fixed: Maps | None = None
         sums: dict[str, list[float]] = defaultdict(list)
-        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
+
+        def tell(line: dict[str, Any]) -> None:
+            self._log(line)
+            report(line)
+
+        def look() -> None:
+            if fixed is not None:
+                self.picture(fixed)
+            if validation is not None:
+                tell(validation.run(self))
 
         def due(name: str, minutes: float | None) -> bool:
             if minutes is None or time.monotonic() - clock[name] < 60 * minutes:
@@ -132,36 +138,38 @@ class Trainer:
             clock[name] = time.monotonic()
             return True
 
+        look()
+        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
         while self.progress < 1:
             batch = source.next()
             fixed = batch if fixed is None else fixed
-            for name, value in self.train_step(batch).items():
+            for name, value in (self.train_step(batch) | self.overflow(batch)).items():
                 sums[name].append(value)
             now = time.monotonic()
             self.seconds += now - clock["step"]
             clock["step"] = now
             if self.step % self.run.log_every == 0 or self.progress >= 1:
-                line: dict[str, Any] = {name: sum(values) / len(values) for name, values in sums.items()}
+                means = {name: sum(values) / len(values) for name, values in sums.items()}
                 count = max(len(values) for values in sums.values())
                 speed = count * self.config.batch_size / (now - clock["log"])
-                line = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed, **line}
                 clock["log"] = now
                 sums.clear()
-                self._log(line)
-                report(line)
+                known = {name: mean for name, mean in means.items() if mean or not name.startswith(OVERFLOW)}
+                tell({"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed, **known})
             if due("save", self.run.save_minutes):
                 self.save(source)
             if due("picture", self.run.picture_minutes):
-                self.picture(fixed)
-                if validate is not None:
-                    with self.averaged():
-                        self._log({"step": self.step, "validation": validate(self)})
+                look()
             if due("refresh", self.run.refresh_minutes) and (news := source.refresh()):
-                self._log({"step": self.step, "data": news})
-                report({"step": self.step, "data": news})
+                tell({"step": self.step, "data": news})
         self.save(source)
-        if fixed is not None:
-            self.picture(fixed)
+        look()
+
+    def overflow(self, batch: Maps) -> dict[str, float]:
+        """Share of each HDR map's values above the brightest that its curve is made for; they are trained on as they
+        are."""
+        curves = self.loss.conditioning.packing.curves
+        return {OVERFLOW + name: float((batch[name] > curve.x_max).float().mean()) for name, curve in curves.items()}
 
     def picture(self, batch: Maps) -> None:
         """Writes the picture of the averaged weights."""
@@ -196,10 +204,11 @@ class Trainer:
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
+            "parallel": self.run.parallel,
         }
 
-    def resume(self, source: BatchSource) -> bool:
-        """Continues from the folder's state, if it has one.
+    def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
+        """Continues from the folder's state, if it has one; `report` is told where that cannot be exact.
 
         Raises:
             UnirenderError: the state is broken or belongs to another config.
@@ -219,48 +228,13 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         source.load_state_dict(state["source"])
+        parallel = state.get("parallel", self.run.parallel)  # states of version 0.1.0 do not say
+        if parallel != self.run.parallel:
+            news = f"{parallel} -> {self.run.parallel}: from here on other noise is drawn than without the change"
+            line = {"step": self.step, "parallel": news}
+            self._log(line)
+            report(line)
         return True
-
-    def _backward(self, passes: list[Pass]) -> dict[str, float]:
-        """Runs the passes, side by side where `parallel` says so; sums their gradients and averages their terms."""
-        parameters = list(self.model.parameters())
-
-        def run(part: Pass) -> tuple[tuple[Tensor | None, ...], dict[str, Tensor]]:
-            with torch.autocast(self.device.type, self.dtype, enabled=self.dtype != torch.float32):
-                terms = part.terms()
-            loss = part.share * self.loss.total(terms)
-            return torch.autograd.grad(loss, parameters, allow_unused=True), terms
-
-        results = list(self.pool.map(run, passes)) if self.pool else [run(part) for part in passes]
-        for p, *gradients in zip(parameters, *(grads for grads, _ in results), strict=True):
-            known = [g for g in gradients if g is not None]
-            p.grad = sum(known[1:], start=known[0]) if known else None
-        weighted: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        for part, (_, terms) in zip(passes, results, strict=True):
-            for name, value in terms.items():
-                weighted[name].append((part.share, float(value.detach())))
-        return {name: sum(w * v for w, v in pairs) / sum(w for w, _ in pairs) for name, pairs in weighted.items()}
-
-    def _passes(self, batch: Maps) -> Iterator[Pass]:
-        """The forward passes of a batch: by direction, and cut into parts that can run side by side."""
-        size = len(batch["image"])
-        c, last = self.config, last_timestep(self.loss.scheduler)
-        drawn = draw_timesteps(c.timestep_rule, size, last, c.p_render, c.p_t, self.generator)
-        if c.timestep_rule == "conditional":  # rendering samples come first; every part gets its share of both kinds
-            count = int((drawn.attributes == 0).sum())
-            kinds = torch.arange(count), torch.arange(count, size)
-            parts = [torch.cat(rows) for rows in zip(*(k.tensor_split(self.run.parallel) for k in kinds), strict=True)]
-        else:
-            parts = list(torch.arange(size).tensor_split(self.run.parallel))
-        terms = self.loss.terms if c.timestep_rule == "conditional" else self.loss.joint_terms
-        for rows in parts:
-            if not len(rows):
-                continue
-            part = {name: value[rows] for name, value in batch.items()}
-            t = Timesteps(drawn.attributes[rows].to(self.device), drawn.image[rows].to(self.device))
-            seed = int(torch.randint(0, 2**62, (), generator=self.generator))
-            generator = torch.Generator().manual_seed(seed)
-            yield Pass(len(rows) / size, functools.partial(terms, part, t, generator))
 
     def _write_config(self) -> None:
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}

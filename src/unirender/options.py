@@ -1,0 +1,181 @@
+"""Options that the model's commands share, and how a command speaks to its user. Light to import."""
+
+import contextlib
+import dataclasses
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from unirender.errors import UnirenderError, UsageError
+
+if TYPE_CHECKING:
+    from unirender.camera import Camera
+    from unirender.pictures import Picture
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+Device = Literal["auto", "cpu", "cuda", "mps"]
+DType = Literal["auto", "float32", "bfloat16", "float16"]
+
+MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
+
+
+def notice(text: str) -> None:
+    """One line to the user that is no result."""
+    print(f"unirender: {text}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def usage() -> Iterator[None]:
+    """Whatever is refused inside was asked for in a wrong way: a `UnirenderError` becomes a `UsageError`."""
+    try:
+        yield
+    except UnirenderError as error:
+        raise UsageError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Which model runs, and how."""
+
+    checkpoint: Path | None = None
+    """Folder of a checkpoint (`unirender train` writes them); None: the shipped `tiny`."""
+    device: Device = "auto"
+    """auto: cuda, then mps, then cpu, whichever is there."""
+    dtype: DType = "auto"
+    """auto: bfloat16 only on hardware that computes in it, else float32."""
+    seed: int = 0
+    """Seed of the noise."""
+    steps: int | None = None
+    """Sampler steps. None: 1, the mean prediction, or 20 where several samples are asked for."""
+    samples: int = 1
+    """1: the mean prediction. More: that many diffusion samples, their average, and their spread."""
+    fov: float | None = None
+    """Vertical field of view of the picture in degrees. None: 36, and a notice."""
+    progress: bool = True
+    """Show progress."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        if self.samples < 1 or (self.steps is not None and self.steps < 1):
+            raise UsageError(
+                f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each (or no --steps)"
+            )
+        if not -(2**63) <= self.seed < 2**64:
+            raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
+        if self.fov is not None:
+            from unirender.camera import Camera
+
+            with usage():
+                Camera(fov_deg=self.fov)
+
+    def load(self) -> "UniRenderPipeline":
+        """The pipeline on its device.
+
+        Raises:
+            UnirenderError: no such checkpoint, or the device is not there.
+        """
+        import diffusers
+
+        from unirender.models.precision import resolve_device, resolve_dtype
+        from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+        device = resolve_device(self.device)
+        diffusers.utils.logging.disable_progress_bar()  # of loading: two small files
+        pipeline = UniRenderPipeline.from_pretrained(self.checkpoint, torch_dtype=resolve_dtype(self.dtype, device))
+        pipeline.to(device)
+        pipeline.set_progress_bar_config(disable=not self.progress or not sys.stderr.isatty())
+        return pipeline
+
+    @property
+    def mode(self) -> str:
+        """`mean`, or `sample` where several samples or steps are asked for."""
+        return "sample" if self.samples > 1 or (self.steps or 1) > 1 else "mean"
+
+    def sampling(self) -> dict[str, Any]:
+        """Keyword arguments of the pipeline's methods."""
+        import torch
+
+        sampled = self.mode == "sample"
+        return {
+            "mode": self.mode,
+            "num_samples": self.samples if sampled else None,
+            "num_inference_steps": self.steps if sampled else None,
+            "generator": torch.Generator().manual_seed(self.seed),
+        }
+
+    def camera(self) -> "Camera":
+        """The picture's camera; a notice is printed where its field of view is assumed."""
+        from unirender.camera import DEFAULT_FOV_DEG, Camera
+
+        if self.fov is None:
+            notice(f"field of view not given: {DEFAULT_FOV_DEG:g} degrees assumed (--fov)")
+            return Camera()
+        return Camera(fov_deg=self.fov)
+
+    def provenance(self, pipeline: "UniRenderPipeline") -> dict[str, Any]:
+        """What goes into `meta.json` and the headers: which model ran, and how."""
+        import unirender
+        from unirender.diffusion.sampling import steps_of
+        from unirender.files import checkpoint_sha256
+        from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
+
+        return {
+            "unirender": unirender.__version__,
+            "checkpoint": self.checkpoint or "tiny (shipped)",
+            "checkpoint_sha256": checkpoint_sha256(self.checkpoint or SHIPPED_CHECKPOINT),
+            "mode": self.mode,
+            "seed": self.seed,
+            "steps": steps_of(self.mode, self.steps),
+            "samples": self.samples,
+            "device": str(pipeline.device),
+            "dtype": str(pipeline.dtype).removeprefix("torch."),
+        }
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Where the result goes."""
+
+    output: Path
+    """Folder to write; it appears complete or not at all."""
+    overwrite: bool = False
+    """Replace the folder if it is there."""
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """The picture."""
+
+    picture: Annotated[Path, tyro.conf.Positional]
+    """PNG, JPG or EXR (linear, premultiplied), at least 8 pixels along each side."""
+    mask: Path | None = None
+    """Picture of the object's coverage (white: object). None: the alpha channel, else the whole frame."""
+
+    def read(self) -> "Picture":
+        """The picture with a mask; notices say what was assumed, and what the picture cannot show.
+
+        Raises:
+            UnirenderError: an unreadable file, or a mask that does not fit.
+        """
+        import numpy as np
+
+        from unirender.pictures import read_mask, read_picture
+
+        picture = read_picture(self.picture)
+        height, width = picture.image_srgb.shape[:2]
+        if self.mask is not None:
+            picture = dataclasses.replace(picture, mask=read_mask(self.mask, (height, width)))
+        elif picture.mask is None:
+            notice("no mask and no alpha channel: the whole frame is taken as the object (--mask)")
+            picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
+        if picture.clipped > MANY_CLIPPED:
+            notice(f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there")
+        return picture

@@ -1,0 +1,60 @@
+"""What a user sees of a training run: one live line in a terminal, plain lines anywhere else."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+Report = Callable[[dict[str, Any]], None]
+
+RATES = ("step", "minutes", "samples_per_s")  # entries of a line of losses; the others are its losses
+
+
+@contextlib.contextmanager
+def live_report(steps: int | None, minutes: float | None, console: Console) -> Iterator[Report]:
+    """Gives the function that shows a line of the log.
+
+    Args:
+        steps: length of the run, if it has one in steps.
+        minutes: the same in minutes.
+        console: where to. Its lines of losses replace each other if it is a terminal; all else stands.
+    """
+    if not console.is_terminal:
+        yield lambda line: console.print(words(line), soft_wrap=True, highlight=False, markup=False)
+        return
+    with Live(console=console, auto_refresh=False, transient=False) as live:
+
+        def report(line: dict[str, Any]) -> None:
+            if "samples_per_s" in line:
+                live.update(progress_line(line, steps, minutes), refresh=True)
+            else:
+                console.print(words(line), highlight=False, markup=False)
+
+        yield report
+
+
+def progress_line(line: dict[str, Any], steps: int | None, minutes: float | None) -> Group:
+    """A bar with step, minutes and samples/s, and the losses below it."""
+    done = max(line["step"] / steps if steps else 0.0, line["minutes"] / minutes if minutes else 0.0)
+    step = f"step {line['step']}" + (f" of {steps}" if steps else "")
+    clock = f"{line['minutes']:.1f}" + (f" of {minutes:g}" if minutes else "") + " min"
+    row = Table.grid(padding=(0, 2))
+    row.add_row(ProgressBar(total=1.0, completed=done, width=30), step, clock, f"{line['samples_per_s']:.1f} samples/s")
+    losses = {name: value for name, value in line.items() if name not in RATES}
+    return Group(row, Text(words(losses), style="dim"))
+
+
+def words(line: dict[str, Any]) -> str:
+    """`name value  name value ...`, numbers to four digits."""
+    parts: list[str] = []
+    for name, value in line.items():
+        if isinstance(value, dict):
+            parts.append(f"{name}: {words(value)}")
+        else:
+            parts.append(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
+    return "  ".join(parts)

@@ -1,0 +1,82 @@
+"""Validation of a run: the averaged weights, as users would load them, are scored by a function that is passed in.
+
+What the scores are is not known here: the composition root hands in the benchmark's own. Every validation is logged;
+with `keep_best` the pipeline that scored best stands in the run's folder `best/`, with its scores in
+`validation.json`.
+"""
+
+import dataclasses
+import json
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unirender.errors import UnirenderError
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.score import Score
+from unirender.training.export import averaged_pipeline, export_pipeline
+
+if TYPE_CHECKING:
+    from unirender.training.trainer import Trainer
+
+Validate = Callable[[UniRenderPipeline], Mapping[str, Score]]
+
+BEST_FOLDER, SCORES_FILE = "best", "validation.json"
+
+
+@dataclass(frozen=True)
+class Validation:
+    """How a run is validated.
+
+    Attributes:
+        validate: pipeline -> scores by name.
+        keep_best: name of the score by which `best/` is chosen; None: no such folder.
+    """
+
+    validate: Validate
+    keep_best: str | None = None
+
+    def run(self, trainer: "Trainer") -> dict[str, Any]:
+        """Scores the averaged weights, and keeps them if they are the best so far; returns a line for the log.
+
+        Raises:
+            UnirenderError: there is no score of the name `keep_best`.
+        """
+        start = time.monotonic()
+        scores = self.validate(averaged_pipeline(trainer))
+        values = {name: score.value for name, score in scores.items()}
+        line = {"step": trainer.step, "validation": values, "validation_s": round(time.monotonic() - start, 2)}
+        if self.keep_best is None:
+            return line
+        if self.keep_best not in scores:
+            raise UnirenderError(
+                f"the best of {self.keep_best!r}: there is no such score, expected one of: {', '.join(scores)}"
+            )
+        folder = trainer.run.out / BEST_FOLDER
+        before = best_score(folder, self.keep_best)
+        better = before is None or scores[self.keep_best].better_than(before)
+        if better:
+            _replace_best(trainer, folder, scores)
+        return line | {"best": better}
+
+
+def best_score(folder: Path, name: str) -> Score | None:
+    """The named score of the pipeline in `best/`; None where there is none."""
+    path = folder / SCORES_FILE
+    if not path.is_file():
+        return None
+    stored = json.loads(path.read_text())["scores"].get(name)
+    return None if stored is None else Score(**stored)
+
+
+def _replace_best(trainer: "Trainer", folder: Path, scores: Mapping[str, Score]) -> None:
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    export_pipeline(trainer, partial)
+    record = {"step": trainer.step, "scores": {name: dataclasses.asdict(score) for name, score in scores.items()}}
+    (partial / SCORES_FILE).write_text(json.dumps(record, indent=2) + "\n")
+    shutil.rmtree(folder, ignore_errors=True)
+    partial.rename(folder)

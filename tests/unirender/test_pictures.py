@@ -1,0 +1,84 @@
+"""Pictures and masks from files: what the pixels become, and which files are refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, write_exr
+from unirender.pictures import MAX_PIXELS, read_mask, read_picture
+
+RNG = np.random.default_rng(0)
+
+
+def test_display_picture_keeps_its_values(tmp_path: Path) -> None:
+    pixels = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    picture = read_picture(tmp_path / "a.png")
+    assert picture.mask is None
+    np.testing.assert_array_equal(np.round(picture.image_srgb * 255), pixels)
+
+
+def test_alpha_becomes_the_mask_and_palettes_are_understood(tmp_path: Path) -> None:
+    rgba = RNG.integers(0, 256, (4, 4, 4), dtype=np.uint8)
+    rgba[0, 0, 3] = 255
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    mask = read_picture(tmp_path / "a.png").mask
+    assert mask is not None
+    np.testing.assert_array_equal(np.round(mask[..., 0] * 255), rgba[..., 3])
+    Image.fromarray(rgba[..., :3]).convert("P").save(tmp_path / "p.png")
+    assert read_picture(tmp_path / "p.png").image_srgb.shape == (4, 4, 3)
+
+
+def test_sixteen_bit_grey(tmp_path: Path) -> None:
+    values = np.array([[0, 32768, 65535]], dtype=np.uint16)
+    Image.fromarray(values).save(tmp_path / "a.png")
+    np.testing.assert_allclose(read_picture(tmp_path / "a.png").image_srgb[0, :, 1], [0, 0.5, 1], atol=1e-4)
+
+
+def test_exif_orientation_is_applied(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn
+    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_picture(tmp_path / "a.jpg").image_srgb.shape == (8, 4, 3)
+
+
+def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
+    alpha = np.array([[1.0, 0.5, 0.0]], dtype=np.float32)
+    rgb = np.array([[0.2, 0.2, 0.2]], dtype=np.float32) * alpha
+    write_exr(tmp_path / "a.exr", image_channels(np.stack([rgb, rgb, rgb * 9, alpha], axis=-1)))
+    picture = read_picture(tmp_path / "a.exr")
+    np.testing.assert_allclose(picture.image_srgb[0, :2, 0], srgb_encode(np.full(2, 0.2)), atol=1e-3)
+    assert picture.image_srgb[0, 0, 2] == pytest.approx(1)
+    assert picture.clipped == pytest.approx(1)
+
+
+def test_clipped_is_the_share_of_the_object_at_display_white(tmp_path: Path) -> None:
+    rgba = np.full((2, 4, 4), 254, dtype=np.uint8)
+    rgba[..., 3] = 255
+    rgba[0, :2, 1] = 255  # one channel is enough
+    rgba[1, :2] = (255, 255, 255, 0)  # not on the object
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    assert read_picture(tmp_path / "a.png").clipped == pytest.approx(2 / 6)
+    Image.fromarray(rgba[..., :3]).save(tmp_path / "b.png")
+    assert read_picture(tmp_path / "b.png").clipped == pytest.approx(4 / 8)
+    rgba[..., :3] = 254
+    Image.fromarray(rgba[..., :3]).save(tmp_path / "c.png")
+    assert read_picture(tmp_path / "c.png").clipped == 0
+
+
+def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
+    side = int(MAX_PIXELS**0.5) + 10
+    Image.new("1", (side, side)).save(tmp_path / "bomb.png")
+    with pytest.raises(UnirenderError, match="scale it down"):
+        read_picture(tmp_path / "bomb.png")
+
+
+def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:
+    Image.fromarray(np.array([[0, 255]], dtype=np.uint8)).save(tmp_path / "m.png")
+    np.testing.assert_allclose(read_mask(tmp_path / "m.png", (1, 2))[..., 0], [[0, 1]])
+    Image.fromarray(np.array([[[9, 9, 9, 255], [9, 9, 9, 0]]], dtype=np.uint8)).save(tmp_path / "a.png")
+    np.testing.assert_allclose(read_mask(tmp_path / "a.png", (1, 2))[..., 0], [[1, 0]])
