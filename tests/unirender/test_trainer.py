@@ -20,7 +20,9 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
+from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.checkpoint import STATE_FILE, load_state, save_state
+from unirender.training.data import iterate_batches
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline
 from unirender.training.live import live_report
@@ -368,3 +370,32 @@ def test_device_and_dtype_names() -> None:
         resolve_dtype("int8", CPU)
     with pytest.raises(UnirenderError, match="not available here"):
         resolve_device("tpu")
+
+
+def test_a_run_starts_from_other_weights(tmp_path: Path) -> None:
+    first = Trainer(TRAIN, RunConfig(tmp_path / "a", steps=2), CPU, torch.float32)
+    second = Trainer(dataclasses.replace(TRAIN, seed=1), RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
+    name = "attribute_unet.conv_in.weight"
+    assert not torch.equal(first.model.state_dict()[name], second.model.state_dict()[name])
+    second.start_from(first.model)
+    for key, value in first.model.state_dict().items():
+        assert torch.equal(value, second.model.state_dict()[key])
+    assert torch.equal(second.ema.average[name], first.model.state_dict()[name])
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    wider = dataclasses.replace(
+        TRAIN, model=dataclasses.replace(TRAIN.model, cross_attention_dim=2 * TRAIN.model.cross_attention_dim)
+    )
+    trainer = Trainer(TRAIN, RunConfig(tmp_path / "a", steps=2), CPU, torch.float32)
+    other = Trainer(wider, RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
+    with pytest.raises(UnirenderError, match="expected the same network"):
+        trainer.start_from(other.model)
+
+
+def test_the_augmentation_of_a_config_reaches_the_batches(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", size=32)
+    batches = [ShardSource(data, 2, 0, workers=0, augmentation=a).next() for a in (NO_AUGMENTATION, TRAIN.augmentation)]
+    stored = next(iterate_batches(data, 2, 0, workers=0, augmentation=NO_AUGMENTATION))
+    assert torch.equal(batches[0]["image"], stored["image"])
+    assert not torch.equal(batches[1]["image"], stored["image"])

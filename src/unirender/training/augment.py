@@ -18,6 +18,7 @@ from unirender.symmetries import LIGHT_MAPS, Maps
 from unirender.symmetries import mirror as mirror
 from unirender.symmetries import quarter_turn as quarter_turn
 from unirender.symmetries import turn_rotation as turn_rotation
+from unirender.training.presets import Augmentation
 
 COLOUR_MAPS = ("image", "albedo", "specular", "diffuse", "environment")
 METALLIC_NODES = (0.0, 0.5, 1.0)
@@ -82,20 +83,6 @@ def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
     if tuple(order) == (0, 1, 2):
         return dict(maps)
     return {name: value[..., list(order)] if name in COLOUR_MAPS else value for name, value in maps.items()}
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """How often each augmentation is drawn, and how strongly."""
-
-    mix: float = 0.5  # probability that more than one light of a basis group is on
-    max_lights: int = 3  # most lights in a mixture
-    tint: float = 0.25  # largest standard deviation of the logarithm of a light's tint per channel; 0: none
-    metallic: bool = True  # continuous metallic in basis groups; False: the stored nodes only
-    permute: float = 0.3  # probability of a channel permutation other than the identity: lights have natural colours
-    mirror: float = 0.5  # probability of a mirror flip
-    turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
-    expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
 
 
 DEFAULT_AUGMENTATION = Augmentation()

@@ -27,7 +27,6 @@ from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
     METALLIC_NODES,
     NO_AUGMENTATION,
-    Augmentation,
     Draw,
     draw,
     from_maps,
@@ -36,6 +35,7 @@ from unirender.training.augment import (
     permute_channels,
 )
 from unirender.training.groups import Group, Pair, Shard, list_shards, open_packed
+from unirender.training.presets import Augmentation
 
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
 

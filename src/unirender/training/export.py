@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from unirender.models.build import build_model
+from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 if TYPE_CHECKING:
@@ -26,6 +27,15 @@ def averaged_pipeline(
     pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
+
+
+def load_network(folder: Path) -> DualStreamModel:
+    """The network of a pipeline folder, in float32.
+
+    Raises:
+        UnirenderError: no such folder, or no pipeline in it.
+    """
+    return UniRenderPipeline.from_pretrained(folder).dual_stream
 
 
 def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch.float16) -> Path:

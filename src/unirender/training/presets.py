@@ -62,12 +62,27 @@ class OptimizerConfig:
 
 
 @dataclass(frozen=True)
+class Augmentation:
+    """How often each exact augmentation is drawn, and how strongly; see `unirender.training.augment`."""
+
+    mix: float = 0.5  # probability that more than one light of a basis group is on
+    max_lights: int = 3  # most lights in a mixture
+    tint: float = 0.25  # largest standard deviation of the logarithm of a light's tint per channel; 0: none
+    metallic: bool = True  # continuous metallic in basis groups; False: the stored nodes only
+    permute: float = 0.3  # probability of a channel permutation other than the identity: lights have natural colours
+    mirror: float = 0.5  # probability of a mirror flip
+    turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
+    expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """A training run but for its data, its length and its folder."""
 
     model: ModelConfig = field(default_factory=ModelConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    augmentation: Augmentation = field(default_factory=Augmentation)
     batch_size: int = 16
     steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
@@ -77,7 +92,16 @@ class TrainConfig:
     seed: int = 0
 
 
-_TINY = TrainConfig(loss=LossConfig(cycle_into_renderer=False), batch_size=12, p_render=0.3, p_t=0.15, map_dropout=0.03)
+_TINY = TrainConfig(
+    loss=LossConfig(cycle_into_renderer=False),
+    augmentation=Augmentation(
+        mix=0.4, tint=0.15, permute=0.1, turn=0.05
+    ),  # close to natural light: it comes from above
+    batch_size=24,
+    p_render=0.25,
+    p_t=0.15,
+    map_dropout=0.03,
+)
 _SD_MODEL = ModelConfig(
     resolution=512,
     codec="kl",

@@ -25,6 +25,10 @@ class Train:
     """Folder that `unirender dataset` wrote."""
     preset: str = "tiny"
     """Row of `unirender.training.presets.PRESETS`."""
+    init: Path | None = None
+    """Begin with the weights of this pipeline folder instead of random ones; its network must be the preset's."""
+    learning_rate: float | None = None
+    """Peak learning rate, instead of the preset's."""
     out: Path | None = None
     """Run folder. None: `${UNIRENDER_CACHE}/runs/<preset>`."""
     minutes: float | None = None
@@ -58,7 +62,7 @@ class Train:
         Raises:
             UsageError: an unknown preset, a value outside its range, or options that contradict each other.
         """
-        for name in ("minutes", "steps", "batch_size", "parallel", "refresh_minutes"):
+        for name in ("minutes", "steps", "batch_size", "learning_rate", "parallel", "refresh_minutes"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise UsageError(f"--{name.replace('_', '-')} {value}: expected more than 0")
@@ -68,7 +72,12 @@ class Train:
             raise UsageError(f"--keep-best {self.keep_best}: nothing is scored, expected --validate beside it")
         with usage():
             config = dataclasses.replace(get_preset(self.preset), seed=self.seed)
-        return config if self.batch_size is None else dataclasses.replace(config, batch_size=self.batch_size)
+        if self.batch_size is not None:
+            config = dataclasses.replace(config, batch_size=self.batch_size)
+        if self.learning_rate is not None:
+            optimizer = dataclasses.replace(config.optimizer, learning_rate=self.learning_rate)
+            config = dataclasses.replace(config, optimizer=optimizer)
+        return config
 
     def run(self, make_validation: MakeValidation) -> int:
         """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status."""
@@ -88,7 +97,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     from rich.console import Console
 
     from unirender.models.precision import resolve_device, resolve_dtype
-    from unirender.training.export import export_pipeline
+    from unirender.training.export import export_pipeline, load_network
     from unirender.training.groups import list_shards
     from unirender.training.live import live_report
     from unirender.training.source import ShardSource
@@ -109,7 +118,9 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     )
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     trainer = Trainer(config, run, device, dtype)
-    source = ShardSource(options.data, config.batch_size, config.seed)
+    if options.init is not None:
+        trainer.start_from(load_network(options.init))
+    source = ShardSource(options.data, config.batch_size, config.seed, augmentation=config.augmentation)
     console = Console()
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     console.print(

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from unirender.errors import UnirenderError
+from unirender.training.augment import DEFAULT_AUGMENTATION
 from unirender.training.data import Batch, GroupDataset, iterate_batches
+from unirender.training.presets import Augmentation
 
 
 @runtime_checkable
@@ -36,8 +38,16 @@ class ShardSource:
     resumed run sees the same samples. `refresh` is the one place where the shards change, and it says so.
     """
 
-    def __init__(self, folder: str | Path, batch_size: int, seed: int, workers: int = 1) -> None:
+    def __init__(
+        self,
+        folder: str | Path,
+        batch_size: int,
+        seed: int,
+        workers: int = 1,
+        augmentation: Augmentation = DEFAULT_AUGMENTATION,
+    ) -> None:
         self.folder, self.batch_size, self.seed, self.workers = Path(folder), batch_size, seed, workers
+        self.augmentation = augmentation
         self.consumed = 0
         self.dataset: GroupDataset | None = None
         self._batches: Iterator[Batch] | None = None
@@ -45,7 +55,9 @@ class ShardSource:
     def next(self) -> Batch:
         if self._batches is None:
             self.dataset = self.dataset or GroupDataset(self.folder)
-            self._batches = iterate_batches(self.dataset, self.batch_size, self.seed, self.consumed, self.workers)
+            self._batches = iterate_batches(
+                self.dataset, self.batch_size, self.seed, self.consumed, self.workers, self.augmentation
+            )
         self.consumed += self.batch_size
         return next(self._batches)
 

@@ -23,6 +23,7 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.conditioning import Maps
+from unirender.models.dual_stream import DualStreamModel
 from unirender.training.checkpoint import load_state, save_state
 from unirender.training.ema import Ema
 from unirender.training.live import Report
@@ -89,6 +90,23 @@ class Trainer:
         by_steps = self.step / self.run.steps if self.run.steps else 0.0
         by_clock = self.seconds / (60 * self.run.minutes) if self.run.minutes else 0.0
         return max(by_steps, by_clock)
+
+    def start_from(self, network: DualStreamModel) -> None:
+        """Begins with the weights of another network, the average too. A state in the run's folder goes before.
+
+        Raises:
+            UnirenderError: the networks differ.
+        """
+        own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (self.model, network))
+        curves = [m.config["hdr_curves"] for m in (self.model, network)]
+        if own != other or {k: tuple(v) for k, v in curves[0].items()} != {k: tuple(v) for k, v in curves[1].items()}:
+            differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
+            raise UnirenderError(
+                f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
+                "expected the same network; choose the preset that the weights were trained with"
+            )
+        self.model.load_state_dict(network.state_dict())
+        self.ema = Ema(self.model, self.config.optimizer.ema_decay)
 
     def train_step(self, batch: Maps) -> dict[str, float]:
         """One optimiser step; returns the loss terms."""
