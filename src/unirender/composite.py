@@ -5,8 +5,17 @@
 It leaves out interreflection, the angle in the Fresnel term and the retro-reflection of the principled diffuse lobe:
 about 4 % of a pixel's radiance. The functions are plain arithmetic and take numpy arrays and torch tensors alike, as
 long as single-channel maps broadcast against three-channel ones.
+
+The *split-sum* composite (numpy only) puts the angle back. Schlick's reflectance is F0 + (1 - F0)(1 - v.h)^5; its mean
+over the lobe, by the environment-BRDF terms A and B of Karis ("Real Shading in Unreal Engine 4", 2013), is
+
+    F = (F0 A + B) / (A + B),    A = integral (1 - (1 - v.h)^5) f n.l dl,    B = integral (1 - v.h)^5 f n.l dl
+
+with f = D G / (4 n.v n.l) the GGX lobe of a reflector of F = 1, whose radiance under the light is s. A + B is its
+albedo in the direction v; the sum is split because the light and F are averaged over the lobe one by one.
 """
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -14,8 +23,12 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import MIN_ALPHA
 
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
+COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced over [0, 1]
+LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
+GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
 
 
 def fresnel(albedo: Any, metallic: Any) -> Any:
@@ -34,12 +47,95 @@ def composite_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     Raises:
         UnirenderError: one of albedo, metallic, diffuse, specular or mask is unknown.
     """
-    maps = {name: getattr(intrinsics, name) for name in ("albedo", "metallic", "diffuse", "specular", "mask")}
+    maps = _maps(intrinsics, "albedo", "metallic", "diffuse", "specular", "mask")
+    mask = maps.pop("mask")
+    return (composite(**maps) * mask).astype(np.float32)
+
+
+def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+    """The split-sum composite of an `Intrinsics`, linear and premultiplied by its mask; n.v along the true view rays.
+
+    Raises:
+        UnirenderError: one of albedo, normal, roughness, metallic, diffuse, specular or mask is unknown.
+    """
+    maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
+    view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
+    n_v = np.sum(maps["normal"] * view, axis=-1, keepdims=True)
+    reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
+    radiance = (1 - maps["metallic"]) * maps["albedo"] * maps["diffuse"] + reflectance * maps["specular"]
+    return (radiance * maps["mask"]).astype(np.float32)
+
+
+def mean_fresnel(
+    f0: Float[np.ndarray, "*size c"], n_v: Float[np.ndarray, "*size 1"], roughness: Float[np.ndarray, "*size 1"]
+) -> Float[np.ndarray, "*size c"]:
+    """Schlick's reflectance averaged over the lobe, (F0 A + B) / (A + B), in [F0, 1]."""
+    a, b = environment_brdf(n_v, roughness)
+    return (f0 * a + b) / (a + b)
+
+
+def environment_brdf(
+    n_v: Float[np.ndarray, "*size"], roughness: Float[np.ndarray, "*size"]
+) -> tuple[Float[np.ndarray, "*size"], Float[np.ndarray, "*size"]]:
+    """Karis's scale A and bias B of F0, interpolated (bilinearly) in a table that is integrated at the first call.
+
+    Args:
+        n_v: cosine between normal and view direction; clipped to [0, 1].
+        roughness: perceptual, clipped to [0, 1]; alpha = roughness^2.
+    """
+    x = np.clip(n_v, 0, 1) * (COSINES - 1)
+    y = np.clip(roughness, 0, 1) * (ROUGHNESSES - 1)
+    i, j = (np.minimum(p.astype(np.int64), n - 2) for p, n in ((x, COSINES), (y, ROUGHNESSES)))
+    fx, fy = x - i, y - j
+    corners = [
+        ((1 - fx) * (1 - fy), i, j),
+        (fx * (1 - fy), i + 1, j),
+        ((1 - fx) * fy, i, j + 1),
+        (fx * fy, i + 1, j + 1),
+    ]
+    a, b = (sum(weight * table[p, q] for weight, p, q in corners) for table in _environment_brdf_tables())
+    return np.asarray(a, np.float32), np.asarray(b, np.float32)
+
+
+@functools.cache
+def _environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
+    n_v = np.maximum(np.linspace(0, 1, COSINES), GRAZING)
+    alpha = np.maximum(np.square(np.linspace(0, 1, ROUGHNESSES)), MIN_ALPHA)
+    cells = [[_integrate_lobe(float(c), float(r)) for r in alpha] for c in n_v]
+    tables = np.array(cells)
+    return tables[..., 0], tables[..., 1]
+
+
+def _integrate_lobe(n_v: float, alpha: float) -> tuple[float, float]:
+    """A and B of one lobe: the midpoint rule over visible normals (Dupuy & Benyoub 2023), n = +z, v in the xz plane.
+
+    A visible normal h is drawn with the density D G1(v) max(v.h, 0) / n.v, so that f n.l over the density of l is
+    G1(l), Smith's shadowing of the light.
+    """
+    v = np.array([np.sqrt(1 - n_v**2), 0.0, n_v])
+    stretched = v * np.array([alpha, alpha, 1.0])
+    stretched /= np.linalg.norm(stretched)
+    u, phi = np.meshgrid((np.arange(LOBE_SAMPLES[0]) + 0.5) / LOBE_SAMPLES[0], (np.arange(LOBE_SAMPLES[1]) + 0.5))
+    phi = np.pi * phi / LOBE_SAMPLES[1]  # the other half is its mirror image
+    z = (1 - u) * (1 + stretched[2]) - stretched[2]  # a point of the cap of the sphere that v sees, moved by v
+    radius = np.sqrt(np.maximum(1 - z**2, 0))
+    h = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1) + stretched
+    h *= np.array([alpha, alpha, 1.0])
+    h /= np.linalg.norm(h, axis=-1, keepdims=True)
+    v_h = h @ v
+    n_l = 2 * v_h * h[..., 2] - n_v
+    squared = np.square(np.maximum(n_l, 1e-6))
+    g1 = np.where(n_l > 0, 2 / (1 + np.sqrt(1 + alpha**2 * (1 - squared) / squared)), 0)
+    schlick = np.clip(1 - v_h, 0, 1) ** 5
+    return float(np.mean((1 - schlick) * g1)), float(np.mean(schlick * g1))
+
+
+def _maps(intrinsics: Intrinsics, *names: str) -> dict[str, np.ndarray]:
+    maps = {name: getattr(intrinsics, name) for name in names}
     missing = [name for name, value in maps.items() if value is None]
     if missing:
         raise UnirenderError(
-            f"composite: maps {', '.join(missing)} are missing, expected albedo, metallic, diffuse, specular and mask; "
+            f"composite: maps {', '.join(missing)} are missing, expected {', '.join(names[:-1])} and {names[-1]}; "
             "derive specular and diffuse from an environment with unirender.lighting"
         )
-    mask = maps.pop("mask")
-    return (composite(**maps) * mask).astype(np.float32)
+    return maps
