@@ -1,14 +1,17 @@
 """Two rows that say what the truth itself is worth: the noise ceiling and the reference rendered with another seed.
 
 Truth with noise of variance v scores a noise-free prediction at v, and another render of the same quality at 2 v, 3 dB
-worse: a good method may pass the second and must not pass the first.
+worse: a good method may pass the second and must not pass the first. PSNR's ceiling follows from v; SSIM's and LPIPS's
+are scored, on a picture that is nearly noise-free.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.color import unpremultiply
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.metrics import METRICS, Variant, metric_key, psnr_from_mse
 
@@ -51,3 +54,30 @@ def noise_ceiling(quantity: str, mean: Image, variance: Image, mask: Mask, premu
             error = noise_mse(mean, variance, mask, variant, premultiplied)
             values[metric_key(quantity, METRICS["psnr"], variant)] = math.inf if error == 0 else psnr_from_mse(error)
     return values
+
+
+def similarity_ceiling(
+    quantity: str, twin: Image, truth: Image, mask: Mask, premultiplied: bool, backbones: Sequence[str] = ()
+) -> dict[str, float]:
+    """SSIM and LPIPS that a noise-free prediction is expected to score, for all masks and colour spaces, unaligned.
+
+    The nearly noise-free `twin` stands for it. What noise it has left (a 1/n-th of the truth's variance for n times the
+    samples) makes the ceiling pessimistic by about that share.
+
+    Args:
+        quantity: name in the metric keys.
+        twin: the truth's scene with many times its samples (`Suite.ceiling_image`, ...), linear.
+        truth: linear.
+        mask: coverage.
+        premultiplied: whether `twin` and `truth` are.
+        backbones: of LPIPS; one left out has no values.
+    """
+    from unirender_evaluation import lpips  # torch
+    from unirender_evaluation.scoring import score_colour
+
+    if premultiplied:
+        twin, truth = unpremultiply(twin, mask), unpremultiply(truth, mask)
+    networks = [lpips.load(name) for name in backbones]
+    scores = score_colour(quantity, twin, truth, mask, mask, ("raw",), networks)
+    wanted = (f"{quantity}.ssim@", f"{quantity}.lpips_")
+    return {key: value for key, value in scores.items() if key.startswith(wanted)}

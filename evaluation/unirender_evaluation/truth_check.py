@@ -18,28 +18,15 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
+from unirender_evaluation.geometry_check import GeometryTest, compare_geometry, twin_geometry
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
-from unirender_evaluation.truth import item_seed, object_hash
+from unirender_evaluation.truth_file import diffuse_member, image_member, specular_member
+from unirender_evaluation.truth_object import object_hash
+from unirender_evaluation.truth_render import good_spp, item_seed
 
 LIGHTS = ("specular", "diffuse")
 HALF_ROUNDING = 5e-4  # relative rounding of half floats
 TWIN_FACTOR = 1.12
-ALBEDO_TWIN = 1.02
-INSIDE = 0.99  # coverage above which a pixel is not an edge
-FAINT = 0.1  # edges with less coverage hold too few of the samples to compare
-# Largest differences between two traces of the same geometry; three times or more what 24 objects show at 256 samples.
-TOLERANCES: Mapping[str, float] = {
-    "mask, mean": 0.004,  # over covered pixels
-    "mask, max": 0.08,
-    "albedo, bias": 0.005,  # of a channel's mean over inside pixels, relative
-    "albedo inside, mean": 0.004,
-    "albedo inside, max": 0.04,
-    "albedo edge, mean": 0.02,
-    "normal inside, mean deg": 0.4,
-    "normal inside, max deg": 15.0,
-    "normal edge, mean deg": 2.0,
-}
 
 
 @dataclass(frozen=True)
@@ -57,26 +44,6 @@ class Check:
     def name(self) -> str:
         what = material_key(self.material) if self.kind == "image" else self.kind
         return f"{self.scene.key}.{what}"
-
-
-@dataclass(frozen=True)
-class GeometryTest:
-    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`."""
-
-    differences: Mapping[str, float]
-
-    @property
-    def exceeded(self) -> tuple[str, ...]:
-        return tuple(name for name, value in self.differences.items() if not value <= TOLERANCES[name])
-
-    @property
-    def passed(self) -> bool:
-        return not self.exceeded
-
-    def __str__(self) -> str:
-        worst = max(self.differences, key=lambda name: self.differences[name] / TOLERANCES[name])
-        state = "passed" if self.passed else f"FAILED on {', '.join(self.exceeded)}"
-        return f"geometry {state}: {worst} {self.differences[worst]:.4g} (tolerance {TOLERANCES[worst]:g})"
 
 
 @dataclass(frozen=True)
@@ -190,42 +157,10 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
         if twin is None:
             off = (spec.base[0], spec.base[1] * TWIN_FACTOR)
             twin = _check_image(suite, renderer, scene, spec.base, off, seed, alpha).test
-        environment, mask = suite.environment(scene), suite.mask(scene)
         for kind in LIGHTS:
-            checks.append(_check_light(suite, renderer, scene, kind, environment, mask, seed, alpha))
+            checks.append(_check_light(suite, renderer, scene, kind, seed, alpha))
             yield checks[-1]
     yield TruthCheck(tuple(checks), twin, seed, tuple(others), tuple(geometry), geometry_twins)
-
-
-def compare_geometry(stored: Intrinsics, again: Intrinsics) -> GeometryTest:
-    """Compares two traces of mask, albedo and normal: strictly inside, where both cover the pixel, loosely at edges."""
-    a, b = (maps.require("mask", "albedo", "normal") for maps in (stored, again))
-    low, high = (f(a["mask"], b["mask"])[..., 0] for f in (np.minimum, np.maximum))
-    inside, edge = low > INSIDE, (low > FAINT) & (low <= INSIDE)
-    mask = np.abs(a["mask"] - b["mask"])[..., 0][high > 0]
-    albedo = np.abs(a["albedo"] - b["albedo"]).max(axis=-1)
-    chord = np.linalg.norm(a["normal"].astype(np.float64) - b["normal"], axis=-1)
-    angle = np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
-    found = {"mask, mean": mask.mean(), "mask, max": mask.max()} if mask.size else {}
-    if inside.any():
-        mean_a, mean_b = (np.mean(maps["albedo"][inside], axis=0, dtype=np.float64) for maps in (a, b))
-        found["albedo, bias"] = np.max(np.abs(mean_b - mean_a) / np.maximum(mean_a, 1e-3))
-        found |= {"albedo inside, mean": albedo[inside].mean(), "albedo inside, max": albedo[inside].max()}
-        found |= {"normal inside, mean deg": angle[inside].mean(), "normal inside, max deg": angle[inside].max()}
-    if edge.any():
-        found |= {"albedo edge, mean": albedo[edge].mean(), "normal edge, mean deg": angle[edge].mean()}
-    if not found:
-        raise UnirenderError("truth check: the object covers no pixel in either trace, expected at least one")
-    return GeometryTest({name: float(value) for name, value in found.items()})
-
-
-def twin_geometry(maps: Intrinsics) -> dict[str, Intrinsics]:
-    """Wrong maps that the comparison has to refuse."""
-    good = maps.require("albedo", "normal")
-    return {
-        f"albedo {ALBEDO_TWIN - 1:.0%} off": maps.replace(albedo=np.clip(good["albedo"] * ALBEDO_TWIN, 0, 1)),
-        "normal mirrored in x": maps.replace(normal=good["normal"] * np.array([-1, 1, 1], np.float32)),
-    }
 
 
 def share_bar(pixels: int, alpha: float) -> float:
@@ -253,12 +188,18 @@ def member_test(
     return replace(test, passed=bool(test.min_p >= test.threshold and test.pass_share >= bar))
 
 
+def _samples(suite: Suite, member: str) -> int:
+    """Samples per pixel of a member rendered again: its own, or the next number that divides into batches."""
+    return good_spp(suite.provenance["quality"][member]["spp"], suite.spec)
+
+
 def _check_image(
     suite: Suite, renderer: Any, scene: Scene, stored: Material, rendered: Material, seed: int, alpha: float
 ) -> Check:
-    member = f"{scene.key}.{material_key(stored)}.exr"
-    spp = int(suite.provenance["quality"][member]["spp"])
-    again = renderer.image(suite.environment(scene), rendered[1], rendered[0], spp, item_seed("check", seed, member))
+    member = image_member(scene.key, stored)
+    again = renderer.image(
+        suite.environment(scene), rendered[1], rendered[0], _samples(suite, member), item_seed("check", seed, member)
+    )
     test = member_test(
         again.mean[..., :3],
         again.variance[..., :3],
@@ -270,28 +211,14 @@ def _check_image(
     return Check(scene, "image", stored, again.mean[..., :3], test)
 
 
-def _check_light(
-    suite: Suite,
-    renderer: Any,
-    scene: Scene,
-    kind: str,
-    environment: Float[np.ndarray, "eh ew 3"],
-    mask: Float[np.ndarray, "h w 1"],
-    seed: int,
-    alpha: float,
-) -> Check:
-    material = suite.spec.base
+def _check_light(suite: Suite, renderer: Any, scene: Scene, kind: str, seed: int, alpha: float) -> Check:
+    material, environment = suite.spec.base, suite.environment(scene)
     maps = suite.intrinsics(scene, material).require("diffuse", "specular")
     if kind == "diffuse":
-        member, variance = f"{scene.key}.diffuse.exr", suite.diffuse_variance(scene)
-        spp = int(suite.provenance["quality"][member]["spp"])
-        again = renderer.diffuse(environment, spp, item_seed("check", seed, member))
-        stored = maps["diffuse"]
+        member, variance = diffuse_member(scene.key), suite.diffuse_variance(scene)
+        again = renderer.diffuse(environment, _samples(suite, member), item_seed("check", seed, member))
     else:
-        member = f"{scene.key}.r{round(100 * material[1]):03d}.specular.exr"
-        variance = suite.specular_variance(scene, material[1])
-        spp = int(suite.provenance["quality"][member]["spp"])
-        again = renderer.specular(environment, material[1], spp, item_seed("check", seed, member))
-        stored = maps["specular"]
-    test = member_test(again.mean, again.variance, stored, variance, mask=mask, alpha=alpha)
+        member, variance = specular_member(scene.key, material[1]), suite.specular_variance(scene, material[1])
+        again = renderer.specular(environment, material[1], _samples(suite, member), item_seed("check", seed, member))
+    test = member_test(again.mean, again.variance, maps[kind], variance, mask=suite.mask(scene), alpha=alpha)
     return Check(scene, kind, material, again.mean, test)

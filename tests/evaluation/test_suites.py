@@ -1,5 +1,6 @@
-"""Suites: stratification, the truth file's hash, what a task hands out, and the shipped truth against Mitsuba."""
+"""Suites: stratification, the suite file, the truth file's hash, what a task hands out."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,6 @@ from unirender_evaluation.suites import (
     suite_path,
 )
 from unirender_evaluation.tasks import PROTOCOLS, scene_ids, tasks
-from unirender_evaluation.truth import noise_ceiling_db, quality_summary, render_to_ceiling
 
 
 def test_tiny_materials_are_stratified_and_independent() -> None:
@@ -74,6 +74,16 @@ def test_broken_suite_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "short.toml").write_text('name = "x"\nwrong = 1\n')
     with pytest.raises(UnirenderError, match=r"missing keys .*unknown keys \['wrong'\]"):
         read_spec(tmp_path / "short.toml")
+    good = suite_path("tiny").read_text()
+    for name, wrong, message in (
+        ("split", '"both"', "split is 'both'"),
+        ("specular_roughness", "[0.3]", r"specular_roughness is \[0.3\], expected some of"),
+        ("ceiling_scenes", "[[0, 2]]", r"ceiling_scenes has \[\(0, 2\)\], expected pairs"),
+    ):
+        broken = tmp_path / f"{name}.toml"
+        broken.write_text(re.sub(rf"^{name} = .*$", f"{name} = {wrong}", good, flags=re.MULTILINE))
+        with pytest.raises(UnirenderError, match=message):
+            read_spec(broken)
 
 
 def test_methods_see_eight_bits_and_nothing_else(tmp_path: Path) -> None:
@@ -133,88 +143,22 @@ def test_limited_runs_take_scenes_evenly(tmp_path: Path) -> None:
         scene_ids(suite, 0)
 
 
-def test_stored_noise_survives_half_floats(tmp_path: Path) -> None:
-    """Radiances over four decades keep their standard deviation to a few per cent."""
+def test_scenes_have_twins_where_the_suite_says(tmp_path: Path) -> None:
     suite = make_suite(tmp_path)
-    scene = suite.scenes[0]
-    mean, variance = suite.image(scene, suite.spec.base), suite.image_variance(scene, suite.spec.base)
-    bright = mean > 1e-3
-    np.testing.assert_allclose(np.sqrt(variance[bright]) / mean[bright], 1e-3, rtol=0.06)
-
-
-def test_noise_ceiling_is_the_score_of_a_noise_free_prediction() -> None:
-    """Monte Carlo against the delta method; the twin is the score of another noisy render, 3 dB worse."""
-    from unirender.color import image_srgb
-
-    rng = np.random.default_rng(0)
-    mask = np.ones((64, 64, 1), np.float32)
-    clean = rng.uniform(0.05, 0.9, (64, 64, 3)).astype(np.float32)
-    sigma = 0.01 * clean
-    noisy, again = (clean + sigma * rng.standard_normal(clean.shape, np.float32) for _ in range(2))
-
-    def measured(a: np.ndarray, b: np.ndarray) -> float:
-        return float(-10 * np.log10(np.mean((image_srgb(a) - image_srgb(b)) ** 2)))
-
-    predicted = noise_ceiling_db(noisy, sigma**2, mask, True)
-    assert measured(clean, noisy) == pytest.approx(predicted, abs=0.15)
-    assert measured(again, noisy) == pytest.approx(predicted - 3.01, abs=0.15)
-
-
-def test_sampling_goes_on_until_the_ceiling_is_reached(tmp_path: Path) -> None:
-    """Combined estimates average means and variances; sampling stops at target or limit."""
-    from unirender_reference.passes import Estimate
-
-    spec = read_spec(write_suite(tmp_path))
-    mask, calls = np.ones((8, 8, 1), np.float32), []
-
-    def render(spp: int, seed: int) -> Estimate:
-        calls.append((spp, seed))
-        noise = np.random.default_rng(seed).standard_normal((8, 8, 3)) * 0.2 / np.sqrt(spp)
-        variance = np.full((8, 8, 3), 0.04 / spp, np.float32)
-        return Estimate((0.5 + noise).astype(np.float32), variance)
-
-    mean, variance, spp, ceiling = render_to_ceiling(render, mask, spec, 7, True)
-    assert 1 < len(calls) <= 3, "the first render says how many samples are missing"
-    assert len({seed for _, seed in calls}) == len(calls), "every render has its own seed"
-    assert spp == sum(count for count, _ in calls)
-    assert all(count % spec.batches == 0 for count, _ in calls)
-    np.testing.assert_allclose(variance, 0.04 / spp, rtol=1e-4)
-    assert spec.target_db <= ceiling < spec.target_db + 0.5
-    assert np.abs(mean - 0.5).max() < 0.2 / np.sqrt(spp) * 6
-
-
-def test_shipped_truth_reaches_its_noise_ceiling() -> None:
-    suite = load_suite("tiny")
-    assert len({scene.object for scene in suite.scenes}) >= 24
-    assert len(suite.scenes) == 2 * len({scene.object for scene in suite.scenes})
-    assert sum(len(scene.materials) for scene in suite.scenes) == 240
-    summary = quality_summary(suite)
-    assert summary["image"]["mean_db"] >= 45
-    assert summary["image"]["share_below_target"] < 0.05  # the noisiest end at max_spp
-    assert summary["image"]["min_db"] > 40
-    assert summary["specular"]["min_db"] >= suite.spec.light_target_db
-    assert summary["diffuse"]["min_db"] >= suite.spec.light_target_db
-    assert suite.spec.truth_path.stat().st_size < 12e6
-
-
-@pytest.mark.slow
-def test_shipped_truth_agrees_with_mitsuba_here() -> None:
-    """One image and one roughness 12 % off, rendered here: the first passes the z-test, the second must not."""
-    from unirender_evaluation.truth_check import _check_image, chosen_scenes, compare_geometry, twin_geometry
-    from unirender_reference.render import Renderer
-    from unirender_reference.shapes import make_object
-
-    suite = load_suite("tiny")
-    scene = min(
-        chosen_scenes(suite, 8, seed=5), key=lambda s: suite.provenance["quality"][f"{s.key}.m050_r050.exr"]["spp"]
-    )
-    obj = make_object(suite.provenance["objects"][scene.object]["seed"], "test")
-    renderer = Renderer(obj, camera=suite.spec.camera, resolution=suite.spec.resolution)
-    good = _check_image(suite, renderer, scene, suite.spec.base, suite.spec.base, seed=5, alpha=1e-3)
-    wrong = _check_image(suite, renderer, scene, suite.spec.base, (0.5, 0.56), seed=5, alpha=1e-3)
-    assert good.test.passed, str(good.test)
-    assert not wrong.test.passed, str(wrong.test)
-    stored, again = suite.intrinsics(scene, suite.spec.base), renderer.geometry(suite.spec.geometry_spp, seed=77)
-    assert compare_geometry(stored, again).passed, str(compare_geometry(stored, again))
-    for name, twin in twin_geometry(again).items():
-        assert not compare_geometry(stored, twin).passed, name
+    first, second = suite.scenes[:2]
+    base, rough = suite.spec.base, suite.spec.base[1]
+    for material in (base, *suite.spec.edits):
+        twin, image = suite.ceiling_image(first, material), suite.image(first, material)
+        assert twin is not None
+        assert 0 < np.abs(twin - image).max() < 0.02 * image.max()
+        assert suite.ceiling_image(second, material) is None
+    assert suite.ceiling_image(first, first.materials[0]) is None
+    for twin, true in (
+        (suite.ceiling_diffuse(first), suite.intrinsics(first, base).diffuse),
+        (suite.ceiling_specular(first, rough), suite.intrinsics(first, base).specular),
+    ):
+        assert twin is not None
+        assert true is not None
+        assert 0 < np.abs(twin - true).max() < 0.02 * true.max()
+    assert suite.ceiling_diffuse(second) is None
+    assert suite.ceiling_specular(second, rough) is None

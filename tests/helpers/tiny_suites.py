@@ -10,13 +10,24 @@ import numpy as np
 
 from unirender.camera import Camera
 from unirender.composite import composite
-from unirender.exr import exr_bytes
+from unirender.exr import exr_bytes, image_channels
 from unirender.lighting import diffuse_light, specular_light
-from unirender_evaluation.suites import STD_FLOOR, Scene, Suite, load_suite, material_key, read_spec
-from unirender_evaluation.truth import _write_tar
+from unirender_evaluation.suites import Scene, Suite, SuiteSpec, load_suite, read_spec
+from unirender_evaluation.truth_file import (
+    CEILING,
+    diffuse_member,
+    estimate_channels,
+    image_member,
+    light_member,
+    member_kind,
+    shared_member,
+    specular_member,
+    write_tar,
+)
 
 SIZE = 32
 NOISE = 1e-3  # relative standard deviation that the suite claims
+TWIN_SCENE = (0, 0)  # the object and light whose base, edits, s and d have a twin of more samples
 
 
 def write_suite(folder: Path, objects: int = 2, per_scene: int = 2) -> Path:
@@ -32,6 +43,7 @@ def write_suite(folder: Path, objects: int = 2, per_scene: int = 2) -> Path:
         "light_rows": "8",
         "file": '"ball.tar"',
         "sha256": '""',
+        "ceiling_scenes": str([list(TWIN_SCENE)]),
     }
     for line in text.splitlines():
         name = line.split("=")[0].strip()
@@ -44,29 +56,34 @@ def write_suite(folder: Path, objects: int = 2, per_scene: int = 2) -> Path:
     materials = spec.materials()
     lights = _lights(spec.light_rows)
     for name, light in lights.items():
-        members[f"light_{name}.exr"] = exr_bytes({c: light[..., i] for i, c in enumerate("RGB")}, half=False)
+        members[light_member(name)] = exr_bytes(image_channels(light), half=False)
     for index in range(objects):
         name = f"ball-{index}"
         normal, mask = _sphere(0.9 - 0.2 * index)
         albedo = (mask > 0) * np.array([0.7, 0.4 - 0.1 * index, 0.2 + 0.2 * index], np.float32)
         shared = {"mask.Y": mask[..., 0]} | {f"albedo.{c}": albedo[..., i] for i, c in enumerate("RGB")}
-        members[f"{name}.shared.exr"] = exr_bytes(shared | {f"normal.{c}": normal[..., i] for i, c in enumerate("XYZ")})
+        members[shared_member(name)] = exr_bytes(shared | {f"normal.{c}": normal[..., i] for i, c in enumerate("XYZ")})
         made[name] = {"seed": index, "sha256": "none"}
         for k in range(spec.lights_per_object):
             key, light_name = f"{name}_l{k}", list(lights)[k]
             environment = lights[light_name]
             diffuse = diffuse_light(normal, environment)
-            _add(members, quality, f"{key}.diffuse.exr", diffuse)
+            buffers = {diffuse_member(key): diffuse}
             chosen = materials[index * spec.lights_per_object + k]
             for m, r in dict.fromkeys([spec.base, *spec.edits, *chosen]):
                 specular = specular_light(normal, r, environment, Camera())
-                _add(members, quality, f"{key}.r{round(100 * r):03d}.specular.exr", specular)
-                image = composite(albedo, m, diffuse, specular) * mask
-                _add(members, quality, f"{key}.{material_key((m, r))}.exr", image)
+                buffers[specular_member(key, r)] = specular
+                buffers[image_member(key, (m, r))] = composite(albedo, m, diffuse, specular) * mask
+            for member, value in buffers.items():
+                members[member] = _encode(member, value, mask)
+                quality[member] = {"spp": 8, "ceiling_db": 50.0, "nan_pixels": 0}
+            if (index, k) == TWIN_SCENE:
+                for member in _twin_members(spec, key):
+                    members[CEILING + member] = _twin(member, buffers[member], mask)
             rows.append(asdict(Scene(key, name, "sphere", False, light_name, 0, 1.0, tuple(chosen))))
     provenance = {"suite": "ball", "mitsuba": "none", "batches": 8, "objects": made, "scenes": rows, "quality": quality}
     members["suite.json"] = json.dumps(provenance).encode()
-    _write_tar(spec.truth_path, members)
+    write_tar(spec.truth_path, members)
     digest = hashlib.sha256(spec.truth_path.read_bytes()).hexdigest()
     path.write_text(path.read_text().replace('sha256 = ""', f'sha256 = "{digest}"'))
     return path
@@ -77,14 +94,20 @@ def make_suite(folder: Path, **options: int) -> Suite:
     return load_suite(write_suite(folder, **options))
 
 
-def _add(members: dict[str, bytes], quality: dict[str, dict], name: str, value: np.ndarray) -> None:
+def _encode(member: str, value: np.ndarray, mask: np.ndarray) -> bytes:
     value = value.astype(np.float16).astype(np.float32)
-    relative = NOISE * np.abs(value) / np.maximum(np.abs(value), STD_FLOOR)
-    channels = {c: value[..., i] for i, c in enumerate("RGB")} | {
-        f"std.{c}": relative[..., i] for i, c in enumerate("RGB")
-    }
-    members[name] = exr_bytes(channels)
-    quality[name] = {"spp": 8, "ceiling_db": 50.0}
+    variance = np.square(NOISE * np.abs(value))
+    return exr_bytes(estimate_channels(member_kind(member), value, variance, mask))
+
+
+def _twin_members(spec: SuiteSpec, key: str) -> list[str]:
+    images = [image_member(key, material) for material in (spec.base, *spec.edits)]
+    return [diffuse_member(key), specular_member(key, spec.base[1]), *images]
+
+
+def _twin(member: str, value: np.ndarray, mask: np.ndarray) -> bytes:
+    noise = np.random.default_rng(len(member)).standard_normal(value.shape, np.float32)
+    return exr_bytes(estimate_channels(member_kind(member), value * (1 + NOISE * noise), None, mask))
 
 
 def _sphere(radius: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,194 @@
+"""Renders everything that a suite's truth holds of one object; what one worker process does."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.exr import exr_bytes, intrinsics_channels
+from unirender_evaluation.stratification import Material
+from unirender_evaluation.suite_spec import SuiteSpec
+from unirender_evaluation.suites import Scene
+from unirender_evaluation.truth_file import (
+    CEILING,
+    Kind,
+    diffuse_member,
+    estimate_channels,
+    image_member,
+    shared_member,
+    specular_member,
+    write_tar,
+)
+from unirender_evaluation.truth_render import (
+    TruthBuffer,
+    good_spp,
+    item_seed,
+    render_once,
+    render_to_ceiling,
+    stored_ceiling_db,
+)
+
+PART = "part.json"
+Environment = Float[np.ndarray, "eh ew 3"]
+
+
+@dataclass(frozen=True)
+class ObjectJob:
+    """Everything that one worker needs: `lights` are (name, turn in columns) and `materials` the stratified ones of
+    each scene; `environments` are the lights by name; the finished part goes to the folder `out`."""
+
+    spec: SuiteSpec
+    seed: int
+    lights: tuple[tuple[str, int], ...]
+    environments: dict[str, Environment]
+    materials: tuple[tuple[Material, ...], ...]
+    out: Path
+
+
+@dataclass(frozen=True)
+class _Buffer:
+    """An image, s or d that has to be rendered: `render` takes (samples per pixel, seed)."""
+
+    name: str
+    kind: Kind
+    render: Callable[[int, int], Any]
+    attributes: dict[str, str]
+    has_twin: bool = False  # a near-noise-free one, for scenes in `ceiling_scenes`
+
+
+def object_hash(obj: Any) -> str:
+    """sha256 over an object's geometry and texture."""
+    digest = hashlib.sha256()
+    for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo):
+        digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def shared_scene_hash(hashes: Iterable[str]) -> str:
+    """The scene hash of a member that belongs to several scenes: sha256 over theirs, in order (as in data sets)."""
+    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()
+
+
+def render_object(job: ObjectJob) -> Path:
+    """Renders all members of one object into `<out>/<seed>-<object hash>.tar`; returns at once if that file exists."""
+    from unirender_reference.render import Renderer, renderer_provenance
+    from unirender_reference.shapes import make_object
+
+    spec = job.spec
+    obj = make_object(job.seed, spec.split)
+    path = job.out / f"{job.seed}-{object_hash(obj)[:12]}.tar"
+    if path.exists():
+        return path
+    renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
+    header = renderer_provenance(renderer)
+    name = obj.name.replace(".", "-")
+    seed = item_seed(spec.name, name, "geometry")
+    geometry = renderer.geometry(spec.geometry_spp, seed)
+    mask = geometry.require("mask")["mask"]
+    members: dict[str, bytes] = {}
+    scenes, quality, hashes = [], {}, {}
+    for index, (light, turn) in enumerate(job.lights):
+        key = f"{name}_l{index}"
+        scene, environment, hash_of = _light_scene(renderer, job, key, light, turn, job.materials[index])
+        scenes.append(asdict(scene))
+        hashes[key] = list(hash_of.values())
+        twins = (job.seed, index) in spec.ceiling_scenes
+        for buffer in _buffers(renderer, spec, scene, environment, hash_of):
+            first = item_seed(spec.name, buffer.name)
+            found, channels = render_to_ceiling(buffer.render, mask, spec, first, buffer.kind)
+            ceiling = stored_ceiling_db(channels, mask, buffer.kind)
+            quality[buffer.name] = {"spp": found.spp, "ceiling_db": round(ceiling, 3), "nan_pixels": found.nan_pixels}
+            made = _made(buffer, found, ceiling, first)
+            members[buffer.name] = exr_bytes(channels, attributes={**header, **made})
+            if twins and buffer.has_twin:
+                spp, other = good_spp(spec.ceiling_factor * found.spp, spec), item_seed(spec.name, CEILING, buffer.name)
+                twin = render_once(buffer.render, mask, spp, other, buffer.kind)
+                channels = estimate_channels(buffer.kind, twin.mean, None, mask)
+                made = _made(buffer, twin, twin.ceiling_db, other)
+                members[CEILING + buffer.name] = exr_bytes(channels, attributes={**header, **made})
+    shared = {**header, "spp": str(spec.geometry_spp), "seed": str(seed)}
+    shared["scene"] = shared_scene_hash(h for own in hashes.values() for h in own)
+    members[shared_member(name)] = exr_bytes(intrinsics_channels(geometry), attributes=shared)
+    part = {
+        "header": header,
+        "scenes": scenes,
+        "hashes": hashes,
+        "quality": quality,
+        "object": {name: {"seed": job.seed, "sha256": object_hash(obj)}},
+    }
+    members[PART] = json.dumps(part).encode()
+    write_tar(path, members)
+    return path
+
+
+def _light_scene(
+    renderer: Any, job: ObjectJob, key: str, light: str, turn: int, materials: Sequence[Material]
+) -> tuple[Scene, Environment, dict[Material, str]]:
+    """The scene, its exposed light, and the scene hash of each of its materials."""
+    from unirender_reference.exposure import scene_exposure
+    from unirender_reference.lights import Light
+    from unirender_reference.render import SceneSpec, scene_hashes
+
+    spec, obj = job.spec, renderer.obj
+    turned = np.roll(job.environments[light], turn, axis=1)
+    gauge = item_seed(spec.name, key, "gauge")
+    exposure = float(np.float32(scene_exposure(renderer, turned, gauge)))
+    textured = np.ndim(obj.albedo) == 3
+    scene = Scene(key, obj.name.replace(".", "-"), obj.family, textured, light, turn, exposure, tuple(materials))
+    pairs, lit = list(dict.fromkeys([spec.base, *spec.edits, *materials])), Light(light, turned)
+    specs = [SceneSpec(obj, lit, r, m, spec.camera, spec.resolution, gauge) for m, r in pairs]
+    hash_of = dict(zip(pairs, scene_hashes(specs), strict=True))
+    return scene, turned * np.float32(exposure), hash_of
+
+
+def _buffers(
+    renderer: Any, spec: SuiteSpec, scene: Scene, environment: Environment, hash_of: dict[Material, str]
+) -> Iterator[_Buffer]:
+    """d, s at the suite's roughness values, and the images of a scene."""
+    from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH
+
+    common = {
+        "light": scene.light,
+        "turn_columns": str(scene.turn_columns),
+        "exposure_factor": repr(scene.exposure),
+        "batches": str(spec.batches),
+    }
+
+    def diffuse(spp: int, seed: int) -> Any:
+        return renderer.diffuse(environment, spp, seed, spec.batches)
+
+    direct = {**common, "depth": str(DIRECT_DEPTH)}
+    whole = {**direct, "scene": shared_scene_hash(hash_of.values())}
+    yield _Buffer(diffuse_member(scene.key), "diffuse", diffuse, whole, has_twin=True)
+    for roughness in spec.specular_roughness:
+
+        def specular(spp: int, seed: int, roughness: float = roughness) -> Any:
+            return renderer.specular(environment, roughness, spp, seed, spec.batches)
+
+        scenes = shared_scene_hash(h for (_, r), h in hash_of.items() if r == roughness)
+        attributes = {**direct, "roughness": f"{roughness:g}", "scene": scenes}
+        name, is_base = specular_member(scene.key, roughness), roughness == spec.base[1]
+        yield _Buffer(name, "specular", specular, attributes, has_twin=is_base)
+    for (m, r), own in hash_of.items():
+
+        def image(spp: int, seed: int, m: float = m, r: float = r) -> Any:
+            return renderer.image(environment, r, m, spp, seed, batches=spec.batches)
+
+        attributes = {**common, "depth": str(IMAGE_DEPTH), "metallic": f"{m:g}", "roughness": f"{r:g}", "scene": own}
+        yield _Buffer(image_member(scene.key, (m, r)), "image", image, attributes, (m, r) in (spec.base, *spec.edits))
+
+
+def _made(buffer: _Buffer, found: TruthBuffer, ceiling_db: float, seed: int) -> dict[str, str]:
+    """The attributes of a member that tell one render from another."""
+    return {
+        **buffer.attributes,
+        "spp": str(found.spp),
+        "seed": str(seed),
+        "nan_pixels": str(found.nan_pixels),
+        "noise_ceiling_db": f"{ceiling_db:.3f}",
+    }

@@ -1,0 +1,193 @@
+"""Making truth: how noise is measured, stored and brought down to a target, and the generator end to end."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_suites import make_suite
+
+from unirender.color import image_srgb
+from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
+from unirender_evaluation.ceiling import similarity_ceiling
+from unirender_evaluation.scoring import score_image
+from unirender_evaluation.suites import load_suite, read_spec, suite_path
+from unirender_evaluation.truth import make_truth, quality_summary
+from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
+from unirender_evaluation.truth_render import (
+    TruthBuffer,
+    combined,
+    good_spp,
+    noise_ceiling_db,
+    render_to_ceiling,
+    stored_ceiling_db,
+)
+from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
+
+
+def test_stored_noise_survives_half_floats(tmp_path: Path) -> None:
+    """Radiances over four decades keep their standard deviation to a few per cent."""
+    suite = make_suite(tmp_path)
+    scene = suite.scenes[0]
+    mean, variance = suite.image(scene, suite.spec.base), suite.image_variance(scene, suite.spec.base)
+    bright = mean > 1e-3
+    np.testing.assert_allclose(np.sqrt(variance[bright]) / mean[bright], 1e-3, rtol=0.06)
+
+
+def test_noise_ceiling_is_the_score_of_a_noise_free_prediction() -> None:
+    """Monte Carlo against the delta method; the twin is the score of another noisy render, 3 dB worse."""
+    rng = np.random.default_rng(0)
+    mask = np.ones((64, 64, 1), np.float32)
+    clean = rng.uniform(0.05, 0.9, (64, 64, 3)).astype(np.float32)
+    sigma = 0.01 * clean
+    noisy, again = (clean + sigma * rng.standard_normal(clean.shape, np.float32) for _ in range(2))
+
+    def measured(a: np.ndarray, b: np.ndarray) -> float:
+        return float(-10 * np.log10(np.mean((image_srgb(a) - image_srgb(b)) ** 2)))
+
+    predicted = noise_ceiling_db(noisy, sigma**2, mask, "image")
+    assert measured(clean, noisy) == pytest.approx(predicted, abs=0.15)
+    assert measured(again, noisy) == pytest.approx(predicted - 3.01, abs=0.15)
+
+
+def test_sampling_goes_on_until_the_ceiling_is_reached() -> None:
+    """Combined estimates average means and variances; sampling stops at target or limit."""
+    spec = read_spec("tiny")
+    mask, calls = np.ones((8, 8, 1), np.float32), []
+    unit = np.random.default_rng(0).uniform(0.01, 0.07, (8, 8, 3))  # variance of one sample
+
+    def render(spp: int, seed: int) -> Estimate:
+        calls.append((spp, seed))
+        noise = np.random.default_rng(seed).standard_normal((8, 8, 3)) * np.sqrt(unit / spp)
+        return Estimate((0.5 + noise).astype(np.float32), (unit / spp).astype(np.float32), nan_pixels=2)
+
+    found, channels = render_to_ceiling(render, mask, spec, 7, "image")
+    assert 1 < len(calls) <= 3, "the first render says how many samples are missing"
+    assert len({seed for _, seed in calls}) == len(calls), "every render has its own seed"
+    assert found.spp == sum(count for count, _ in calls)
+    assert all(count % spec.batches == 0 for count, _ in calls)
+    assert found.nan_pixels == 2 * len(calls)
+    np.testing.assert_allclose(found.variance, unit / found.spp, rtol=1e-4)
+    assert spec.target_db <= found.ceiling_db < spec.target_db + 0.5
+    assert spec.target_db <= stored_ceiling_db(channels, mask, "image") < spec.target_db + 0.7
+    assert np.abs((found.mean - 0.5) / np.sqrt(unit / found.spp)).max() < 6
+    short = replace(spec, max_spp=320)
+    assert render_to_ceiling(render, mask, short, 7, "image")[0].ceiling_db < spec.target_db, "max_spp ends it"
+
+
+def test_combined_estimates_are_weighted_by_their_samples() -> None:
+    """Against the estimate from all samples at once; the twin, the plain mean of the two, is another one."""
+    rng = np.random.default_rng(1)
+    samples = rng.random((24, 4, 4, 3))
+    parts = [samples[:8], samples[8:]]
+    a, b = (TruthBuffer(x.mean(0), x.var(0, ddof=1) / len(x), len(x), 0.0, 1) for x in parts)
+    both = combined(a, b, np.ones((4, 4, 1), np.float32), "image")
+    np.testing.assert_allclose(both.mean, samples.mean(0), rtol=1e-12)
+    assert (both.spp, both.nan_pixels) == (24, 2)
+    within = sum((len(x) / 24) ** 2 * x.var(0, ddof=1) / len(x) for x in parts)
+    np.testing.assert_allclose(both.variance, within, rtol=1e-12)
+    assert np.abs((a.mean + b.mean) / 2 - samples.mean(0)).max() > 0.01
+
+
+@pytest.mark.parametrize("wanted", [1, 9, 256, 1000, 20_000, 60_000])
+def test_sample_counts_make_full_passes(wanted: int) -> None:
+    """Passes of whole grids, a multiple of the batches, each within a wavefront, at most 15 % more than asked for."""
+    spec = read_spec("tiny")
+    spp, most = good_spp(wanted, spec), SAMPLES_PER_PASS // spec.resolution**2
+    assert wanted <= spp <= max(1.15 * wanted, wanted + spec.batches)
+    assert spp // pass_count(spp, spec.batches, most) <= most
+    assert pass_count(spp, spec.batches, most) <= spec.batches * (spp // (spec.batches * most) + 1)
+
+
+@pytest.mark.parametrize("kind", ["image", "specular", "diffuse"])
+def test_members_come_back_as_they_were_written(kind: Kind) -> None:
+    """Mean to half precision, std to 3 %, radiance over six decades; 0 outside the mask."""
+    rng = np.random.default_rng(3)
+    mask = np.array([0, 0.25, 1, 1], np.float32).reshape(2, 2, 1)
+    mean = (10 ** rng.uniform(-4, 2, (2, 2, 3))).astype(np.float32)
+    variance = np.square(0.01 * mean)
+    channels = estimate_channels(kind, mean, variance, mask)
+    assert set(channels) == {f"{PREFIX[kind]}{c}" for c in "RGB"} | {f"std.{c}" for c in "RGB"} | (
+        {"A"} if kind == "image" else set()
+    )
+    read = read_exr_bytes(exr_bytes(channels))[0]
+    inside = np.broadcast_to(mask > 0, mean.shape)
+    found = estimate_mean(kind, read)
+    np.testing.assert_allclose(found[inside], mean[inside], rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(estimate_variance(kind, read))[inside], 0.01 * mean[inside], rtol=0.04)
+    assert not found[~inside].any()
+    if kind == "image":
+        np.testing.assert_array_equal(read["A"], mask[..., 0])
+    else:
+        np.testing.assert_array_equal(getattr(intrinsics_from_channels(read), kind), found)
+    assert not {"std.R", "std.G", "std.B"} & set(estimate_channels(kind, mean, None, mask))
+
+
+def test_similarity_ceiling_lies_between_a_noisy_render_and_a_perfect_score(tmp_path: Path) -> None:
+    """A nearly noise-free picture scores better than another noisy one, by SSIM and by LPIPS, and below perfection."""
+    suite = make_suite(tmp_path)
+    scene, material = suite.scenes[0], suite.spec.base
+    rng = np.random.default_rng(0)
+    clean, mask = suite.image(scene, material), suite.mask(scene)
+    truth, other, twin = (clean * (1 + sigma * rng.standard_normal(clean.shape)) for sigma in (0.02, 0.02, 0.005))
+    found, worse = (similarity_ceiling("relit", x, truth, mask, True, ("alex",)) for x in (twin, other))
+    same = score_image(twin, truth, mask, lpips=())
+    assert {key.partition("@")[0] for key in found} == {"relit.ssim", "relit.lpips_alex"}
+    assert all("aligned" not in key for key in found)
+    for key, value in found.items():
+        if ".ssim" in key:
+            assert worse[key] < value < 1
+            assert value == pytest.approx(same[key], rel=1e-12)
+        else:
+            assert worse[key] > value > 0
+
+
+@pytest.mark.slow
+def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) -> None:
+    """One object at 16 px: what the suite file asks for is there; finished parts are kept; another work folder gives
+    the same bytes; another suite file does not reuse parts."""
+    text = suite_path("tiny").read_text()
+    changes = {
+        "name": '"mini"',
+        "resolution": "16",
+        "objects": "[1]",
+        "per_scene": "1",
+        "light_rows": "8",
+        "bundled_lights": "1",
+        "procedural_lights": "[0, 2]",
+        "file": '"mini.tar"',
+        "spp": "64",
+        "light_spp": "64",
+        "target_db": "33.0",
+        "light_target_db": "35.0",
+        "ceiling_factor": "4",
+        "ceiling_scenes": "[[1, 1]]",
+    }
+    for name, value in changes.items():
+        text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    path = tmp_path / "mini.toml"
+    path.write_text(text)
+    assert list(make_truth(path, tmp_path / "work", workers=1)) == [(1, 1)]
+    suite, first = load_suite(path), (tmp_path / "mini.tar").read_bytes()
+    kinds = quality_summary(suite)
+    assert {kind: row["n"] for kind, row in kinds.items()} == {"image": 10, "specular": 6, "diffuse": 2}
+    assert kinds["image"]["min_db"] >= 33
+    assert min(kinds[kind]["min_db"] for kind in ("specular", "diffuse")) >= 35
+    assert sum(name.startswith(CEILING) for name in suite.members) == 6
+    assert len({scene.light for scene in suite.scenes}) == sum(name.startswith("light_") for name in suite.members) == 2
+    _, attributes = suite.read(f"{suite.scenes[1].key}.m050_r050.exr")
+    _, twin = suite.read(f"{CEILING}{suite.scenes[1].key}.m050_r050.exr")
+    assert int(twin["spp"]) >= 4 * int(attributes["spp"])
+    assert twin["seed"] != attributes["seed"]
+
+    (part,) = (tmp_path / "work").glob("*/*.tar")
+    made = part.stat().st_mtime_ns
+    list(make_truth(path, tmp_path / "work", workers=1))
+    assert part.stat().st_mtime_ns == made, "a finished part is not rendered again"
+    list(make_truth(path, tmp_path / "elsewhere", workers=1))
+    assert (tmp_path / "mini.tar").read_bytes() == first, "equal seeds give equal bytes"
+    path.write_text(text.replace("assignment_seed = 3", "assignment_seed = 4"))
+    list(make_truth(path, tmp_path / "work", workers=1))
+    assert len(list((tmp_path / "work").glob("*/*.tar"))) == 2
+    assert (tmp_path / "mini.tar").read_bytes() != first
