@@ -1,7 +1,7 @@
 """`bench run`: a suite x rows -> per-sample records, tables, verdict and report in one folder.
 
     records.jsonl run.json        every value with its content key; the rows and the protocol (see `records`)
-    truth_check.json              what was rendered again on the spot, and how it compares
+    truth_check.json              what was rendered again on the spot, and how it compares (see `run_check`)
     tables.md tables.tex tables.json
     verdict.txt                   who beats whom
     report.html                   one self-contained page
@@ -9,14 +9,9 @@
 Running the same command again reuses what is done.
 """
 
-import hashlib
-import importlib.metadata
-import json
 import os
 import platform
-import secrets
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -28,37 +23,25 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.errors import UnirenderError
+from unirender.errors import UsageError
 from unirender_evaluation import bounds, physics_rows
-from unirender_evaluation.engine import (
-    Prediction,
-    Store,
-    code_version,
-    content_key,
-    record_of,
-    score,
-)
+from unirender_evaluation.engine import Store
 from unirender_evaluation.physics import PHYSICS_TABLE
 from unirender_evaluation.pictures import Pictures
+from unirender_evaluation.pipeline_method import LazyPipeline, weights_hash
+from unirender_evaluation.plugins import installed_plugins, named_plugin
+from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.records import Record, RunInfo, write_run
 from unirender_evaluation.report import write_report
-from unirender_evaluation.rows import (
-    LazyPipeline,
-    Row,
-    check_rows,
-    our_rows,
-    plugin_rows,
-    prediction_rows,
-    trivial_rows,
-    weights_hash,
-)
+from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, trivial_rows
+from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
 from unirender_evaluation.specs import TABLES
-from unirender_evaluation.suites import Scene, Suite, load_suite
+from unirender_evaluation.suites import load_suite
 from unirender_evaluation.tables import Table, build_tables
-from unirender_evaluation.tasks import PROTOCOLS, scene_ids, tasks
+from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth import quality_summary
-from unirender_evaluation.truth_check import TruthCheck, check_truth
 from unirender_evaluation.verdict import verdict_text
+from unirender_evaluation.versions import installed_version, versions
 from unirender_evaluation.workers import Run, run_in_workers
 
 GROUPS = ("ours", "trivial", "plugins")
@@ -73,12 +56,14 @@ class BenchConfig:
         suite: name of a bundled suite, or path of a TOML file.
         out: folder of the run; an earlier run in it is continued.
         checkpoint: folder of our model; None = the shipped one.
-        methods: groups of rows: ours, trivial, plugins.
+        methods: groups of rows: ours, trivial, plugins (installed); a stranger's row always brings the trivial ones.
+        method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
         predictions: name -> folder of somebody's predictions.
         limit: scenes (evenly spaced); the tables are then watermarked.
         seed: of sampling methods.
         check_scenes: scenes that Mitsuba renders again on the spot.
         check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
+        recheck: render them again also where the folder holds the same check.
         jobs: worker processes, each with one thread; 0 = all in this one.
         device: of our model.
         sample_scenes: scenes of the sampling rows; 0 = leave them out.
@@ -88,11 +73,13 @@ class BenchConfig:
     out: Path = Path("results")
     checkpoint: Path | None = None
     methods: tuple[str, ...] = GROUPS
+    method: tuple[str, ...] = ()
     predictions: dict[str, Path] = field(default_factory=dict)
     limit: int | None = None
     seed: int = 0
     check_scenes: int = 4
     check_seed: int | None = None
+    recheck: bool = False
     jobs: int = 2
     device: str = "cpu"
     sample_scenes: int = 4
@@ -119,25 +106,23 @@ def build_rows(config: BenchConfig) -> list[Row]:
     """The rows that a configuration asks for.
 
     Raises:
-        UnirenderError: unknown group, no checkpoint, broken predictions, or two rows of one name.
+        UnirenderError: unknown group, no checkpoint, broken plug-in or predictions folder, or two rows of one name.
     """
     unknown = sorted(set(config.methods) - set(GROUPS))
     if unknown:
-        raise UnirenderError(f"methods: got {', '.join(unknown)}, expected some of {', '.join(GROUPS)}")
+        raise UsageError(f"methods: got {', '.join(unknown)}, expected some of {', '.join(GROUPS)}")
     rows: list[Row] = []
     if "ours" in config.methods:
         folder = config.checkpoint or shipped_checkpoint()
-        rows += our_rows(
-            LazyPipeline(lambda: _load_pipeline(folder, config.device)),
-            weights_hash(folder),
-            config.seed,
-            config.sample_scenes,
-        )
+        pipeline = LazyPipeline(lambda: _load_pipeline(folder, config.device))
+        rows += our_rows(pipeline, weights_hash(folder), config.seed, config.sample_scenes, config.device)
+    plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
+    strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
+    if "trivial" in config.methods or strangers:
+        rows += trivial_rows()
     if "trivial" in config.methods:
-        rows += [*trivial_rows(), bounds.shade_row()]
-    if "plugins" in config.methods:
-        rows += plugin_rows()
-    return check_rows(rows + prediction_rows(config.predictions))
+        rows.append(bounds.shade_row())
+    return check_rows(rows + strangers)
 
 
 def _load_pipeline(folder: Path, device: str) -> Any:
@@ -152,24 +137,27 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     """Runs or continues a benchmark and writes its folder (see the module).
 
     Raises:
-        UnirenderError: unusable suite, checkpoint or predictions. A failed truth check or claim is no error: the
-            verdict says so.
+        UnirenderError: unusable suite, checkpoint, plug-in or predictions; nothing has run then. A failed truth check
+            or claim is no error: the verdict says so.
     """
+    from unirender_evaluation.lpips import available
+
     console = console or Console()
     suite, rows = load_suite(config.suite), build_rows(config)
     scenes = scene_ids(suite, config.limit)
+    check_predictions(rows, suite)
     config.out.mkdir(parents=True, exist_ok=True)
-    code, backbones = code_version(), _backbones()
-    version = f"{code}/{'+'.join(backbones)}"
+    backbones = tuple(available())
+    here = Run(suite, rows, scenes, versions(backbones), backbones, config.out / "pictures")
     store = Store.open(config.out / "records.jsonl")
     before = set(store.known)
+    request = CheckRequest(config.out / "truth_check.json", config.check_scenes, config.check_seed, config.recheck)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
-        check = _truth_check(config, suite, store, version, backbones, progress)
-        here = Run(suite, rows, scenes, version, backbones, config.out / "pictures")
+        check = run_check(request, here, store, progress, partial(console.print, highlight=False))
         _work(here, config, store, progress)
     records = [record for record in store.close() if record.values]
-    info = _run_info(config, suite, scenes, rows, check, records, code, backbones)
+    info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
     specs = {**TABLES, "physics": PHYSICS_TABLE}
     tables = build_tables(records, info, specs)
@@ -177,7 +165,7 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     result = BenchResult(tuple(records), info, tuple(tables), verdict, check, len({r.key for r in records} - before))
     write_outputs(config.out, result)
     pictures = Pictures(config.out / "pictures", suite, scenes)
-    main = next((row.info.key for row in rows if row.info.kind == "ours"), rows[0].info.key if rows else "")
+    main = next((row.info.key for kind in ("ours", "external") for row in rows if row.info.kind == kind), "")
     write_report(config.out / "report.html", tables, pictures.items(records, main), info, records, specs=specs)
     return result
 
@@ -201,69 +189,17 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
         progress.advance(bar, len(records))
 
 
-def _backbones() -> tuple[str, ...]:
-    from unirender_evaluation.lpips import available
-
-    return tuple(available())
-
-
-def _truth_check(
-    config: BenchConfig, suite: Suite, store: Store, version: str, backbones: tuple[str, ...], progress: Progress
-) -> dict[str, Any]:
-    """Renders a random part of the truth again unless this was done before; scores the renders as a row."""
-    path = config.out / "truth_check.json"
-    identity = hashlib.sha256(
-        json.dumps([suite.sha256, config.check_seed, config.check_scenes, version]).encode()
-    ).hexdigest()
-    check: dict[str, Any] = {}
-    if path.exists():
-        with suppress(json.JSONDecodeError):
-            check = json.loads(path.read_text(encoding="utf-8"))
-    keys = check.get("record_keys", [])
-    if check.get("identity") == identity and all([store.has(key) for key in keys]):
-        return check
-    bar = progress.add_task("Mitsuba: truth check", total=None)
-    outcome: TruthCheck | None = None
-    seed = secrets.randbits(31) if config.check_seed is None else config.check_seed
-    for step in check_truth(suite, config.check_scenes, seed):
-        progress.advance(bar)
-        if isinstance(step, TruthCheck):
-            outcome = step
-    assert outcome is not None
-    check = outcome.summary() | {"identity": identity, "checked_scenes": outcome.summary()["scenes"]}
-    images, info = bounds.reference_images(outcome), bounds.reference_info(check)
-    keys = []
-    for table, protocol in PROTOCOLS:
-        for task in tasks(suite, table, protocol, list(suite.scenes)):
-            image, maps = bounds.reference_prediction(task, images, suite)
-            if image is None and maps is None:
-                continue
-            key = content_key(suite, task.scene, task.identity, info.config, version)
-            if not store.has(key):
-                store.add(record_of(task, info, score(task, Prediction(image, maps), backbones), key))
-            keys.append(key)
-    progress.remove_task(bar)
-    check["record_keys"] = keys
-    _write_text(path, json.dumps(check, indent=1) + "\n")
-    return check
-
-
-def _run_info(
-    config: BenchConfig,
-    suite: Suite,
-    scenes: list[Scene],
-    rows: list[Row],
-    check: dict[str, Any],
-    records: list[Record],
-    code: str,
-    backbones: tuple[str, ...],
-) -> RunInfo:
+def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: list[Record]) -> RunInfo:
+    suite, scenes = here.suite, here.scenes
     used = {record.method for record in records}
-    infos = [row.info for row in rows] + [bounds.CEILING, bounds.reference_info(check), *physics_rows.INFOS]
-    quality = quality_summary(suite)
-    versions = {name: _version(name) for name in ("unirender", "torch", "mitsuba", "numpy")}
-    ceiling = quality["image"]
-    versions |= {
+    infos = [row.info for row in here.rows] + [
+        bounds.ceiling_info(suite),
+        reference_row(check, scenes),
+        *physics_rows.INFOS,
+    ]
+    environment = {name: installed_version(name) for name in ("unirender", "torch", "mitsuba", "numpy")}
+    ceiling = quality_summary(suite)["image"]
+    environment |= {
         "cpu": platform.machine(),
         "python": platform.python_version(),
         "noise ceiling": f"mean {ceiling['mean_db']:.1f} dB, min {ceiling['min_db']:.1f} dB over {ceiling['n']} images",
@@ -274,22 +210,15 @@ def _run_info(
         resolution=suite.spec.resolution,
         methods=tuple(info for info in infos if info.key in used),
         coverage=float(np.mean([suite.mask(scene).mean() for scene in scenes])),
-        lpips=backbones,
+        lpips=here.backbones,
         mitsuba=str(suite.provenance["mitsuba"]),
         truth_spp=round(ceiling["mean_spp"]),
-        code=code[:12],
+        code=here.versions.code[:12],
         date=datetime.now(UTC).date().isoformat(),
         limit=config.limit,
         seeds=(config.seed,),
-        environment=versions,
+        environment=environment,
     )
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def write_outputs(out: Path, result: BenchResult) -> None:
@@ -303,10 +232,6 @@ def write_outputs(out: Path, result: BenchResult) -> None:
         "verdict.txt": lambda: result.verdict + "\n",
     }
     for name, write in writers.items():
-        _write_text(out / name, write())
-
-
-def _write_text(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+        temporary = out / f"{name}.tmp"
+        temporary.write_text(write(), encoding="utf-8")
+        os.replace(temporary, out / name)

@@ -1,7 +1,7 @@
 """Rows that are no method's: the noise ceiling, the reference with another seed, and Mitsuba's own shading of true
 maps."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.ceiling import noise_ceiling
+from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
 from unirender_evaluation.engine import Job, record_of
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
@@ -17,28 +17,40 @@ from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 from unirender_evaluation.truth_check import TruthCheck
+from unirender_evaluation.versions import LPIPS, REFERENCE
 
+KeyOf = Callable[[str, MethodInfo, Collection[str]], str]  # question, row, parts that it uses -> content key
 SHADE_SPP = 256
 SHADE_SCENES = 12
 
-CEILING = MethodInfo(
-    "noise-ceiling",
-    "Noise ceiling",
-    "ceiling",
-    note="a noise-free prediction against the noisy truth; PSNR only, from the truth's batch variance (delta method)",
-    config={"bound": "noise-ceiling"},
-)
+CEILING_KEY, REFERENCE_KEY = "noise-ceiling", "reference-other-seed"
 
 
-def reference_info(check: dict[str, Any]) -> MethodInfo:
-    """The row of the re-rendered truth; its configuration is the check that rendered it."""
+def ceiling_info(suite: Suite) -> MethodInfo:
+    """The row of the noise ceiling."""
+    note = "a noise-free prediction against the noisy truth; PSNR from the truth's batch variance (delta method)"
+    if suite.spec.ceiling_scenes:
+        note += (
+            f"; SSIM and LPIPS from an independent render of {suite.spec.ceiling_factor} times the samples, on "
+            f"{len(suite.spec.ceiling_scenes)} scenes of the suite"
+        )
+    return MethodInfo(CEILING_KEY, "Noise ceiling", "ceiling", note=note, config={"bound": CEILING_KEY})
+
+
+def reference_info(seed: int, scenes: int) -> MethodInfo:
+    """The row of the re-rendered truth.
+
+    Args:
+        seed: of the truth check that rendered it.
+        scenes: how many of the run's scenes it rendered.
+    """
     return MethodInfo(
-        "reference-other-seed",
+        REFERENCE_KEY,
         "Reference (other seed)",
         "reference",
-        seed=check["seed"],
-        note=f"Mitsuba again, on the {len(check['checked_scenes'])} scenes of the truth check",
-        config={"bound": "other-seed", "seed": check["seed"], "scenes": check["checked_scenes"]},
+        seed=seed,
+        note=f"Mitsuba again, on the {'scene' if scenes == 1 else f'{scenes} scenes'} of the truth check",
+        config={"bound": "other-seed", "seed": seed},
     )
 
 
@@ -59,36 +71,54 @@ def shade_row() -> Row:
     """`shade(true maps)`: the ceiling of every closed loop."""
     note = "Mitsuba, one point per pixel, no shadows or interreflection"
     given_light = frozenset({("rendering", "given-light")})
-    return make_row(Shade(), "reference", protocols=given_light, scenes=SHADE_SCENES, note=note)
+    uses = frozenset({REFERENCE})
+    return make_row(Shade(), "reference", protocols=given_light, scenes=SHADE_SCENES, note=note, uses=uses)
 
 
-def ceiling_values(suite: Suite, task: Task) -> dict[str, float]:
-    """The noise ceiling's values for one task; empty where the truth has no variance (maps)."""
+def ceiling_values(suite: Suite, task: Task, backbones: Sequence[str] = ()) -> dict[str, float]:
+    """The noise ceiling's values for one task; empty where the truth has no variance (maps).
+
+    Args:
+        suite: the suite.
+        task: the question.
+        backbones: of LPIPS.
+    """
     values: dict[str, float] = {}
     if task.truth_image is not None and task.truth_variance is not None:
         values |= noise_ceiling(task.quantity, task.truth_image, task.truth_variance, task.mask, premultiplied=True)
-    maps = task.truth_maps
-    if maps is not None and maps.diffuse is not None:
-        values |= noise_ceiling(
-            "diffuse", maps.diffuse, suite.diffuse_variance(task.scene), task.mask, premultiplied=False
-        )
-    if maps is not None and maps.specular is not None:
-        variance = suite.specular_variance(task.scene, suite.spec.base[1])
-        values |= noise_ceiling("specular", maps.specular, variance, task.mask, premultiplied=False)
+        if task.truth_twin is not None:
+            pair = task.truth_twin, task.truth_image
+            values |= similarity_ceiling(task.quantity, *pair, task.mask, premultiplied=True, backbones=backbones)
+    maps, scene, roughness = task.truth_maps, task.scene, suite.spec.base[1]
+    if maps is None or maps.diffuse is None or maps.specular is None:
+        return values
+    lights = {
+        "diffuse": (maps.diffuse, suite.diffuse_variance(scene), suite.ceiling_diffuse(scene)),
+        "specular": (
+            maps.specular,
+            suite.specular_variance(scene, roughness),
+            suite.ceiling_specular(scene, roughness),
+        ),
+    }
+    for quantity, (truth, variance, twin) in lights.items():
+        values |= noise_ceiling(quantity, truth, variance, task.mask, premultiplied=False)
+        if twin is not None:
+            values |= similarity_ceiling(quantity, twin, truth, task.mask, premultiplied=False, backbones=backbones)
     return values
 
 
-def ceiling_jobs(suite: Suite, scene: Scene, key_of: Callable[[str, MethodInfo], str]) -> Iterator[Job]:
-    """The noise ceiling's records of one scene; `key_of` gives the content key of a question."""
+def ceiling_jobs(suite: Suite, scene: Scene, key_of: KeyOf, backbones: Sequence[str]) -> Iterator[Job]:
+    """The noise ceiling's records of one scene."""
+    info = ceiling_info(suite)
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):
             if task.truth_variance is not None:
-                key = key_of(task.identity, CEILING)
-                yield Job(key, CEILING.label, partial(_ceiling_record, suite, task, key))
+                key = key_of(task.identity, info, {LPIPS})
+                yield Job(key, info.label, partial(_ceiling_record, suite, task, info, key, backbones))
 
 
-def _ceiling_record(suite: Suite, task: Task, key: str) -> Record:
-    return record_of(task, CEILING, ceiling_values(suite, task), key)
+def _ceiling_record(suite: Suite, task: Task, info: MethodInfo, key: str, backbones: Sequence[str]) -> Record:
+    return record_of(task, info, ceiling_values(suite, task, backbones), key)
 
 
 def reference_images(check: TruthCheck) -> dict[str, np.ndarray]:

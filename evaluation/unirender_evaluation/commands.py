@@ -2,13 +2,14 @@
 
 import json
 import secrets
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class BenchRun:
     checkpoint: Path | None = None
     """Folder of our model; None: the shipped tiny."""
     methods: tuple[str, ...] = ("ours", "trivial", "plugins")
-    """Groups of rows."""
+    """Groups of rows; plugins: what is installed. The trivial rows also run whenever there is a row of yours."""
+    method: tuple[str, ...] = ()
+    """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class."""
     predictions: tuple[str, ...] = ()
     """NAME=FOLDER of somebody's predictions (`unirender bench export` writes the inputs); repeatable."""
     limit: int | None = None
@@ -33,6 +36,8 @@ class BenchRun:
     """Scenes that Mitsuba renders again on the spot; at least 1."""
     check_seed: int | None = None
     """Chooses them; None: drawn anew in a new folder, kept in one that is continued."""
+    recheck: bool = False
+    """Render them again also where the folder holds a check of the same truth, code and seed."""
     sample_scenes: int = 4
     """Scenes of the sampling rows; 0 leaves them out."""
     jobs: int = 2
@@ -43,32 +48,37 @@ class BenchRun:
     """Run the slow rows on the whole suite instead of on their fixed subset."""
 
     def run(self) -> int:
-        """Returns the exit status: 1 where the shipped truth does not stand up to Mitsuba."""
+        """Returns the exit status: 1 where predictions cannot be scored or the truth does not stand up to Mitsuba."""
         from rich.console import Console
 
         from unirender_evaluation import benchmark
+        from unirender_evaluation.prediction_check import PredictionError
         from unirender_evaluation.suites import load_suite
         from unirender_evaluation.table_formats import print_table
 
         console = Console()
         whole = len(load_suite(self.suite).scenes)
-        result = benchmark.run(
-            benchmark.BenchConfig(
-                suite=self.suite,
-                out=self.out,
-                checkpoint=self.checkpoint,
-                methods=self.methods,
-                predictions=named_folders(self.predictions),
-                limit=self.limit,
-                seed=self.seed,
-                check_scenes=self.check_scenes,
-                check_seed=self.check_seed,
-                jobs=self.jobs,
-                device=self.device,
-                sample_scenes=whole if self.full else self.sample_scenes,
-            ),
-            console,
+        config = benchmark.BenchConfig(
+            suite=self.suite,
+            out=self.out,
+            checkpoint=self.checkpoint,
+            methods=self.methods,
+            method=self.method,
+            predictions=named_folders(self.predictions),
+            limit=self.limit,
+            seed=self.seed,
+            check_scenes=self.check_scenes,
+            check_seed=self.check_seed,
+            recheck=self.recheck,
+            jobs=self.jobs,
+            device=self.device,
+            sample_scenes=whole if self.full else self.sample_scenes,
         )
+        try:
+            result = benchmark.run(config, console)
+        except PredictionError as error:
+            print(f"unirender: error: {error}", file=sys.stderr)  # a line for each problem
+            return 1
         for table in result.tables:
             print_table(console, table)
         console.print(result.verdict, markup=False, highlight=False)
@@ -174,14 +184,14 @@ def named_folders(pairs: tuple[str, ...]) -> dict[str, Path]:
     """`NAME=FOLDER` strings as a dict.
 
     Raises:
-        UnirenderError: a string of another form, or a name given twice.
+        UsageError: a string of another form, or a name given twice.
     """
     folders: dict[str, Path] = {}
     for pair in pairs:
         name, separator, folder = pair.partition("=")
         if not (name and separator and folder):
-            raise UnirenderError(f"--predictions {pair}: expected NAME=FOLDER")
+            raise UsageError(f"--predictions {pair}: expected NAME=FOLDER")
         if name in folders:
-            raise UnirenderError(f"--predictions {name}: given twice, expected one folder for each name")
+            raise UsageError(f"--predictions {name}: given twice, expected one folder for each name")
         folders[name] = Path(folder)
     return folders

@@ -37,7 +37,14 @@ class Comparison:
     b_beats_a: bool
 
     @property
+    def decided(self) -> bool:
+        """Whether there is an interval: with fewer than two objects there is none."""
+        return math.isfinite(self.difference.low)
+
+    @property
     def verdict(self) -> str:
+        if not self.decided:
+            return "is not comparable on one object with"
         return "beats" if self.a_beats_b else "is beaten by" if self.b_beats_a else "is level with"
 
 

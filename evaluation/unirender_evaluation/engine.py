@@ -1,18 +1,20 @@
 """The engine of a run: asks methods, scores their answers, and never does again what is done.
 
-Every record carries a content key, sha256 of (scene truth, task, method configuration, code): a second run, or one more
-method, computes only what has no record. Records are appended as they are made, so that a killed run resumes.
+Every record carries a content key, sha256 of (scene truth, task, method configuration, versions of the parts that its
+row uses): a second run, or one more method, computes only what has no record. Records are appended as they are made, so
+that a killed run resumes.
 """
 
 import hashlib
-import importlib.metadata
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
@@ -21,28 +23,9 @@ from unirender_evaluation.records import MethodInfo, Record, append_record, writ
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.versions import SEPARATOR, Versions
 
-CODE = {
-    "unirender": ("*.py", "models/*.py", "diffusion/*.py", "pipelines/*.py"),
-    "unirender_evaluation": ("*.py",),
-    "unirender_reference": ("*.py",),
-}
-PRESENTATION = (  # what changes how results look, not what they are
-    "cli.py",
-    "commands.py",
-    "gallery.py",
-    "pictures.py",
-    "protocol.py",
-    "readme.py",
-    "report.py",
-    "report_plots.py",
-    "strip.py",
-    "table_formats.py",
-    "tables.py",
-    "verdict.py",
-)
 KEY_PREFIX = 12
-LIBRARIES = ("torch", "mitsuba", "diffusers", "numpy", "scikit-image", "scipy")
 
 
 @dataclass(frozen=True)
@@ -63,34 +46,14 @@ class Keeper(Protocol):
     def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None: ...
 
 
-@cache
-def code_version() -> str:
-    """sha256 over the sources and libraries that results depend on: a change makes every stored record stale."""
-    from importlib.util import find_spec
-
-    digest = hashlib.sha256()
-    for package, patterns in CODE.items():
-        found = find_spec(package)
-        if found is None or not found.submodule_search_locations:
-            raise UnirenderError(f"package {package!r} is not installed: `pip install -e .`")
-        root = Path(found.submodule_search_locations[0])
-        for path in sorted({p for pattern in patterns for p in root.glob(pattern)}):
-            if path.name not in PRESENTATION:
-                digest.update(f"{package}/{path.relative_to(root)}".encode() + path.read_bytes())
-    for library in LIBRARIES:
-        digest.update(f"{library} {importlib.metadata.version(library)}".encode())
-    return digest.hexdigest()
-
-
 def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any], code: str) -> str:
-    """What a record depends on: the scene's truth, the question, the method's configuration, the code.
+    """What a record depends on: the scene's truth, the question, the method's configuration, the code (`Versions.of`).
 
-    The first `KEY_PREFIX` digits are the code's alone, so that records of other code can be told.
+    The first `KEY_PREFIX` digits are the core's alone, so that records of another core can be told.
     """
     text = json.dumps([suite.scene_hash(scene), what, config, code], sort_keys=True, default=str)
-    return (
-        hashlib.sha256(code.encode()).hexdigest()[:KEY_PREFIX] + hashlib.sha256(text.encode()).hexdigest()[KEY_PREFIX:]
-    )
+    core = hashlib.sha256(code.partition(SEPARATOR)[0].encode()).hexdigest()
+    return core[:KEY_PREFIX] + hashlib.sha256(text.encode()).hexdigest()[KEY_PREFIX:]
 
 
 def answer(row: Row, task: Task) -> Prediction:
@@ -101,15 +64,40 @@ def answer(row: Row, task: Task) -> Prediction:
         return Prediction(image, maps, 0.0)
     image = maps = None
     for capability in task.asks:
-        function = getattr(row.method, capability, None)
-        if function is None:
+        if not callable(getattr(row.method, capability, None)):
             continue
-        result = function(**task.inputs[capability])
+        result = ask(row, capability, task.identity, **task.inputs[capability])
         if capability == "decompose":
             maps = result
         else:
             image = result
     return Prediction(image, maps, time.perf_counter() - start)
+
+
+def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
+    """Calls one capability of a row's method.
+
+    Raises:
+        UnirenderError: a stranger's method fails, or returns something else than maps or a finite picture.
+    """
+    function = getattr(row.method, capability)
+    if row.info.kind != "external":
+        return function(**inputs)
+    name = f"method {row.info.label!r}, {capability} ({what})"
+    try:
+        result = function(**inputs)
+    except Exception as error:
+        raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
+    if capability == "decompose":
+        if not isinstance(result, Intrinsics):
+            raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
+        return result
+    picture = np.asarray(result)
+    if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype.kind != "f" or not np.isfinite(picture).all():
+        raise UnirenderError(
+            f"{name}: got {picture.dtype} of shape {picture.shape}, expected finite linear radiance, floats (h, w, 3)"
+        )
+    return picture.astype(np.float32)
 
 
 def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[str, float]:
@@ -183,6 +171,10 @@ class Store:
             append_record(self.path, record)
         self.used[record.key] = record
 
+    def lay_by(self, record: Record) -> None:
+        """Stores a record for later runs that this one did not ask for."""
+        self.known[record.key] = record
+
     def close(self) -> list[Record]:
         """Sorts this run's records, writes and returns them; keeps unused ones of the same code, drops the others."""
         records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
@@ -219,7 +211,7 @@ def method_jobs(
     rows: Sequence[Row],
     scenes: list[Scene],
     scene: Scene,
-    version: str,
+    versions: Versions,
     backbones: Sequence[str],
     pictures: Keeper,
 ) -> Iterator[Job]:
@@ -230,7 +222,7 @@ def method_jobs(
         rows: the rows.
         scenes: of the whole run: rows on a subset choose from them.
         scene: whose questions are asked.
-        version: of the code and of what it depends on.
+        versions: of the code and of what it depends on.
         backbones: LPIPS backbones.
         pictures: keeps the predictions of the gallery.
     """
@@ -238,7 +230,7 @@ def method_jobs(
         for task in tasks(suite, table, protocol, [scene]):
             for row in rows:
                 if row.answers(task, scenes):
-                    key = content_key(suite, scene, task.identity, row.config, version)
+                    key = content_key(suite, scene, task.identity, row.config, versions.of(row.scored_with))
                     make = partial(_ask, row, task, key, backbones, pictures)
                     yield Job(key, row.info.label, make, pictures.has(task, row.info.key, key))
 

@@ -1,10 +1,14 @@
 """Writes a suite's inputs for foreign code, in the folder names that `predictions` reads answers from.
 
-    <picture>/image.png      what a method may see: 8-bit sRGB, straight, with the mask as alpha
-    <picture>/meta.json      what is asked of this picture: file names of the answers; camera
-    <picture>/<answer>/...   what is given with a question: light.exr, or s and d, or true maps (`given.exr`, linear)
+    <picture>/image.png                  what a method may see: 8-bit sRGB, straight, with the mask as alpha
+    <picture>/meta.json                  the suite, the camera, and the questions by the name of their answer: table,
+                                         protocol, what is asked, new metallic or roughness
+    <picture>/<answer>/given.exr         maps given with a question (true ones, or s and d of another light): channels
+                                         of the data contract, linear, half floats
+    <picture>/<answer>/environment.exr   the light given with it: R, G, B, linear, float32, lat-long in camera axes
 
-No truth is written but what its protocol gives away.
+A picture that no method may see (its true maps are given instead) has no `image.png`. No truth is written but what its
+protocol gives away.
 """
 
 import json
@@ -42,7 +46,7 @@ def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> int:
 
 def _write_question(task: Task, folder: Path) -> dict[str, Any]:
     """Writes what comes with a question and describes it."""
-    question: dict[str, Any] = {"table": task.table, "protocol": task.protocol}
+    question: dict[str, Any] = {"table": task.table, "protocol": task.protocol, "asks": list(task.asks)}
     for capability in task.asks:
         inputs = task.inputs[capability]
         if "image_srgb" in inputs:

@@ -10,13 +10,12 @@ picture, the mask and the camera, nothing else:
     render(intrinsics) -> image_linear                                                 s and d may be unknown
 
 `image_srgb` is float32 (h, w, 3) in {0, 1/255 .. 1}, straight as in a PNG with alpha (not premultiplied, 0 outside);
-`mask` (h, w, 1) is the alpha. Results are linear and premultiplied by the mask, as everywhere. Other people's methods
-come through the entry-point group `unirender.methods` (a callable without arguments that returns a method).
+`mask` (h, w, 1) is the alpha. Results are linear and premultiplied by the mask, as everywhere. How other people's
+methods come in: `plugins`.
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
-from importlib import metadata
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
@@ -25,15 +24,14 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.color import image_srgb as encode_srgb
-from unirender.color import srgb_decode
-from unirender.composite import composite_image
+from unirender.color import srgb_decode, unpremultiply
+from unirender.composite import composite_image, split_sum_image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import diffuse_light, specular_light
 from unirender_evaluation.training_statistics import training_statistics
 
 CAPABILITIES = ("decompose", "edit", "relight", "render")
-ENTRY_POINT_GROUP = "unirender.methods"
 Image = Float[np.ndarray, "h w 3"]
 Mask = Float[np.ndarray, "h w 1"]
 
@@ -67,11 +65,6 @@ def quantise(image_linear: Image, mask: Mask) -> Image:
     """The picture that a method is shown: display values of the covered part, straight, rounded to 8 bits, in [0,
     1]."""
     return (np.round(encode_srgb(unpremultiply(image_linear, mask)) * 255.0) / 255.0).astype(np.float32)
-
-
-def unpremultiply(image: Image, mask: Mask) -> Image:
-    """Divides by coverage; 0 where the mask is 0."""
-    return np.where(mask > 0, image / np.maximum(mask, 1e-6), 0.0).astype(np.float32)
 
 
 def seen_linear(image_srgb: Image, mask: Mask) -> Image:
@@ -190,6 +183,16 @@ class Composite:
         return composite_image(with_derived_light(intrinsics))
 
 
+class SplitSum:
+    """The composite with Schlick's reflectance averaged over the lobe (Karis), instead of that at normal incidence."""
+
+    name = "composite (split-sum)"
+    config: Mapping[str, Any] = MappingProxyType({"composite": "split-sum"})
+
+    def render(self, intrinsics: Intrinsics) -> Image:
+        return split_sum_image(with_derived_light(intrinsics))
+
+
 def set_material(intrinsics: Intrinsics, roughness: float | None, metallic: float | None) -> Intrinsics:
     """The same scene with another material; for a new roughness s changes by our pipeline's own rule."""
     from unirender.pipelines.editing import specular_for_roughness
@@ -253,26 +256,3 @@ class CompositeOf:
         from unirender.pipelines.editing import anchor
 
         return anchor(seen_linear(image_srgb, mask), composite_image(before), composite_image(after))
-
-
-def plugin_methods(names: list[str] | None = None) -> list[Any]:
-    """Methods of the entry-point group `unirender.methods`, all or the named ones.
-
-    Raises:
-        UnirenderError: a name is not registered, or what it returns is not a method.
-    """
-    found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)}
-    wanted = list(found) if names is None else names
-    for name in wanted:
-        if name not in found:
-            raise UnirenderError(
-                f"no method {name!r}: installed are {', '.join(sorted(found)) or 'none'}; register a callable in the "
-                f"entry-point group {ENTRY_POINT_GROUP!r}, or score a folder with --predictions {name}=FOLDER"
-            )
-    built = []
-    for name in wanted:
-        factory: Callable[[], Any] = found[name].load()
-        method = factory()
-        capabilities(method)
-        built.append(method)
-    return built

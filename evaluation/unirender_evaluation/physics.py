@@ -17,13 +17,14 @@ method's `render` of the maps x, in linear light, premultiplied; sums run over t
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import mirror_environment, rotate_environment
+from unirender.symmetries import mirror, quarter_turn, scale_light
 from unirender_evaluation.methods import Composite, Image
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.specs import Column, TableSpec
@@ -31,19 +32,11 @@ from unirender_evaluation.suites import Scene, Suite
 
 Render = Callable[[Intrinsics], Image]
 FURNACE_RADIANCE = 0.5
-QUARTER_TURN = np.array(
-    [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.float32
-)  # x -> y, y -> -x: anticlockwise
 
 
-def scale_light(maps: Intrinsics, factor: float) -> Intrinsics:
-    """The same scene under `factor` times the light."""
-    changes = {
-        name: getattr(maps, name) * np.float32(factor)
-        for name in ("specular", "diffuse", "environment")
-        if name in maps.present
-    }
-    return maps.replace(**changes)
+def changed(maps: Intrinsics, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Intrinsics:
+    """The scene after a change of `unirender.symmetries`, in arrays of its own."""
+    return maps.replace(**{name: np.ascontiguousarray(value) for name, value in change(maps.maps).items()})
 
 
 def add_lights(a: Intrinsics, b: Intrinsics) -> Intrinsics:
@@ -54,26 +47,6 @@ def add_lights(a: Intrinsics, b: Intrinsics) -> Intrinsics:
         if name in a.present
     }
     return a.replace(**changes)
-
-
-def mirror(maps: Intrinsics) -> Intrinsics:
-    """The scene in a mirror that flips x."""
-    changes: dict[str, Any] = {n: getattr(maps, n)[:, ::-1].copy() for n in maps.present if n != "environment"}
-    if "normal" in changes:
-        changes["normal"] *= np.array([-1, 1, 1], np.float32)
-    if maps.environment is not None:
-        changes["environment"] = mirror_environment(maps.environment)
-    return maps.replace(**changes)
-
-
-def quarter_turn(maps: Intrinsics) -> Intrinsics:
-    """The scene turned by 90 degrees anticlockwise about the view axis (square pictures, centred camera)."""
-    changes: dict[str, Any] = {n: np.rot90(getattr(maps, n)).copy() for n in maps.present if n != "environment"}
-    if "normal" in changes:
-        changes["normal"] = changes["normal"] @ QUARTER_TURN.T
-    if maps.environment is not None:
-        changes["environment"] = rotate_environment(maps.environment, QUARTER_TURN)
-    return maps.replace(**changes)
 
 
 def relative_error(a: Image, b: Image, keep: Float[np.ndarray, "h w"] | None = None) -> float:
@@ -88,14 +61,14 @@ def _unclipped(*images: Image) -> Float[np.ndarray, "h w"]:
 
 def superposition(render: Render, a: Intrinsics, b: Intrinsics) -> float:
     """Relative error of adding two lights; `a`, `b` are one scene under two lights."""
-    a, b = scale_light(a, 0.5), scale_light(b, 0.5)
+    a, b = (changed(maps, partial(scale_light, factor=0.5)) for maps in (a, b))
     both, separate = render(add_lights(a, b)), render(a) + render(b)
     return relative_error(both, separate, _unclipped(both, separate))
 
 
 def exposure_linearity(render: Render, maps: Intrinsics) -> float:
     """Relative error of halving the light."""
-    half, full = render(scale_light(maps, 0.5)), render(maps)
+    half, full = render(changed(maps, partial(scale_light, factor=0.5))), render(maps)
     return relative_error(half, full / 2, _unclipped(full))
 
 
@@ -118,12 +91,12 @@ def white_furnace(render: Render, maps: Intrinsics) -> float:
 
 def mirror_flip(render: Render, maps: Intrinsics) -> float:
     """Relative error of rendering the mirrored scene."""
-    return relative_error(render(mirror(maps)), render(maps)[:, ::-1])
+    return relative_error(render(changed(maps, mirror)), render(maps)[:, ::-1])
 
 
 def roll(render: Render, maps: Intrinsics) -> float:
     """Relative error of rendering the scene turned about the view axis."""
-    return relative_error(render(quarter_turn(maps)), np.rot90(render(maps)))
+    return relative_error(render(changed(maps, quarter_turn)), np.rot90(render(maps)))
 
 
 def metallic_linearity(render: Render, maps: Intrinsics) -> float:

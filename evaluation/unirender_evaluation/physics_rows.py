@@ -5,8 +5,8 @@ from functools import partial
 from typing import Any
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.bounds import SHADE_SPP, Shade
-from unirender_evaluation.engine import Job
+from unirender_evaluation.bounds import SHADE_SPP, KeyOf, Shade
+from unirender_evaluation.engine import Job, ask
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.physics import RENDERER_TESTS, closed_loop, composite_shader, renderer_tests
 from unirender_evaluation.records import MethodInfo, Record
@@ -14,6 +14,7 @@ from unirender_evaluation.rows import Row
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture, scene_ids
+from unirender_evaluation.versions import REFERENCE
 
 SCENES = 12
 TRUE_MAPS = MethodInfo(
@@ -40,9 +41,9 @@ def physics_scenes(suite: Suite, scenes: list[Scene]) -> list[Scene]:
     return scenes if len(scenes) <= SCENES else [s for s in scene_ids(suite, SCENES) if s in scenes] or scenes[:SCENES]
 
 
-def renderer_values(method: Any, suite: Suite, scene: Scene) -> dict[str, float]:
+def renderer_values(render: Callable[[Intrinsics], Any], suite: Suite, scene: Scene) -> dict[str, float]:
     """Metric key -> value of a renderer's tests on one scene."""
-    values = renderer_tests(method.render, suite, scene)
+    values = renderer_tests(render, suite, scene)
     return {metric_key(name, RENDERER_TESTS[name][1]): value for name, value in values.items()}
 
 
@@ -55,27 +56,32 @@ def loop_values(maps: Intrinsics, suite: Suite, scene: Scene) -> dict[str, float
     return values
 
 
-def physics_jobs(
-    suite: Suite, scene: Scene, rows: Sequence[Row], key_of: Callable[[str, MethodInfo], str]
-) -> Iterator[Job]:
+def physics_jobs(suite: Suite, scene: Scene, rows: Sequence[Row], key_of: KeyOf) -> Iterator[Job]:
     """The records of the physics table on one scene: renderers, decomposers, and the true maps."""
-    for info, method in [(TRUE_MAPS, None), *((row.info, row.method) for row in rows if takes_part(row))]:
-        key = key_of("physics", info)
-        yield Job(key, f"physics: {info.label}", partial(_record, suite, scene, info, method, key))
+    key = key_of("physics", TRUE_MAPS, {REFERENCE})
+    yield Job(key, f"physics: {TRUE_MAPS.label}", partial(_true_maps, suite, scene, key))
+    for row in filter(takes_part, rows):
+        loops = callable(getattr(row.method, "decompose", None))  # shaded again by Mitsuba
+        key = key_of("physics", row.info, row.uses | {REFERENCE} if loops else row.uses)
+        yield Job(key, f"physics: {row.info.label}", partial(_record, suite, scene, row, key))
 
 
-def _record(suite: Suite, scene: Scene, info: MethodInfo, method: Any, key: str) -> Record:
+def _true_maps(suite: Suite, scene: Scene, key: str) -> Record:
+    values = loop_values(suite.intrinsics(scene, suite.spec.base), suite, scene)
+    return Record("physics", "physics", TRUE_MAPS.key, scene.key, scene.object, values, key)
+
+
+def _record(suite: Suite, scene: Scene, row: Row, key: str) -> Record:
     values: dict[str, float] = {}
-    if method is None:
-        values = loop_values(suite.intrinsics(scene, suite.spec.base), suite, scene)
-    if callable(getattr(method, "render", None)):
-        values |= renderer_values(method, suite, scene)
-    decompose: Any = getattr(method, "decompose", None)
-    if decompose is not None:
-        maps = decompose(**picture(suite, scene, suite.spec.base))
+    if callable(getattr(row.method, "render", None)):
+        render = partial(ask, row, "render", f"physics/{scene.key}")
+        values |= renderer_values(lambda maps: render(intrinsics=maps), suite, scene)
+    if callable(getattr(row.method, "decompose", None)):
+        seen = picture(suite, scene, suite.spec.base)
+        maps = ask(row, "decompose", f"physics/{scene.key}", **seen)
         if {"albedo", "normal", "roughness", "metallic"} <= set(maps.present):
             values |= loop_values(maps, suite, scene)
-    return Record("physics", "physics", info.key, scene.key, scene.object, values, key)
+    return Record("physics", "physics", row.info.key, scene.key, scene.object, values, key)
 
 
 def takes_part(row: Row) -> bool:

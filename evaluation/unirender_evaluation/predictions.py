@@ -5,7 +5,7 @@ own name of the picture):
 
     <picture>/intrinsics.exr            maps under the contract's channel names (albedo.R .. roughness.Y ..), linear;
                                         or single maps:
-    <picture>/albedo.png                sRGB-encoded, 8 or 16 bits
+    <picture>/albedo.png                sRGB-encoded
     <picture>/normal.png                (n + 1) / 2, unit normal in camera axes: +x right, +y up, +z to the viewer
     <picture>/roughness.png             linear values, perceptual roughness; likewise metallic.png
     <picture>/specular.png              sRGB-encoded, clipped; likewise diffuse.png; use EXR for the full range
@@ -14,8 +14,9 @@ own name of the picture):
     <picture>/relight_l1_hdri.exr|png   the same, the light given
     <picture>/render_given.exr|png      the picture from true maps, s and d; `render_given-light`: from maps and light
 
-Rendered pictures are premultiplied: black outside the object. EXR is linear, PNG sRGB-encoded. Absent files are absent
-numbers, never errors; a file that is there and unreadable, of another size or not finite is an error.
+Rendered pictures are premultiplied: black outside the object. EXR is linear, PNG sRGB-encoded. Other habits are
+declared in a `conventions.toml` (see `conventions`). Absent files are absent numbers, never errors; a file that is
+there and unreadable, of another size or not finite is an error, which `prediction_check` finds before a run begins.
 """
 
 import hashlib
@@ -24,35 +25,55 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from unirender.color import srgb_decode
+from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender_evaluation.methods import Image
+from unirender_evaluation.conventions import FILE, Conventions, read_conventions
+from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.tasks import Task
 
 PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
+COLOURS = ("albedo", "specular", "diffuse")
+MAP_FILES = ("intrinsics.exr", *(f"{name}.png" for name in PNG_MAPS))
+SUFFIXES = (".exr", ".png")
 
 
 class PredictionFolder:
     """A folder of predictions; see the module for its layout.
 
+    Args:
+        folder: where it is.
+        conventions: how its files are to be read; None = as its `conventions.toml` says.
+
     Raises:
         UnirenderError: it does not exist or has no subfolder.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
         if not folder.is_dir() or not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
                 f"predictions: {folder} is not a folder with one subfolder per picture; "
                 "`unirender bench export` writes the inputs and their names"
             )
         self.folder = folder
+        self._conventions = conventions
+
+    @property
+    def conventions(self) -> Conventions:
+        """How the files are to be read.
+
+        Raises:
+            UnirenderError: `conventions.toml` is not readable, or says what it cannot say.
+        """
+        if self._conventions is None:
+            self._conventions = read_conventions(self.folder)
+        return self._conventions
 
     def sha256(self) -> str:
-        """Over names and contents of all files."""
+        """Over names and contents of all files that are read."""
         digest = hashlib.sha256()
-        for path in sorted(p for p in self.folder.rglob("*") if p.suffix in (".exr", ".png")):
+        for path in sorted(p for p in self.folder.rglob("*") if p.suffix in SUFFIXES or p.name == FILE):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
@@ -67,59 +88,94 @@ class PredictionFolder:
             UnirenderError: a file is broken, has the wrong size, or values outside the contract.
         """
         path = self._picture(task)
-        image = None if path is None else self._read_image(path, task.mask.shape[:2])
-        maps = self._read_maps(task) if "decompose" in task.asks and self._map_files(task) else None
-        return image, maps
+        image = None if path is None else self.read_picture(path, task.mask)
+        files = self._map_files(task) if "decompose" in task.asks else []
+        if not files:
+            return image, None
+        camera = task.inputs["decompose"]["camera"]
+        maps: dict[str, np.ndarray] = {}
+        for file in files:
+            maps = self.read_maps(file, task.mask, camera) | maps
+        return image, Intrinsics(**{**maps, "mask": task.mask}, camera=camera)
 
     def _picture(self, task: Task) -> Path | None:
-        for suffix in (".exr", ".png"):
+        for suffix in SUFFIXES:
             path = self.folder / task.folder / f"{task.answer}{suffix}"
             if task.answer != "intrinsics" and path.is_file():
                 return path
         return None
 
     def _map_files(self, task: Task) -> list[Path]:
-        folder = self.folder / task.folder
-        return [p for p in (folder / "intrinsics.exr", *(folder / f"{name}.png" for name in PNG_MAPS)) if p.is_file()]
+        return [path for path in (self.folder / task.folder / name for name in MAP_FILES) if path.is_file()]
 
-    def _read_image(self, path: Path, size: tuple[int, ...]) -> Image:
-        image = channels_rgb(read_exr(path)[0])[..., :3] if path.suffix == ".exr" else srgb_decode(read_png(path, 3))
-        if image.shape[:2] != size:
-            raise UnirenderError(
-                f"predictions: {path} has {image.shape[:2]} pixels, expected {tuple(size)}; resample it"
-            )
-        return image
+    def read_picture(self, path: Path, mask: Mask) -> Image:
+        """A rendered picture, linear and premultiplied.
 
-    def _read_maps(self, task: Task) -> Intrinsics:
-        folder = self.folder / task.folder
-        camera = task.inputs["decompose"]["camera"]
-        maps: dict[str, np.ndarray] = {}
-        if (folder / "intrinsics.exr").is_file():
-            read = intrinsics_from_channels(read_exr(folder / "intrinsics.exr")[0], camera=camera)
-            maps = {name: getattr(read, name) for name in read.present}
-        for name in PNG_MAPS:
-            path = folder / f"{name}.png"
-            if name in maps or not path.is_file():
-                continue
-            value = read_png(path, MAPS[name])
-            if name == "normal":
-                value = 2 * value - 1
-                length = np.linalg.norm(value, axis=-1, keepdims=True)
-                value = np.divide(value, length, out=np.zeros_like(value), where=(length > 1e-3) & (task.mask > 0))
-            elif MAPS[name] == 3:
-                value = srgb_decode(value)
-            maps[name] = value
+        Raises:
+            UnirenderError: the file is broken, has another size than the mask, or values that are not finite.
+        """
+        stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else read_png(path, 3)
+        _check_size(path, "the picture", stored, mask)
+        if not np.isfinite(stored).all():
+            raise UnirenderError(f"predictions: {path} has NaN or infinite values, expected finite radiance")
+        image = self.conventions.linear(stored, path.suffix)
+        return image if self.conventions.premultiplied else (image * mask).astype(np.float32)
+
+    def read_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
+        """The maps of one file, in the contract's conventions.
+
+        Raises:
+            UnirenderError: the file is broken or without maps, or one has another size than the mask or values outside
+                the contract.
+        """
+        try:
+            return self._read_exr_maps(path, mask, camera) if path.suffix == ".exr" else self._read_png_map(path, mask)
+        except UnirenderError as error:
+            raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
+
+    def _read_exr_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
+        read = intrinsics_from_channels(read_exr(path)[0], camera=camera)
+        maps = {name: getattr(read, name) for name in read.present if name != "mask"}
+        if not maps:
+            raise UnirenderError(f"predictions: {path} has no map, expected channels like albedo.R or roughness.Y")
         for name, value in maps.items():
-            if name != "environment" and value.shape[:2] != task.mask.shape[:2]:
-                raise UnirenderError(
-                    f"predictions: {name} in {folder} has {value.shape[:2]} pixels, expected {task.mask.shape[:2]}; "
-                    "resample it"
-                )
-        return Intrinsics(**{**maps, "mask": task.mask}, camera=camera)
+            _check_size(path, name, value, mask)
+        if "albedo" in maps:
+            maps["albedo"] = self.conventions.linear(maps["albedo"], ".exr")
+        return self._converted(maps)
+
+    def _read_png_map(self, path: Path, mask: Mask) -> dict[str, np.ndarray]:
+        name = path.stem
+        value = read_png(path, MAPS[name])
+        _check_size(path, name, value, mask)
+        if name == "normal":
+            value = 2 * value - 1
+            length = np.linalg.norm(value, axis=-1, keepdims=True)
+            value = np.divide(value, length, out=np.zeros_like(value), where=(length > 1e-3) & (mask > 0))
+        elif name in COLOURS:
+            value = self.conventions.linear(value, ".png")
+        return self._converted({name: value})
+
+    def _converted(self, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        if "normal" in maps:
+            maps["normal"] = self.conventions.camera_normal(maps["normal"])
+        if "roughness" in maps:
+            maps["roughness"] = self.conventions.perceptual(maps["roughness"])
+        return Intrinsics().replace(**maps).maps
+
+
+def _check_size(path: Path, what: str, value: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "mh mw 1"]) -> None:
+    if value.shape[:2] != mask.shape[:2]:
+        (height, width), (rows, columns) = value.shape[:2], mask.shape[:2]
+        raise UnirenderError(
+            f"predictions: {path}: {what} is {width} x {height} pixels, expected {columns} x {rows}; resample it"
+        )
 
 
 def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
-    """Values in [0, 1] of an 8- or 16-bit PNG; alpha is dropped, grey and colour are converted to `channels`.
+    """Values in [0, 1] of a PNG; alpha is dropped, grey and colour are converted to `channels`.
+
+    Grey keeps 16 bits; colour is read at 8 bits a channel.
 
     Raises:
         UnirenderError: not a readable PNG.
@@ -132,7 +188,7 @@ def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
                 value = np.asarray(picture, np.float32) / 65535.0
             else:
                 value = np.asarray(picture.convert("RGB" if channels == 3 else "L"), np.float32) / 255.0
-    except OSError as error:
+    except (OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"predictions: {path} is not a readable PNG ({error})") from None
     value = value if value.ndim == 3 else value[..., None]
     return np.repeat(value, 3, axis=-1) if channels == 3 and value.shape[-1] == 1 else value.astype(np.float32)

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from unirender.color import srgb_encode
+from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
@@ -119,11 +119,6 @@ def score_image(
     _check_shapes(quantity, prediction_linear, truth_linear)
     p, t = (unpremultiply(x, m) for x, m in ((prediction_linear, own), (truth_linear, w)))
     return score_colour(quantity, p, t, w, own, IMAGE_SCALES, lpips, lpips_scales)
-
-
-def unpremultiply(image: Rgb, mask: Weights) -> Rgb:
-    """Radiance of the covered part of each pixel: image / mask, 0 where the mask is 0."""
-    return np.divide(image, mask, out=np.zeros_like(image), where=mask > 0)
 
 
 def over_white(colour: Rgb, mask: Weights) -> Rgb:

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Image, Mask, quantise
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
@@ -56,6 +56,7 @@ class Task:
     inputs: dict[str, dict[str, Any]] = field(repr=False)  # by capability
     truth_image: Image | None = field(default=None, repr=False)
     truth_variance: Image | None = field(default=None, repr=False)
+    truth_twin: Image | None = field(default=None, repr=False)  # of many times the samples, where the suite has one
     truth_maps: Intrinsics | None = field(default=None, repr=False)
     quantity: str = "relit"
 
@@ -86,7 +87,7 @@ def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
     if limit is None or limit >= len(scenes):
         return scenes
     if limit < 1:
-        raise UnirenderError(f"limit: got {limit}, expected at least 1 scene")
+        raise UsageError(f"limit: got {limit}, expected at least 1 scene")
     return [scenes[i] for i in np.linspace(0, len(scenes) - 1, limit).round().astype(int)]
 
 
@@ -125,6 +126,7 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             inputs={"edit": {**seen, **change}},
             truth_image=suite.image(scene, target),
             truth_variance=suite.image_variance(scene, target),
+            truth_twin=suite.ceiling_image(scene, target),
             quantity=edit_quantity(base, target),
         )
 
@@ -145,6 +147,7 @@ def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             inputs={"render": {"intrinsics": maps}},
             truth_image=suite.image(scene, target),
             truth_variance=suite.image_variance(scene, target),
+            truth_twin=suite.ceiling_image(scene, target),
             quantity=edit_quantity(suite.spec.base, target),
         )
 
@@ -186,6 +189,7 @@ def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         inputs={"relight": {**seen, **light}, "decompose": seen},
         truth_image=suite.image(target, base),
         truth_variance=suite.image_variance(target, base),
+        truth_twin=suite.ceiling_image(target, base),
         truth_maps=Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
         if given_sd
         else None,

@@ -4,45 +4,28 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unirender_evaluation.comparisons import Comparison, Selection, compare
-from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
+from unirender_evaluation.metrics import METRICS
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import paired_difference
-
-MASKED = Variant("masked", "srgb", "raw")
-
-
-@dataclass(frozen=True)
-class Claim:
-    """`a` against `b` on one number. `expected`: "beats" is a claim, "stated" only states the distance."""
-
-    table: str
-    protocol: str
-    quantity: str
-    metric: str
-    a: str
-    b: str
-    expected: str = "beats"
-
-    @property
-    def key(self) -> str:
-        return metric_key(self.quantity, METRICS[self.metric], MASKED)
 
 
 @dataclass(frozen=True)
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
-    stated, and where nothing was compared."""
+    stated, for one object, and where nothing was compared, for the reason `why`."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
+    why: str = "not run "
 
     def __str__(self) -> str:
         c = self.claim
         if self.comparison is None:
             what = f"{c.table}/{c.protocol} {c.quantity} {METRICS[c.metric].label}"
-            return f"not run {what}: {c.a} against {c.b}"
+            return f"{self.why}{what}: {c.a} against {c.b}"
         d = self.comparison.difference
         sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = METRICS[c.metric].unit
@@ -53,49 +36,20 @@ class Finding:
         )
 
 
-OURS, ANCHORED = "ours-mean", "ours-mean-anchored"
-PLAIN_COMPOSITE, ANCHORED_COMPOSITE = "composite-of-ours-mean", "composite-of-ours-mean-anchored"
-CLAIMS: tuple[Claim, ...] = (
-    *(
-        Claim("rendering", "from-image", quantity, "psnr", row, "unedited-input")
-        for row in (OURS, ANCHORED)
-        for quantity in ("edit_metallic", "edit_roughness")
-    ),
-    *(
-        Claim("rendering", "from-image", quantity, "psnr", a, b, "stated")
-        for a, b in ((OURS, PLAIN_COMPOSITE), (ANCHORED, ANCHORED_COMPOSITE))
-        for quantity in ("edit_metallic", "edit_roughness")
-    ),
-    *(
-        Claim("rendering", protocol, quantity, "psnr", OURS, "composite", "stated")
-        for protocol in ("given", "given-light")
-        for quantity in ("edit_metallic", "edit_roughness")
-    ),
-    Claim("inverse", "single-image", "albedo", "psnr", OURS, "input-as-albedo"),
-    Claim("inverse", "single-image", "albedo", "psnr", OURS, "mean-albedo"),
-    Claim("inverse", "single-image", "normal", "cosine", OURS, "mean-normal"),
-    Claim("inverse", "single-image", "normal", "cosine", OURS, "sphere-normal"),
-    Claim("inverse", "single-image", "metallic", "mse", OURS, "constant-0-5"),
-    Claim("inverse", "single-image", "roughness", "mse", OURS, "constant-0-5"),
-    *(
-        Claim("relighting", protocol, "relit", "psnr", row, "unedited-input")
-        for protocol in ("from-image-sd", "from-image-hdri")
-        for row in (OURS, ANCHORED)
-    ),
-)
-
-
-def findings(records: Sequence[Record], claims: Sequence[Claim] = CLAIMS) -> list[Finding]:
-    """Every claim; without a comparison where one of its two rows is not in the records."""
+def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) -> list[Finding]:
+    """Every claim; without a comparison where its two rows share no sample, or where they are not to be compared: a
+    picture that is the truth to the bit has an infinite PSNR."""
     found = []
     for claim in claims:
         chosen = Selection(claim.table, claim.protocol).of(records)
-        present = {record.method for record in chosen if claim.key in record.values}
-        if {claim.a, claim.b} <= present:
+        a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
+        common = a.keys() & b.keys()
+        if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
             comparison = compare(chosen, METRICS[claim.metric], claim.key, claim.a, claim.b)
-            found.append(Finding(claim, comparison, comparison.a_beats_b if claim.expected == "beats" else None))
+            claimed = claim.expected == "beats" and comparison.decided
+            found.append(Finding(claim, comparison, comparison.a_beats_b if claimed else None))
         else:
-            found.append(Finding(claim, None, None))
+            found.append(Finding(claim, None, None, "infinite PSNR, not compared " if common else "not run "))
     return found
 
 
@@ -119,7 +73,9 @@ class CeilingBreach:
 def ceiling_breaches(
     records: Sequence[Record], ceiling: str = "noise-ceiling", exempt: Sequence[str] = ()
 ) -> list[CeilingBreach]:
-    """Rows whose paired interval against the noise ceiling lies above 0; empty in a sound benchmark.
+    """Rows whose paired PSNR interval against the noise ceiling lies above 0; empty in a sound benchmark.
+
+    (The ceilings of SSIM and LPIPS are scores of a picture with a little noise of its own: a good row may pass them.)
 
     An infinite score against a finite ceiling has no interval and is a breach by itself. Samples whose truth has no
     noise have an infinite ceiling, which nothing breaches.
@@ -129,7 +85,7 @@ def ceiling_breaches(
         chosen = Selection(table, protocol).of(records)
         clusters = {r.sample: r.object for r in chosen}
         bound = [r for r in chosen if r.method == ceiling]
-        for key in sorted({key for r in bound for key in r.values}):
+        for key in sorted({key for r in bound for key in r.values if ".psnr" in key}):
             limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
             for method in sorted({r.method for r in chosen} - {ceiling, *exempt}):
                 rows = (r for r in chosen if r.method == method and key in r.values and r.sample in limit)
@@ -146,7 +102,7 @@ def ceiling_breaches(
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     """The verdict section: claims, ceiling, truth check; one line each."""
     lines = [f"Verdict on suite {run.suite} (masked, sRGB, unaligned; paired bootstrap 95 % intervals over objects)"]
-    lines += [f"  {finding}" for finding in findings(records)]
+    lines += [f"  {finding}" for finding in findings(records, run_claims(records, run))]
     breaches = ceiling_breaches(records)
     lines += [f"  FAILS  {breach}" for breach in breaches] or [
         "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
@@ -154,7 +110,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     state = "HOLDS" if check["passed"] else "FAILS"
     lines.append(
         f"  {state}  truth: {check['members']} members rendered again with other seeds agree with the shipped file "
-        f"(check seed {check['seed']}, smallest pass share {check['smallest_pass_share']:.3f}), "
+        f"(check seed {check['seed']}, {check['date']}, smallest pass share {check['smallest_pass_share']:.3f}), "
         f"{check['geometries']} objects' mask, albedo and normal too; "
         f"twins (roughness, albedo, normal off) detected: {check['twin_detected']}"
     )

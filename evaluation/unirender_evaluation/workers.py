@@ -1,6 +1,6 @@
 """Runs a suite's scenes one by one, here or in worker processes that each build the rows for themselves."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -13,6 +13,7 @@ from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite, load_suite
+from unirender_evaluation.versions import Versions
 
 
 @dataclass
@@ -23,7 +24,7 @@ class Run:
         suite: the suite.
         rows: the rows.
         scenes: of the whole run.
-        version: of the code and of what it depends on; part of every content key.
+        versions: of the code and of what it depends on; part of every content key.
         backbones: LPIPS backbones.
         pictures: folder of the gallery's predictions.
     """
@@ -31,19 +32,19 @@ class Run:
     suite: Suite
     rows: Sequence[Row]
     scenes: list[Scene]
-    version: str
+    versions: Versions
     backbones: tuple[str, ...]
     pictures: Path
 
     def jobs(self, scene: Scene) -> Iterator[Job]:
         """Every record that the run wants of one scene."""
 
-        def key_of(what: str, info: MethodInfo) -> str:
-            return content_key(self.suite, scene, what, info.config, self.version)
+        def key_of(what: str, info: MethodInfo, uses: Collection[str]) -> str:
+            return content_key(self.suite, scene, what, info.config, self.versions.of(uses))
 
         keeper = Pictures(self.pictures, self.suite, self.scenes)
-        yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.version, self.backbones, keeper)
-        yield from ceiling_jobs(self.suite, scene, key_of)
+        yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.versions, self.backbones, keeper)
+        yield from ceiling_jobs(self.suite, scene, key_of, self.backbones)
         if scene in physics_scenes(self.suite, self.scenes):
             yield from physics_jobs(self.suite, scene, self.rows, key_of)
 
@@ -55,7 +56,7 @@ def _start(
     build: Callable[[], Sequence[Row]],
     suite: Path,
     scenes: list[str],
-    version: str,
+    versions: Versions,
     backbones: tuple[str, ...],
     pictures: Path,
     known: frozenset[str],
@@ -65,7 +66,7 @@ def _start(
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
     loaded = load_suite(suite)
-    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], version, backbones, pictures)
+    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures)
     _here = run, known
 
 
@@ -83,7 +84,7 @@ def run_in_workers(
         build,
         run.suite.spec.path,
         [scene.key for scene in run.scenes],
-        run.version,
+        run.versions,
         run.backbones,
         run.pictures,
         known,

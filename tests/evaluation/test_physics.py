@@ -8,6 +8,7 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender.intrinsics import Intrinsics
+from unirender.symmetries import quarter_turn
 from unirender_evaluation import physics
 from unirender_evaluation.methods import Composite
 from unirender_evaluation.suites import Suite
@@ -62,12 +63,12 @@ def test_quarter_turn_is_a_symmetry_of_the_world(suite: Suite) -> None:
     maps = suite.intrinsics(suite.scenes[1], suite.spec.base).replace(specular=None, diffuse=None)
     error = physics.roll(PERFECT, maps)
     assert error < 0.03  # the environment is resampled
-    turned = physics.quarter_turn(maps)
+    turned = physics.changed(maps, quarter_turn)
     wrong = turned.replace(environment=maps.environment)
     assert physics.relative_error(PERFECT(wrong), np.rot90(PERFECT(maps))) > 3 * error
     four = maps
     for _ in range(4):
-        four = physics.quarter_turn(four)
+        four = physics.changed(four, quarter_turn)
     np.testing.assert_allclose(four.require("normal")["normal"], maps.require("normal")["normal"], rtol=0, atol=1e-5)
 
 

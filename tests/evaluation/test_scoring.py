@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from unirender.color import image_srgb
+from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
 from unirender_evaluation.metrics import SCALES
-from unirender_evaluation.scoring import mask_source, over_white, score_image, score_maps, unpremultiply
+from unirender_evaluation.scoring import mask_source, over_white, score_image, score_maps
 
 SIZE = 32
 

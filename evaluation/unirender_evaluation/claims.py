@@ -1,0 +1,108 @@
+"""What a run claims: which row is expected to beat which, and whose distance is only stated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.records import Record, RunInfo
+
+MASKED = Variant("masked", "srgb", "raw")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """`a` against `b` on one number. `expected`: "beats" is a claim, "stated" only states the distance."""
+
+    table: str
+    protocol: str
+    quantity: str
+    metric: str
+    a: str
+    b: str
+    expected: str = "beats"
+
+    @property
+    def key(self) -> str:
+        return metric_key(self.quantity, METRICS[self.metric], MASKED)
+
+
+EDITS = ("edit_metallic", "edit_roughness")
+GIVEN = ("given", "given-light")
+LIT = ("from-image-sd", "from-image-hdri")
+OURS, ANCHORED = "ours-mean", "ours-mean-anchored"
+PLAIN_COMPOSITE, ANCHORED_COMPOSITE = "composite-of-ours-mean", "composite-of-ours-mean-anchored"
+COMPOSITE, SPLIT_SUM, CEILING = "composite", "composite-split-sum", "noise-ceiling"
+
+
+def edit_claims(row: str) -> tuple[Claim, ...]:
+    """Material edits against the unedited picture."""
+    return tuple(Claim("rendering", "from-image", quantity, "psnr", row, "unedited-input") for quantity in EDITS)
+
+
+def given_claims(row: str, against: Sequence[str] = (COMPOSITE, SPLIT_SUM)) -> tuple[Claim, ...]:
+    """Renderings of true maps: the distance to closed forms."""
+    return tuple(
+        Claim("rendering", protocol, quantity, "psnr", row, other, "stated")
+        for other in against
+        for protocol in GIVEN
+        for quantity in EDITS
+    )
+
+
+def inverse_claims(row: str) -> tuple[Claim, ...]:
+    """Decompositions against the trivial ones."""
+    bars = (
+        ("albedo", "psnr", "input-as-albedo"),
+        ("albedo", "psnr", "mean-albedo"),
+        ("normal", "cosine", "mean-normal"),
+        ("normal", "cosine", "sphere-normal"),
+        ("metallic", "mse", "constant-0-5"),
+        ("roughness", "mse", "constant-0-5"),
+    )
+    return tuple(Claim("inverse", "single-image", quantity, metric, row, bar) for quantity, metric, bar in bars)
+
+
+def relight_claims(row: str, protocol: str) -> tuple[Claim, ...]:
+    """Relighting against the picture as it was."""
+    return (Claim("relighting", protocol, "relit", "psnr", row, "unedited-input"),)
+
+
+def ceiling_claims(row: str) -> tuple[Claim, ...]:
+    """The distance to what a noise-free prediction would score."""
+    asked = [("rendering", protocol, quantity) for protocol in ("from-image", *GIVEN) for quantity in EDITS]
+    asked += [("relighting", protocol, "relit") for protocol in LIT]
+    asked += [("relighting", LIT[0], quantity) for quantity in ("specular", "diffuse")]
+    return tuple(
+        Claim(table, protocol, quantity, "psnr", row, CEILING, "stated") for table, protocol, quantity in asked
+    )
+
+
+OUR_CLAIMS: tuple[Claim, ...] = (
+    *edit_claims(OURS),
+    *edit_claims(ANCHORED),
+    *(
+        Claim("rendering", "from-image", quantity, "psnr", a, b, "stated")
+        for a, b in ((OURS, PLAIN_COMPOSITE), (ANCHORED, ANCHORED_COMPOSITE))
+        for quantity in EDITS
+    ),
+    *given_claims(OURS),
+    *inverse_claims(OURS),
+    *(claim for protocol in LIT for row in (OURS, ANCHORED) for claim in relight_claims(row, protocol)),
+)
+
+
+def stranger_claims(row: str) -> tuple[Claim, ...]:
+    """What is asked of somebody else's row: to beat every trivial row; its distance to closed forms and ceiling."""
+    relighting = (claim for protocol in LIT for claim in relight_claims(row, protocol))
+    return (*edit_claims(row), *given_claims(row), *inverse_claims(row), *relighting, *ceiling_claims(row))
+
+
+def run_claims(records: Sequence[Record], run: RunInfo) -> list[Claim]:
+    """The claims of a run: ours where our rows ran; the closed forms' distance; of strangers' rows those on the tables
+    that they have answers for."""
+    ours = any(info.kind == "ours" for info in run.methods)
+    claims = list(OUR_CLAIMS) if ours else []
+    present = {(r.table, r.protocol, r.method, key) for r in records for key in r.values}
+    others = [c for info in run.methods if info.kind == "external" for c in stranger_claims(info.key)]
+    optional = [*given_claims(SPLIT_SUM, (COMPOSITE,)), *others]
+    return claims + [c for c in optional if (c.table, c.protocol, c.a, c.key) in present]

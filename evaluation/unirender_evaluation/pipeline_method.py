@@ -1,0 +1,137 @@
+"""Our model as a benchmark method, and what identifies its checkpoint."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.methods import Image, Mask
+
+
+class PipelineMethod:
+    """Our model as a benchmark method.
+
+    Args:
+        pipeline: a `UniRenderPipeline`.
+        name: of the row.
+        mode: "mean" (one step) or "sample".
+        anchored: edits and relighting carry over what the decomposition could not explain.
+        steps: denoising steps of "sample".
+        samples: averaged per prediction in "sample".
+        seed: of the generator; every call starts from it.
+        weights: sha256 of the checkpoint.
+        decompositions: shared with another row of the same pipeline and mode.
+        closed: albedo, s and d are changed so that their rendering is the picture.
+        device: where the pipeline runs: another one rounds otherwise.
+    """
+
+    def __init__(
+        self,
+        pipeline: Any,
+        name: str,
+        mode: str,
+        anchored: bool,
+        steps: int,
+        samples: int,
+        seed: int,
+        weights: str,
+        decompositions: dict[str, Any] | None = None,
+        closed: bool = True,
+        device: str = "cpu",
+    ) -> None:
+        self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
+        self.closed, self.device = closed, device
+        self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
+        self._decompositions: dict[str, Any] = {} if decompositions is None else decompositions
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {
+            "pipeline": "unirender",
+            "weights": self.weights,
+            "mode": self.mode,
+            "anchored": self.anchored,
+            "closed": self.closed,
+            "steps": self.steps,
+            "samples": self.samples,
+            "seed": self.seed,
+            "device": self.device,
+        }
+
+    def _options(self) -> dict[str, Any]:
+        import torch
+
+        if self.mode == "mean":
+            return {"mode": "mean"}
+        generator = torch.Generator().manual_seed(self.seed)
+        return {
+            "mode": self.mode,
+            "num_inference_steps": self.steps,
+            "num_samples": self.samples,
+            "generator": generator,
+        }
+
+    def _decomposition(self, image_srgb: Image, mask: Mask, camera: Camera) -> Any:
+        """Of a picture, computed once: the rows that share it differ in what they do with it."""
+        key = hashlib.sha256(image_srgb.tobytes() + mask.tobytes() + repr(camera).encode()).hexdigest()
+        if key not in self._decompositions:
+            options = {**self._options(), "closed": self.closed}
+            made = self.pipeline.decompose(image_srgb, mask=mask, camera=camera, **options)
+            self._decompositions[key] = made
+        return self._decompositions[key]
+
+    def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
+        return self._decomposition(image_srgb, mask, camera).intrinsics
+
+    def edit(self, image_srgb: Image, mask: Mask, camera: Camera, **material: float) -> Image:
+        found = self._decomposition(image_srgb, mask, camera)
+        options = {**self._options(), "anchored": self.anchored, "decomposition": found, **material}
+        return self.pipeline.edit(image_srgb, mask=mask, camera=camera, **options).image_linear
+
+    def relight(
+        self,
+        image_srgb: Image,
+        mask: Mask,
+        camera: Camera,
+        environment: Any = None,
+        specular: Any = None,
+        diffuse: Any = None,
+    ) -> Image:
+        found = self._decomposition(image_srgb, mask, camera)
+        options = {**self._options(), "anchored": self.anchored, "decomposition": found, "exposure": "keep"}
+        light = {"specular": specular, "diffuse": diffuse}
+        return self.pipeline.relight(image_srgb, environment, mask=mask, camera=camera, **light, **options).image_linear
+
+    def render(self, intrinsics: Intrinsics) -> Image:
+        return self.pipeline.render(intrinsics, **self._options())
+
+
+def weights_hash(folder: Path) -> str:
+    """sha256 over the weights and configurations of a checkpoint folder (not over the account of its training).
+
+    Raises:
+        UnirenderError: there are none.
+    """
+    digest = hashlib.sha256()
+    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
+    if not files:
+        raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
+    for path in files:
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+class LazyPipeline:
+    """A pipeline that is loaded when it is first asked something: a run that has nothing to do loads nothing."""
+
+    def __init__(self, load: Callable[[], Any]) -> None:
+        self._load = load
+        self._pipeline: Any = None
+
+    def __getattr__(self, name: str) -> Any:
+        if self._pipeline is None:
+            self._pipeline = self._load()
+        return getattr(self._pipeline, name)

@@ -1,0 +1,142 @@
+"""Other people's methods: installed ones, and those in a file or module that the command line names.
+
+    entry point      group `unirender.methods` of an installed distribution: a row of every run
+    --method SPEC    module:Class, among what is installed or in the current directory; or path/to/file.py:Class
+
+Each names a class, or any callable without arguments that returns a method, or a method itself (see `methods`). The
+current directory and the folder of a file are searched last: a stranger's `copy.py` never stands in for Python's.
+"""
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.methods import CAPABILITIES, capabilities
+
+ENTRY_POINT_GROUP = "unirender.methods"
+FORM = "module:Class or path/to/file.py:Class"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A stranger's method. `source` is the sha256 of the file that defines it: part of the cache key."""
+
+    method: Any
+    source: str
+
+
+def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
+    """Methods of the entry-point group, all or the named ones.
+
+    Raises:
+        UnirenderError: a name is not registered, or cannot be loaded, or what it returns is not a method.
+    """
+    found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)}
+    plugins = []
+    for name in found if names is None else names:
+        if name not in found:
+            raise UnirenderError(
+                f"no method {name!r}: installed are {', '.join(sorted(found)) or 'none'}; register a callable in the "
+                f"entry-point group {ENTRY_POINT_GROUP!r}, name it with --method {FORM}, or score a folder with "
+                f"--predictions {name}=FOLDER"
+            )
+        what = f"plug-in {name!r} ({found[name].value})"
+        plugins.append(_plugin(_attempt(what, "load it", found[name].load), what))
+    return plugins
+
+
+def named_plugin(spec: str) -> Plugin:
+    """The method of one `--method`.
+
+    Raises:
+        UnirenderError: the text has another form, there is no such file, module or name, its import or construction
+            fails, or it is not a method.
+    """
+    place, separator, name = spec.rpartition(":")
+    if not (separator and place and name.isidentifier()):
+        raise UsageError(f"--method {spec}: expected {FORM}")
+    what = f"--method {spec}"
+    is_file = place.endswith(".py") or "/" in place or "\\" in place
+    module = _module_of_file(Path(place), what) if is_file else _module_of_name(place, what)
+    if not hasattr(module, name):
+        defined = [n for n, value in vars(module).items() if any(hasattr(value, c) for c in CAPABILITIES)]
+        raise UnirenderError(
+            f"{what}: {module.__file__ or place} has no {name!r}; with one of {', '.join(CAPABILITIES)} it has "
+            f"{', '.join(defined) or 'nothing'}"
+        )
+    return _plugin(getattr(module, name), what)
+
+
+def _module_of_file(path: Path, what: str) -> ModuleType:
+    path = path.resolve()
+    if not path.is_file():
+        raise UnirenderError(f"{what}: no file {path}, expected {FORM}")
+    name = f"unirender_method_{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise UnirenderError(f"{what}: {path} is no Python file, expected {FORM}")
+    module = importlib.util.module_from_spec(spec)
+    _search_last(path.parent)  # for its neighbours
+    sys.modules[name] = module
+    try:
+        _attempt(what, "import it", lambda: spec.loader.exec_module(module))  # type: ignore[union-attr]  # checked above
+    except UnirenderError:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _module_of_name(name: str, what: str) -> ModuleType:
+    _search_last(Path.cwd())
+    importlib.invalidate_caches()
+    try:
+        return _attempt(what, "import it", lambda: importlib.import_module(name))
+    except UnirenderError as error:
+        missing = error.__cause__
+        if isinstance(missing, ModuleNotFoundError) and missing.name and f"{name}.".startswith(f"{missing.name}."):
+            raise UnirenderError(
+                f"{what}: no module {missing.name!r} in {Path.cwd()} or among the installed ones, expected {FORM}"
+            ) from None
+        raise
+
+
+def _search_last(folder: Path) -> None:
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
+
+
+def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
+    """Runs foreign code; whatever it raises becomes one clear line."""
+    try:
+        return run()
+    except (Exception, SystemExit) as error:
+        raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
+
+
+def _plugin(found: Any, what: str) -> Plugin:
+    """The method that `found` is, or that it returns when it is called."""
+    is_method = not inspect.isclass(found) and any(callable(getattr(found, name, None)) for name in CAPABILITIES)
+    method: Any = found if is_method or not callable(found) else _attempt(what, "construct it", found)
+    try:
+        capabilities(method)
+    except UnirenderError as error:
+        raise UnirenderError(f"{what}: {error}") from None
+    return Plugin(method, _source(type(method)))
+
+
+def _source(defined: type) -> str:
+    try:
+        return hashlib.sha256(Path(inspect.getfile(defined)).read_bytes()).hexdigest()
+    except (OSError, TypeError):
+        return "unknown"  # compiled, or made in an interactive session: its config has to tell versions apart

@@ -1,0 +1,128 @@
+"""Whether a folder of predictions can be scored, found out in full before anything runs: layout, sizes, conventions and
+every file."""
+
+import difflib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender_evaluation.conventions import FILE, Conventions
+from unirender_evaluation.methods import Mask
+from unirender_evaluation.predictions import MAP_FILES, SUFFIXES, PredictionFolder
+from unirender_evaluation.rows import Row
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import PROTOCOLS, tasks
+
+PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
+IGNORED = ("image.png", "meta.json", "environment.exr", "environment.png", "mask.png")  # of `bench export`, `decompose`
+
+
+class PredictionError(UnirenderError):
+    """Folders of predictions that cannot be scored; `problems` has a line for each reason."""
+
+    def __init__(self, problems: list[str]) -> None:
+        count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        super().__init__("\n".join([f"predictions: {count}, nothing was run", *problems]))
+        self.problems = tuple(problems)
+
+
+@dataclass
+class Question:
+    """What a suite asks of one picture: the answers' names, and whether maps are among them."""
+
+    mask: Mask
+    camera: Camera
+    answers: set[str] = field(default_factory=set)
+    maps: bool = False
+
+    @property
+    def files(self) -> str:
+        """The names that a file may have."""
+        names = [f"{name}.exr|png" for name in sorted(self.answers)]
+        return ", ".join([*names, *(MAP_FILES if self.maps else ())])
+
+
+def check_predictions(rows: Iterable[Row], suite: Suite) -> None:
+    """Reads every file of the rows that are folders.
+
+    Raises:
+        PredictionError: there is a problem; all of them at once.
+    """
+    folders = [row.predictions for row in rows if row.predictions is not None]
+    asked = questions(suite) if folders else {}
+    problems = [problem for folder in folders for problem in folder_problems(folder, asked, suite.spec.name)]
+    if problems:
+        raise PredictionError(problems)
+
+
+def questions(suite: Suite) -> dict[str, Question]:
+    """What the suite asks, by the name of the picture's folder."""
+    asked: dict[str, Question] = {}
+    for table, protocol in PROTOCOLS:
+        for task in tasks(suite, table, protocol, list(suite.scenes)):
+            question = asked.setdefault(task.folder, Question(task.mask, suite.spec.camera))
+            if task.answer != "intrinsics":
+                question.answers.add(task.answer)
+            question.maps |= "decompose" in task.asks
+    return asked
+
+
+def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], suite: str) -> list[str]:
+    """All that is wrong with one folder, a line each."""
+    found: list[str] = []
+    try:
+        _ = predictions.conventions
+    except UnirenderError as error:
+        found += str(error).splitlines()
+        predictions = PredictionFolder(predictions.folder, Conventions())  # and on to the files
+    answered = 0
+    for path in _visible(predictions.folder):
+        if path.is_dir() and path.name in asked:
+            files = list(_visible(path))
+            found += _layout_problems(path, files, asked[path.name])
+            readable = [file for file in files if _is_answer(file, asked[path.name])]
+            answered += len(readable)
+            found += [problem for file in readable for problem in _file_problems(predictions, file, asked[path.name])]
+        elif path.is_dir():
+            close = difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
+            found.append(f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}")
+        elif path.name != FILE and path.suffix.lower() in PICTURE_LIKE:
+            found.append(f"{path}: lies outside the pictures' folders, expected <picture>/<answer>")
+    if not answered and not found:
+        found.append(f"{predictions.folder}: no file answers any question of the suite {suite!r}")
+    return found
+
+
+def _visible(folder: Path) -> Iterator[Path]:
+    return (path for path in sorted(folder.iterdir()) if not path.name.startswith("."))
+
+
+def _is_answer(path: Path, question: Question) -> bool:
+    if not path.is_file() or path.suffix not in SUFFIXES:
+        return False
+    return path.stem in question.answers or (question.maps and path.name in MAP_FILES)
+
+
+def _layout_problems(folder: Path, files: list[Path], question: Question) -> Iterator[str]:
+    for path in files:
+        expected = _is_answer(path, question) or path.name in IGNORED
+        if path.is_dir() and path.name not in question.answers:
+            yield f"{path}: an unknown folder, expected files {question.files}"
+        elif path.is_file() and not expected and path.suffix.lower() in PICTURE_LIKE:
+            yield f"{path}: answers no question about this picture, expected {question.files}"
+    names = {path.name for path in files}
+    for answer in sorted(question.answers):
+        if {f"{answer}{suffix}" for suffix in SUFFIXES} <= names:
+            yield f"{folder}: {answer} is there as EXR and as PNG, expected one of them"
+
+
+def _file_problems(predictions: PredictionFolder, path: Path, question: Question) -> Iterator[str]:
+    try:
+        if path.stem in question.answers:
+            predictions.read_picture(path, question.mask)
+        else:
+            predictions.read_maps(path, question.mask, question.camera)
+    except UnirenderError as error:
+        yield str(error).removeprefix("predictions: ")

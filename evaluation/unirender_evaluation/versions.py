@@ -1,0 +1,151 @@
+"""What results depend on besides the suite and the method: the code, libraries and data of each part, as hashes.
+
+Every content key holds the version of the *core* (shared vocabulary and scorer) and of those other parts that its row
+uses, so that a change of the network's code leaves the composite's records valid, and one of a report nobody's.
+
+    core        shared vocabulary, tasks, methods, metrics
+    lpips       the backbones' weights, by content: every row whose pictures are scored
+    model       the network, its diffusion and pipeline: our rows, and plug-ins, which may call them
+    reference   Mitsuba, the generators of shapes and the lights with their data: every row that renders
+"""
+
+import hashlib
+import importlib.metadata
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from importlib.util import find_spec
+from pathlib import Path
+
+from unirender.errors import UnirenderError
+
+MODEL, REFERENCE, LPIPS = "model", "reference", "lpips"
+SEPARATOR = "/"  # between the core's version and those of the other parts
+
+
+@dataclass(frozen=True)
+class Part:
+    """What makes up a part.
+
+    Attributes:
+        files: package -> patterns below its folder.
+        libraries: distributions.
+        without: `package/path` (patterns) of files that results do not depend on.
+        variables: of the environment.
+    """
+
+    files: Mapping[str, tuple[str, ...]]
+    libraries: tuple[str, ...]
+    without: tuple[str, ...] = ()
+    variables: tuple[str, ...] = ()
+
+
+# Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
+# the records anew at the end of every run.
+COMMANDS = ("benchmark", "commands", "export", "lpips_convert", "prediction_check", "truth", "validation", "workers")
+FROM_RECORDS = ("claims", "comparisons", "protocol", "published", "readme", "statistics", "table*", "verdict")
+PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
+PARTS: Mapping[str, Part] = {
+    "core": Part(
+        {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
+        ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR"),
+        (
+            *(f"unirender/{name}.py" for name in ("cli", "commands", "options")),
+            *(f"unirender_evaluation/{name}.py" for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, "versions")),
+        ),
+    ),
+    MODEL: Part({"unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py")}, ("torch", "diffusers")),
+    REFERENCE: Part(
+        {"unirender_reference": ("**/*.py", "data/**/*.*")},
+        ("mitsuba", "drjit", "karellen-llvm-core"),
+        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in ("dataset", "plan", "shards"))),
+        ("UNIRENDER_MITSUBA_VARIANT",),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Versions:
+    """The version of every part: `parts` by the names above."""
+
+    core: str
+    parts: Mapping[str, str] = field(default_factory=dict)
+
+    def of(self, uses: Collection[str] = ()) -> str:
+        """The version of the core and of the parts that a record uses: what stands in its content key."""
+        return SEPARATOR.join([self.core, *(f"{name} {self.parts[name]}" for name in sorted(uses))])
+
+    @property
+    def code(self) -> str:
+        """One hash over all parts: what the protocol line prints."""
+        return hashlib.sha256(self.of(self.parts).encode()).hexdigest()
+
+
+def versions(backbones: Sequence[str] = ()) -> Versions:
+    """The versions of what is installed here.
+
+    Args:
+        backbones: LPIPS backbones whose values are computed.
+
+    Raises:
+        UnirenderError: a package or the weights of a backbone are not there.
+    """
+    hashes = {name: part_version(part, {p: package_folder(p) for p in part.files}) for name, part in PARTS.items()}
+    return Versions(hashes.pop("core"), {**hashes, LPIPS: lpips_version(backbones)})
+
+
+def part_version(part: Part, folders: Mapping[str, Path]) -> str:
+    """sha256 over a part's files, by name and content, its libraries' versions and its variables.
+
+    Args:
+        part: the part.
+        folders: of its packages.
+    """
+    digest = hashlib.sha256()
+    for package, patterns in part.files.items():
+        root = folders[package]
+        for path in sorted({p for pattern in patterns for p in root.glob(pattern) if p.is_file()}):
+            name = f"{package}/{path.relative_to(root).as_posix()}"
+            if "__pycache__" not in path.parts and not any(fnmatch(name, pattern) for pattern in part.without):
+                digest.update(name.encode() + hashlib.sha256(path.read_bytes()).digest())
+    for library in part.libraries:
+        digest.update(f"{library} {installed_version(library)}".encode())
+    for variable in part.variables:
+        digest.update(f"{variable} {os.environ.get(variable, '')}".encode())
+    return digest.hexdigest()
+
+
+def lpips_version(backbones: Sequence[str]) -> str:
+    """sha256 over the weights of the backbones and what computes with them."""
+    from unirender_evaluation.lpips import weights_path
+
+    digest = hashlib.sha256(f"torch {installed_version('torch')}".encode())
+    for name in backbones:
+        path = weights_path(name)  # type: ignore[arg-type]  # the name of a backbone
+        try:
+            weights = path.read_bytes()
+        except OSError as error:
+            raise UnirenderError(f"LPIPS-{name}: {path} cannot be read ({error.strerror}), expected weights") from error
+        digest.update(name.encode() + hashlib.sha256(weights).digest())
+    return digest.hexdigest()
+
+
+def package_folder(package: str) -> Path:
+    """Where an installed package is.
+
+    Raises:
+        UnirenderError: it is not installed.
+    """
+    found = find_spec(package)
+    if found is None or not found.submodule_search_locations:
+        raise UnirenderError(f"package {package!r} is not installed: `pip install -e .`")
+    return Path(found.submodule_search_locations[0])
+
+
+def installed_version(distribution: str) -> str:
+    """The version of an installed distribution, or "not installed"."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,136 @@
+"""`bench run`: which rows a configuration asks for, what stops it, and a whole run with Mitsuba, twice."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+from tiny_suites import make_suite
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import engine
+from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.commands import BenchRun
+from unirender_evaluation.prediction_check import PredictionError
+from unirender_evaluation.rows import make_row, trivial_rows
+from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.tasks import scene_ids, tasks
+from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.verdict import ceiling_breaches
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("bench_run"), objects=1)
+
+
+def test_row_groups_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="expected some of ours, trivial, plugins"):
+        build_rows(BenchConfig(methods=("everything",)))
+    with pytest.raises(UnirenderError, match="no checkpoint in"):
+        build_rows(BenchConfig(methods=("ours",), checkpoint=tmp_path))
+
+
+def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:
+    """A row without what it has to beat says nothing."""
+    (tmp_path / "guess.py").write_text(GUESS)
+    rows = build_rows(BenchConfig(methods=(), method=(f"{tmp_path / 'guess.py'}:Guess",)))
+    assert {row.info.key for row in trivial_rows()} | {"guess"} == {row.info.key for row in rows}
+    assert build_rows(BenchConfig(methods=())) == []
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("raise RuntimeError('out of memory')", r"method 'wild', render \(x\): RuntimeError: out of memory"),
+        ("return intrinsics", r"got object of shape \(\), expected finite linear radiance"),
+        ("return intrinsics.albedo[..., 0]", r"expected finite linear radiance, floats \(h, w, 3\)"),
+        ("return intrinsics.albedo / 0", r"expected finite linear radiance"),
+    ],
+)
+def test_what_a_strangers_method_does_wrong_is_named(body: str, message: str) -> None:
+    scope: dict[str, Any] = {}
+    exec(f"class Wild:\n    name, config = 'wild', {{}}\n    def render(self, intrinsics):\n        {body}", scope)
+    maps = Intrinsics(albedo=np.full((2, 2, 3), 0.5, np.float32))
+    with np.errstate(divide="ignore"), pytest.raises(UnirenderError, match=message):
+        engine.ask(make_row(scope["Wild"](), "external"), "render", "x", intrinsics=maps)
+
+
+def test_nothing_runs_before_all_predictions_are_sound(suite: Suite, tmp_path: Path) -> None:
+    task = next(tasks(suite, "rendering", "given", list(suite.scenes)))
+    for name in ("good", "bad"):
+        (tmp_path / name / task.folder).mkdir(parents=True)
+        (tmp_path / name / task.folder / "render_given.png").write_text("no picture")
+    out = tmp_path / "out"
+    config = BenchConfig(
+        suite=str(suite.spec.path), out=out, methods=(), predictions={n: tmp_path / n for n in ("good", "bad")}
+    )
+    with pytest.raises(PredictionError) as error:
+        run(config, Console(quiet=True))
+    assert len(error.value.problems) == 2
+    assert not out.exists()
+    command = BenchRun(suite=str(suite.spec.path), out=out, methods=(), predictions=(f"bad={tmp_path / 'bad'}",))
+    assert command.run() == 1
+    assert not out.exists()
+
+
+GUESS = """
+import numpy as np
+from unirender import Intrinsics
+
+
+class Guess:
+    name = "guess"
+    config = {}
+
+    def decompose(self, image_srgb, mask, camera):
+        grey = np.full_like(image_srgb, 0.5) * mask
+        return Intrinsics(albedo=grey, roughness=grey[..., :1], metallic=grey[..., :1], mask=mask, camera=camera)
+
+    def edit(self, image_srgb, mask, camera, roughness=None, metallic=None):
+        return 0.5 * image_srgb * mask
+"""
+
+
+@pytest.mark.slow
+def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two scenes of the shipped suite, no row of ours, a stranger's; Mitsuba's truth check; the second run computes
+    nothing."""
+    (tmp_path / "guess.py").write_text(GUESS)
+    out = tmp_path / "run"
+    tiny = load_suite("tiny")
+    scenes = scene_ids(tiny, 2)
+    config = BenchConfig(
+        out=out,
+        methods=("trivial",),
+        method=(f"{tmp_path / 'guess.py'}:Guess",),
+        limit=2,
+        check_scenes=1,
+        check_seed=next(seed for seed in range(1000) if chosen_scenes(tiny, 1, seed)[0] in scenes),
+        jobs=0,
+    )
+    first = run(config, Console(quiet=True))
+    assert first.truth_check["passed"], first.truth_check
+    assert first.computed == len(first.records) > 0
+    names = {"records.jsonl", "run.json", "truth_check.json", "tables.md", "tables.tex", "tables.json", "verdict.txt"}
+    assert names | {"report.html"} <= {path.name for path in out.iterdir()}
+    assert "limit 2" in (out / "tables.md").read_text()
+    assert all(table.watermark for table in first.tables)
+    assert not ceiling_breaches(first.records)
+    methods = {record.method for record in first.records}
+    bounds = {"noise-ceiling", "reference-other-seed", "shade-true-maps", "true-maps"}
+    assert bounds | {"composite", "composite-split-sum", "guess"} <= methods
+    assert all(record.sample.startswith(tuple(scene.key for scene in scenes)) for record in first.records), (
+        "every row keeps to the run's scenes"
+    )
+    assert "rendering/from-image edit_metallic PSNR: guess" in first.verdict
+    assert "against noise-ceiling" not in first.verdict
+    assert "noise-ceiling, difference" in first.verdict
+    assert "ours" not in first.verdict
+    second = run(config, Console())
+    assert f"check seed {first.truth_check['seed']}" in " ".join(capsys.readouterr().out.split())
+    assert second.computed == 0
+    assert [r.to_json() for r in second.records] == [r.to_json() for r in first.records]
+    assert second.verdict == first.verdict

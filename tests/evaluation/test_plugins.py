@@ -1,0 +1,120 @@
+"""Methods that are not installed: found by file or by module, and every way in which that can fail, named."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.plugins import installed_plugins, named_plugin
+from unirender_evaluation.rows import plugin_rows
+
+SOURCE = """
+from helper_of_the_method import SHADE
+
+
+class Grey:
+    name = "grey"
+    config = {"shade": SHADE}
+
+    def render(self, intrinsics):
+        return SHADE * intrinsics.albedo * intrinsics.mask
+
+
+class Empty:
+    name = "empty"
+    config = {}
+
+
+class Broken(Grey):
+    def __init__(self):
+        raise RuntimeError("no weights")
+
+
+class Unwritable(Grey):
+    config = {"weights": object()}
+
+
+def make():
+    return Grey()
+
+
+instance = Grey()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(sys, "path", list(sys.path))  # which plug-ins add to
+    (tmp_path / "my_method.py").write_text(SOURCE)
+    (tmp_path / "helper_of_the_method.py").write_text("SHADE = 0.5\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["Grey", "make", "instance"])
+def test_a_file_with_its_neighbours(folder: Path, name: str) -> None:
+    plugin = named_plugin(f"{folder / 'my_method.py'}:{name}")
+    assert plugin.method.name == "grey"
+    assert len(plugin.source) == 64
+
+
+def test_a_module_of_the_current_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "module_in_the_current_directory.py").write_text(SOURCE)
+    row = plugin_rows([named_plugin("module_in_the_current_directory:Grey")])[0]
+    assert (row.info.key, row.info.kind) == ("grey", "external")
+
+
+def test_an_edited_file_is_another_configuration(folder: Path) -> None:
+    """Records of a method whose source has changed are stale, whatever its config says."""
+    (folder / "copy.py").write_text(f"{SOURCE}\n# edited\n")
+    rows = plugin_rows([named_plugin(f"{folder / name}:Grey") for name in ("my_method.py", "copy.py")])
+    assert rows[0].info.config != rows[1].info.config
+    assert rows[0].info.config["shade"] == rows[1].info.config["shade"] == 0.5
+
+
+def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
+    """Worker processes start with this search path: a file named like one of Python's own must not break them."""
+    (folder / "copy.py").write_text("raise RuntimeError('not this one')\n")
+    named_plugin(f"{folder / 'my_method.py'}:Grey")
+    code = f"import sys; sys.path = {sys.path!r}; import copy, helper_of_the_method; copy.deepcopy([])"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    first = f"import sys; sys.path.insert(0, {str(folder)!r}); import copy"
+    assert subprocess.run([sys.executable, "-c", first], check=False, stderr=subprocess.DEVNULL).returncode != 0
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("{folder}/absent.py:Grey", "no file .*absent.py, expected module:Class or path/to/file.py:Class"),
+        ("{folder}/my_method.py:Gray", "has no 'Gray'; with one of decompose, .* it has Grey"),
+        ("{folder}/my_method.py:Empty", "is not a method"),
+        ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
+        ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),
+        ("{folder}/imports.py:Grey", "could not import it: ModuleNotFoundError: No module named 'no_such_package'"),
+        ("no_such_module_here:Grey", "no module 'no_such_module_here' in "),
+        ("json.no_such_part:Grey", "no module 'json.no_such_part' in "),
+    ],
+)
+def test_what_is_wrong_is_named(folder: Path, spec: str, message: str) -> None:
+    (folder / "syntax.py").write_text("class Grey(:\n")
+    (folder / "imports.py").write_text("import no_such_package\n")
+    with pytest.raises(UnirenderError, match=message):
+        named_plugin(spec.format(folder=folder))
+
+
+@pytest.mark.parametrize("spec", ["Grey", "my_method.py", ":Grey", "my_method:", "my_method:a.b"])
+def test_another_form_is_wrong_usage(spec: str) -> None:
+    with pytest.raises(UsageError, match=r"expected module:Class or path/to/file\.py:Class"):
+        named_plugin(spec)
+
+
+def test_a_config_that_is_not_json(folder: Path) -> None:
+    with pytest.raises(UnirenderError, match="method 'grey': its config is not JSON"):
+        plugin_rows([named_plugin(f"{folder / 'my_method.py'}:Unwritable")])
+
+
+def test_an_unknown_entry_point() -> None:
+    with pytest.raises(UnirenderError, match="no method 'nobody'"):
+        installed_plugins(["nobody"])

@@ -1,0 +1,181 @@
+"""Folders of predictions: how their files are read, and that all that is wrong with one is found at once."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_suites import make_suite
+
+from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, intrinsics_channels, write_exr
+from unirender_evaluation import engine
+from unirender_evaluation.conventions import Conventions, read_conventions
+from unirender_evaluation.export import export_inputs
+from unirender_evaluation.prediction_check import PredictionError, check_predictions
+from unirender_evaluation.rows import prediction_rows
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import Task, tasks
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("predictions"), objects=1)
+
+
+def first(suite: Suite, table: str, protocol: str) -> Task:
+    return next(tasks(suite, table, protocol, list(suite.scenes)))
+
+
+def test_png_predictions_and_broken_files(suite: Suite, tmp_path: Path) -> None:
+    task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    folder = tmp_path / "png" / task.folder
+    folder.mkdir(parents=True)
+    truth = suite.intrinsics(task.scene, task.scene.materials[0])
+    levels = np.round((truth.require("normal")["normal"] + 1) / 2 * 255).astype(np.uint8)
+    Image.fromarray(levels).save(folder / "normal.png")
+    Image.fromarray(np.full(task.mask.shape[:2], 51, np.uint8)).save(folder / "roughness.png")
+    row = prediction_rows({"png": tmp_path / "png"})[0]
+    assert row.predictions is not None
+    _, maps = row.predictions.answer(task)
+    assert maps is not None
+    assert set(maps.present) == {"normal", "roughness", "mask"}
+    values = engine.score(task, engine.Prediction(maps=maps), ())
+    assert values["normal.cosine"] > 0.999
+    np.testing.assert_allclose(maps.require("roughness")["roughness"], 0.2, rtol=0, atol=1e-6)
+    Image.fromarray(levels[:16]).save(folder / "albedo.png")
+    with pytest.raises(UnirenderError, match="resample it"):
+        row.predictions.answer(task)
+    (folder / "albedo.png").write_text("no picture")
+    with pytest.raises(UnirenderError, match="not a readable PNG"):
+        row.predictions.answer(task)
+
+
+def answer_all(suite: Suite, folder: Path) -> None:
+    """Right answers to everything about the first scene."""
+    for table, protocol in (("inverse", "single-image"), ("rendering", "given"), ("relighting", "from-image-sd")):
+        for task in tasks(suite, table, protocol, [suite.scenes[0]]):
+            target = folder / task.folder
+            target.mkdir(parents=True, exist_ok=True)
+            if task.truth_maps is not None:
+                write_exr(target / "intrinsics.exr", intrinsics_channels(task.truth_maps))
+            if task.truth_image is not None:
+                write_exr(target / f"{task.answer}.exr", image_channels(task.truth_image))
+
+
+def test_a_sound_folder_passes_with_what_others_leave_in_it(suite: Suite, tmp_path: Path) -> None:
+    """The export's own files, notes and hidden files are nobody's answer."""
+    folder = tmp_path / "mine"
+    export_inputs(suite, folder)
+    answer_all(suite, folder)
+    (folder / "README.txt").write_text("notes")
+    (folder / ".DS_Store").write_text("")
+    (folder / "conventions.toml").write_text('roughness = "perceptual"\n')
+    check_predictions(prediction_rows({"mine": folder}), suite)
+
+
+def test_every_problem_is_listed_at_once(suite: Suite, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    answer_all(suite, folder)
+    inverse, given = first(suite, "inverse", "single-image"), first(suite, "rendering", "given")
+    maps, renders = folder / inverse.folder, folder / given.folder
+    (maps / "albedo.png").write_text("no picture")
+    Image.fromarray(np.zeros((8, 16), np.uint8)).save(maps / "metallic.png")
+    Image.fromarray(np.zeros((32, 32), np.uint8)).save(maps / "roughnes.png")
+    Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(renders / "render_given.png")
+    Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(folder / "stray.png")
+    (folder / "no_such_picture").mkdir()
+    (folder / "conventions.toml").write_text(
+        'roughness = "squared"\nnormals = "opencv"\nnormal_axes = ["x", "y", "y"]\n'
+    )
+    other = tmp_path / "other"
+    (other / given.folder).mkdir(parents=True)
+    (other / given.folder / "render_given.exr").write_bytes(b"no EXR")
+    with pytest.raises(PredictionError) as error:
+        check_predictions(prediction_rows({"mine": folder, "other": other}), suite)
+    for expected in (
+        "conventions.toml: unknown key 'normals', expected some of normal_axes",
+        "conventions.toml: roughness is 'squared', expected 'perceptual' or 'alpha'",
+        "conventions.toml: normal_axes is ['x', 'y', 'y']",
+        "albedo.png is not a readable PNG",
+        "metallic.png: metallic is 16 x 8 pixels, expected 32 x 32",
+        "roughnes.png: answers no question about this picture",
+        "render_given is there as EXR and as PNG",
+        "stray.png: lies outside the pictures' folders",
+        "no_such_picture: the suite 'ball' has no such picture, expected names like ball-0_l0",
+        f"{other / given.folder / 'render_given.exr'}: not a readable OpenEXR file",
+    ):
+        assert sum(expected in problem for problem in error.value.problems) == 1, (expected, error.value.problems)
+    assert len(error.value.problems) == 10
+    assert "10 problems, nothing was run" in str(error.value)
+
+
+def test_values_outside_the_contract_are_problems(suite: Suite, tmp_path: Path) -> None:
+    task = first(suite, "inverse", "single-image")
+    folder = tmp_path / "mine" / task.folder
+    folder.mkdir(parents=True)
+    truth = suite.intrinsics(task.scene, task.scene.materials[0])
+    channels = intrinsics_channels(truth.replace(specular=None, diffuse=None))
+    write_exr(folder / "intrinsics.exr", channels | {"albedo.R": channels["albedo.R"] + 1})
+    with pytest.raises(PredictionError, match=r"intrinsics.exr: albedo: got values in .*expected \[0, 1\]"):
+        check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+    write_exr(folder / "intrinsics.exr", {"albedo.X": channels["albedo.R"]})
+    with pytest.raises(PredictionError, match=r"intrinsics.exr has no map, expected channels like albedo.R"):
+        check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+    (folder / "intrinsics.exr").unlink()
+    with pytest.raises(PredictionError, match="no file answers any question"):
+        check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+
+
+def test_conventions_are_undone(suite: Suite, tmp_path: Path) -> None:
+    """The same truth in OpenCV axes, sRGB EXR, GGX alpha and straight colour scores as the truth; undeclared it does
+    not."""
+    inverse, given = first(suite, "inverse", "single-image"), first(suite, "rendering", "given")
+    truth = suite.intrinsics(inverse.scene, inverse.scene.materials[0]).replace(specular=None, diffuse=None)
+    maps = truth.require("albedo", "normal", "roughness")
+    foreign = intrinsics_channels(truth)
+    foreign |= {f"albedo.{c}": srgb_encode(maps["albedo"])[..., i] for i, c in enumerate("RGB")}
+    foreign |= {f"normal.{c}": maps["normal"][..., i] * (1, -1, -1)[i] for i, c in enumerate("XYZ")}
+    foreign["roughness.Y"] = maps["roughness"][..., 0] ** 2
+    assert given.truth_image is not None
+    straight = srgb_encode(np.where(given.mask > 0, given.truth_image / np.maximum(given.mask, 1e-6), 0))
+    for task, name, channels in (
+        (inverse, "intrinsics.exr", foreign),
+        (given, "render_given.exr", image_channels(straight)),
+    ):
+        (tmp_path / "mine" / task.folder).mkdir(parents=True, exist_ok=True)
+        write_exr(tmp_path / "mine" / task.folder / name, channels, half=False)
+
+    def scores() -> dict[str, float]:
+        row = prediction_rows({"mine": tmp_path / "mine"})[0]
+        answered = [(task, engine.answer(row, task)) for task in (inverse, given)]
+        return {key: value for task, found in answered for key, value in engine.score(task, found, ()).items()}
+
+    wrong = scores()
+    (tmp_path / "mine" / "conventions.toml").write_text(
+        'normal_axes = ["+x", "-y", "-z"]\nexr_colour = "srgb"\nroughness = "alpha"\npremultiplied = false\n'
+    )
+    right = scores()
+    edit = f"{given.quantity}.psnr@masked-srgb-raw"
+    assert right["albedo.psnr@masked-srgb-raw"] > 50 > 20 > wrong["albedo.psnr@masked-srgb-raw"]
+    assert right["normal.cosine"] > 0.999 > 0.5 > wrong["normal.cosine"]
+    assert right["roughness.mse@masked"] < 1e-6 < 1e-4 < wrong["roughness.mse@masked"]
+    assert right[edit] > 50 > 25 > wrong[edit]
+
+
+def test_conventions_are_part_of_the_key(suite: Suite, tmp_path: Path) -> None:
+    answer_all(suite, tmp_path / "mine")
+    before = prediction_rows({"mine": tmp_path / "mine"})[0].config
+    (tmp_path / "mine" / "conventions.toml").write_text("premultiplied = false\n")
+    assert prediction_rows({"mine": tmp_path / "mine"})[0].config != before
+
+
+def test_conventions_are_the_contract_by_default(tmp_path: Path) -> None:
+    assert read_conventions(tmp_path) == Conventions()
+    (tmp_path / "conventions.toml").write_text("premultiplied = 1")
+    with pytest.raises(UnirenderError, match="premultiplied is 1, expected True or False"):
+        read_conventions(tmp_path)
+    (tmp_path / "conventions.toml").write_text("premultiplied = ")
+    with pytest.raises(UnirenderError, match="not a readable TOML file"):
+        read_conventions(tmp_path)

@@ -1,0 +1,106 @@
+"""Claims and verdict: what holds, what fails, what was not run, and what a stranger's row is asked."""
+
+import math
+
+import numpy as np
+
+from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.verdict import findings, verdict_text
+
+CHECK = {
+    "passed": True,
+    "date": "2026-11-21T12:00+00:00",
+    "members": 3,
+    "smallest_pass_share": 0.96,
+    "seed": 7,
+    "geometries": 1,
+    "twin_detected": True,
+    "failed": [],
+    "other_objects": [],
+}
+ALBEDO, RELIT = "albedo.psnr@masked-srgb-raw", "relit.psnr@masked-srgb-raw"
+
+
+def rows(method: str, key: str, values: np.ndarray, table: str = "inverse", protocol: str = "single-image"):
+    """A record a sample, two samples an object."""
+    return [
+        Record(table, protocol, method, f"s{i}", f"o{i // 2}", {key: float(value)}) for i, value in enumerate(values)
+    ]
+
+
+def run_of(**kinds: str) -> RunInfo:
+    return RunInfo("t", "h", 64, tuple(MethodInfo(key, key, kind) for key, kind in kinds.items()))  # type: ignore[arg-type]  # kinds by name
+
+
+def test_verdict_states_claims_and_failures() -> None:
+    def record(method: str, index: int, value: float) -> Record:
+        key = "albedo.psnr@masked-srgb-raw"
+        return Record("inverse", "single-image", method, f"s{index}", f"o{index}", {key: value})
+
+    rng = np.random.default_rng(0)
+    level = rng.uniform(15, 20, 12)
+    records = [record("a", i, x + 2 + rng.uniform(0, 0.5)) for i, x in enumerate(level)]
+    records += [record("b", i, x) for i, x in enumerate(level)]
+    claims = [Claim("inverse", "single-image", "albedo", "psnr", *pair) for pair in (("a", "b"), ("b", "a"))]
+    found = findings(records, [*claims, Claim("inverse", "single-image", "albedo", "psnr", "a", "missing")])
+    assert [f.holds for f in found] == [True, False, None]
+    assert "HOLDS" in str(found[0])
+    assert "FAILS" in str(found[1])
+    check = CHECK | {"passed": False, "failed": ["x: z-test FAILED"], "other_objects": ["x"]}
+    text = verdict_text(records, RunInfo("t", "h", 64, (), limit=2), check)
+    assert "FAILS  truth" in text
+    assert "x: z-test FAILED" in text
+    assert "partial run" in text
+
+
+def test_a_strangers_row_has_claims_of_its_own() -> None:
+    """Against every trivial row on the tables that it has answers for, and against the ceiling; ours are not missed."""
+    rng = np.random.default_rng(1)
+    level = rng.uniform(15, 20, 12)
+    records = [
+        *rows("theirs", ALBEDO, level + 2),
+        *rows("input-as-albedo", ALBEDO, level + rng.uniform(0, 0.5, 12)),
+        *rows("mean-albedo", ALBEDO, level + 4),
+        *rows("theirs", RELIT, level, "relighting", "from-image-sd"),
+        *rows("noise-ceiling", RELIT, level + 20, "relighting", "from-image-sd"),
+    ]
+    run = run_of(
+        theirs="external", **{"input-as-albedo": "trivial", "mean-albedo": "trivial", "noise-ceiling": "ceiling"}
+    )
+    found = {(f.claim.quantity, f.claim.b): f for f in findings(records, run_claims(records, run))}
+    assert {claim.a for claim in run_claims(records, run)} == {"theirs"}
+    assert found["albedo", "input-as-albedo"].holds is True
+    assert found["albedo", "mean-albedo"].holds is False
+    assert found["relit", "unedited-input"].comparison is None
+    ceiling = found["relit", "noise-ceiling"].comparison
+    assert ceiling is not None
+    assert math.isclose(ceiling.difference.mean, -20)
+    assert not {"metallic", "normal", "edit_metallic"} & {quantity for quantity, _ in found}
+    text = verdict_text(records, run, CHECK)
+    assert "HOLDS  inverse/single-image albedo PSNR: theirs beats input-as-albedo" in text
+    assert "FAILS  inverse/single-image albedo PSNR: theirs is beaten by mean-albedo" in text
+    assert "theirs is beaten by noise-ceiling, difference -20" in text
+    assert "ours" not in text
+
+
+def test_our_claims_are_made_where_our_rows_ran() -> None:
+    records = rows("ours-mean", ALBEDO, np.linspace(15, 20, 4))
+    run = run_of(**{"ours-mean": "ours", "theirs": "external"})
+    assert run_claims(records, run) == list(OUR_CLAIMS)
+    assert run_claims(records, run_of(theirs="external")) == []
+
+
+def test_identical_pictures_do_not_end_the_run() -> None:
+    """An infinite PSNR has no interval: said, not raised."""
+    records = [*rows("a", ALBEDO, np.array([20, math.inf])), *rows("b", ALBEDO, np.array([19, math.inf]))]
+    found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
+    assert found[0].comparison is None
+    assert "infinite PSNR, not compared inverse/single-image albedo PSNR: a against b" in str(found[0])
+
+
+def test_one_object_decides_nothing() -> None:
+    records = [*rows("a", ALBEDO, np.array([20, 21])), *rows("b", ALBEDO, np.array([10, 11]))]
+    found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
+    assert found[0].holds is None
+    assert "stated inverse/single-image albedo PSNR: a is not comparable on one object with b" in str(found[0])

@@ -1,0 +1,103 @@
+"""Content keys: each part's version follows its files, its libraries and its data, and nothing else."""
+
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+from unirender.errors import UnirenderError
+from unirender_evaluation import lpips
+from unirender_evaluation.versions import (
+    LPIPS,
+    MODEL,
+    PARTS,
+    REFERENCE,
+    Part,
+    Versions,
+    lpips_version,
+    package_folder,
+    part_version,
+    versions,
+)
+
+PART = Part({"package": ("*.py", "data/**/*.*")}, ("numpy",), ("package/report*.py",), ("UNIRENDER_TEST_VARIABLE",))
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    for name in ("score.py", "report_plots.py", "data/lights/sun.exr", "sub/unlisted.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    return tmp_path
+
+
+def test_a_part_follows_its_files_and_data(package: Path) -> None:
+    before = part_version(PART, {"package": package})
+    assert part_version(PART, {"package": package}) == before
+    for name in ("report_plots.py", "sub/unlisted.py"):
+        (package / name).write_text("changed")
+    assert part_version(PART, {"package": package}) == before
+    seen = {before}
+    for name in ("score.py", "data/lights/sun.exr", "data/new.toml"):
+        (package / name).write_text("changed")
+        seen.add(part_version(PART, {"package": package}))
+    (package / "score.py").rename(package / "scores.py")
+    seen.add(part_version(PART, {"package": package}))
+    assert len(seen) == 5
+
+
+def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = part_version(PART, {"package": package})
+    monkeypatch.setenv("UNIRENDER_TEST_VARIABLE", "cuda")
+    assert part_version(PART, {"package": package}) != before
+
+
+@pytest.mark.parametrize(
+    ("part", "package", "files"),
+    [
+        ("core", "unirender", ("composite.py", "lighting.py", "intrinsics.py", "symmetries.py")),
+        ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "methods.py", "tasks.py", "predictions.py")),
+        (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/sampling.py")),
+        (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
+        (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
+    ],
+)
+def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:
+    root = package_folder(package)
+    covered = {path for pattern in PARTS[part].files[package] for path in root.glob(pattern)}
+    assert {root / name for name in files} <= covered
+    assert not [name for name in files for pattern in PARTS[part].without if fnmatch(f"{package}/{name}", pattern)]
+
+
+def test_a_record_follows_the_parts_that_its_row_uses() -> None:
+    """Another network leaves the composite's records valid; another Mitsuba leaves the network's."""
+    before = Versions("core", {MODEL: "a", REFERENCE: "b", LPIPS: "c"})
+    network = Versions("core", {MODEL: "changed", REFERENCE: "b", LPIPS: "c"})
+    assert network.of({LPIPS}) == before.of({LPIPS})
+    assert network.of({REFERENCE, LPIPS}) == before.of({REFERENCE, LPIPS})
+    assert network.of({MODEL, LPIPS}) != before.of({MODEL, LPIPS})
+    assert Versions("changed", before.parts).of() != before.of()
+    assert len({network.code, before.code, Versions("changed", before.parts).code}) == 3
+
+
+def test_lpips_values_follow_the_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path))
+    alex = lpips_version(("alex",))
+    path = lpips.weights_path("vgg")
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"some weights")
+    both = lpips_version(("alex", "vgg"))
+    path.write_bytes(b"other weights")
+    assert len({alex, both, lpips_version(("alex", "vgg"))}) == 3
+    path.unlink()
+    with pytest.raises(UnirenderError, match="LPIPS-vgg"):
+        lpips_version(("vgg",))
+
+
+def test_versions_of_this_installation() -> None:
+    found = versions(("alex",))
+    assert set(found.parts) == {MODEL, REFERENCE, LPIPS}
+    assert {len(value) for value in (found.core, found.code, *found.parts.values())} == {64}
+    assert found == versions(("alex",))
+    assert found.of({LPIPS}) != versions(()).of({LPIPS})
+    assert found.of() == versions(()).of()
