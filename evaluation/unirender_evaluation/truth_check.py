@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from unirender.errors import UnirenderError
+from unirender.errors import UsageError
 from unirender_evaluation.geometry_check import GeometryTest, compare_geometry, twin_geometry
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_file import diffuse_member, image_member, specular_member
@@ -101,7 +101,7 @@ class TruthCheck:
 def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
     """`count` scenes at random, of different objects as long as there are enough."""
     if count < 1:
-        raise UnirenderError(f"truth check: got {count} scenes, expected at least 1")
+        raise UsageError(f"truth check: got {count} scenes, expected at least 1")
     rng = np.random.default_rng([seed, 0x7E57])
     scenes = [suite.scenes[i] for i in rng.permutation(len(suite.scenes))]
     first = {scene.object: scene for scene in reversed(scenes)}

@@ -93,12 +93,13 @@ def environment_brdf(
         ((1 - fx) * fy, i, j + 1),
         (fx * fy, i + 1, j + 1),
     ]
-    a, b = (sum(weight * table[p, q] for weight, p, q in corners) for table in _environment_brdf_tables())
+    a, b = (sum(weight * table[p, q] for weight, p, q in corners) for table in environment_brdf_tables())
     return np.asarray(a, np.float32), np.asarray(b, np.float32)
 
 
 @functools.cache
-def _environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
+def environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
+    """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1; integrated at the first call."""
     n_v = np.maximum(np.linspace(0, 1, COSINES), GRAZING)
     alpha = np.maximum(np.square(np.linspace(0, 1, ROUGHNESSES)), MIN_ALPHA)
     cells = [[_integrate_lobe(float(c), float(r)) for r in alpha] for c in n_v]

@@ -22,7 +22,7 @@ MODEL = ModelConfig(
     attention_head_dim=16,
     cross_attention_dim=8,
     norm_num_groups=8,
-    physics_prior=True,
+    physics_prior="split_sum",
 )
 TRAIN = TrainConfig(
     model=MODEL,

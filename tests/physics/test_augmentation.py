@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from unirender.lighting import environment_directions
+from unirender.symmetries import Maps
 from unirender.training.augment import (
     METALLIC_NODES,
-    Maps,
     interpolate_metallic,
     mirror,
     mix_lights,

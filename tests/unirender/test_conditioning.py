@@ -9,7 +9,9 @@ from unirender import color
 from unirender.camera import Camera
 from unirender.composite import composite
 from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
 from unirender.models import conditioning as c
+from unirender.models.priors import PRIORS
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +74,11 @@ def test_twins_agree_with_the_numpy_functions() -> None:
         np.testing.assert_allclose(torch_value.numpy(), numpy_value, rtol=1e-5, atol=1e-6)
 
 
-def test_gradients_are_finite_at_black_and_beyond_the_range(cond: c.Conditioning) -> None:
+@pytest.mark.parametrize("name", sorted(PRIORS))
+def test_gradients_are_finite_at_black_and_beyond_the_range(cond: c.Conditioning, name: str) -> None:
     pictures = torch.linspace(-1.5, 1.5, 18 * 32 * 32).reshape(1, 18, 32, 32).requires_grad_()
     maps = cond.packing.unpack(pictures)
-    c.composite_picture(maps, torch.ones(1, 1, 32, 32)).sum().backward()
+    c.prior_picture(PRIORS[name], maps, torch.ones(1, 1, 32, 32), Camera()).sum().backward()
     assert pictures.grad is not None
     assert torch.isfinite(pictures.grad).all()
     assert pictures.grad.abs().max() > 0
@@ -89,7 +92,8 @@ def test_hdr_values_above_the_range_are_not_clipped(cond: c.Conditioning) -> Non
     torch.testing.assert_close(back, batch["specular"], rtol=1e-3, atol=1e-4)
 
 
-def test_extras_hold_flags_mask_rays_and_composite(cond: c.Conditioning) -> None:
+def test_extras_hold_flags_mask_rays_and_prior() -> None:
+    _, cond = make_model(physics_prior="composite")
     batch = make_batch(2)
     given = torch.tensor([[True] * 6, [True, True, True, False, True, True]])
     extras = cond.extras(batch["mask"], given, batch)
@@ -116,8 +120,25 @@ def test_rays_turn_with_the_camera(cond: c.Conditioning) -> None:
 
 
 def test_plain_model_has_no_prior() -> None:
-    _, plain = make_model(physics_prior=False)
+    _, plain = make_model(physics_prior="none")
     batch = make_batch(1)
     extras = plain.extras(batch["mask"], torch.ones(1, 6, dtype=torch.bool), batch)
     assert extras.prior is None
     assert extras.image.shape == extras.attributes.shape
+
+
+@pytest.mark.parametrize("name", sorted(PRIORS))
+def test_priors_agree_with_their_numpy_originals(name: str) -> None:
+    camera = Camera(fov_deg=50.0)
+    batch = make_batch(1)
+    batch["normal"] = torch.nn.functional.normalize(torch.randn(1, 3, 32, 32), dim=1)  # also facing away
+    maps = {key: value[0].permute(1, 2, 0).numpy() for key, value in batch.items() if key != "image"}
+    expected = PRIORS[name].image(Intrinsics(camera=camera, **maps))
+    found = PRIORS[name].radiance(batch, camera) * batch["mask"]
+    np.testing.assert_allclose(found[0].permute(1, 2, 0).numpy(), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_an_unknown_prior_is_refused(cond: c.Conditioning) -> None:
+    config = {"hdr_curves": None, "environment_size": (16, 32), "physics_prior": "phong"}
+    with pytest.raises(UnirenderError, match="physics_prior: got 'phong'"):
+        c.Conditioning.of(config, cond.codec)

@@ -20,13 +20,13 @@ from unirender.symmetries import turn_rotation
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
     NO_AUGMENTATION,
-    Augmentation,
     Draw,
     draw,
 )
 from unirender.training.data import BATCH_MAPS, GroupDataset, iterate_batches
 from unirender.training.environments import turned_environments
 from unirender.training.groups import list_shards, read_groups
+from unirender.training.presets import Augmentation
 
 
 @pytest.fixture(scope="module")

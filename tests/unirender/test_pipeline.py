@@ -11,7 +11,7 @@ from tiny_models import SIZE, make_pipeline
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
-from unirender.composite import composite_image
+from unirender.composite import split_sum_image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import specular_light
@@ -150,18 +150,18 @@ def test_pil_pictures_bring_their_alpha(pipeline: UniRenderPipeline) -> None:
     assert opaque.intrinsics.mask.min() == 1
 
 
-def test_untrained_prior_renders_the_composite() -> None:
+def test_untrained_prior_renders_the_split_sum() -> None:
     """With the image stream's last convolution at zero the render is the closed form."""
     pipeline = make_pipeline()
     for p in pipeline.dual_stream.image_unet.conv_out.parameters():
         torch.nn.init.zeros_(p)
     given = scene()
     np.testing.assert_allclose(
-        image_srgb(pipeline.render(given)), image_srgb(composite_image(given)), rtol=0, atol=1e-4
+        image_srgb(pipeline.render(given)), image_srgb(split_sum_image(given)), rtol=0, atol=1e-4
     )
     large = scene(80)
     np.testing.assert_allclose(
-        image_srgb(pipeline.render(large)), image_srgb(composite_image(large)), rtol=0, atol=1e-4
+        image_srgb(pipeline.render(large)), image_srgb(split_sum_image(large)), rtol=0, atol=1e-4
     )
 
 

@@ -157,7 +157,7 @@ def test_plain_model_overfits_one_sample(tmp_path: Path) -> None:
     """Both directions, without the prior, in a few seconds on one core."""
     config = dataclasses.replace(
         TRAIN,
-        model=dataclasses.replace(TRAIN.model, physics_prior=False),
+        model=dataclasses.replace(TRAIN.model, physics_prior="none"),
         loss=dataclasses.replace(TRAIN.loss, cycle=0.0),
         optimizer=OptimizerConfig(learning_rate=5e-3, warmup_steps=10, ema_decay=0.9),
         batch_size=2,
@@ -381,6 +381,17 @@ def test_a_run_starts_from_other_weights(tmp_path: Path) -> None:
     for key, value in first.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[key])
     assert torch.equal(second.ema.average[name], first.model.state_dict()[name])
+
+
+def test_another_prior_begins_with_its_own_picture(tmp_path: Path) -> None:
+    other = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="composite"))
+    first = Trainer(other, RunConfig(tmp_path / "a", steps=2), CPU, torch.float32)
+    torch.nn.init.ones_(first.model.image_unet.conv_out.weight)
+    second = Trainer(TRAIN, RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
+    second.start_from(first.model)
+    assert not second.model.image_unet.conv_out.weight.any()
+    assert not second.ema.average["image_unet.conv_out.weight"].any()
+    assert torch.equal(first.model.image_unet.conv_in.weight, second.model.image_unet.conv_in.weight)
 
 
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:

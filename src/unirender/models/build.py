@@ -11,7 +11,7 @@ from unirender.training.presets import ModelConfig
 def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[DualStreamModel, Conditioning]:
     """Returns a fresh network and the conditioning that belongs to it.
 
-    With the physics prior the image stream's last convolution starts at zero: the first render is the composite.
+    With the physics prior the image stream's last convolution starts at zero: the first render is the prior.
     """
     codec = make_codec(config.codec, config.patch, vae)
     recorded = {
@@ -38,8 +38,13 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         patch=config.patch,
         **recorded,
     )
-    if config.physics_prior:
-        nn.init.zeros_(model.image_unet.conv_out.weight)
-        assert model.image_unet.conv_out.bias is not None
-        nn.init.zeros_(model.image_unet.conv_out.bias)
+    if config.physics_prior != "none":
+        restart_from_prior(model)
     return model, conditioning
+
+
+def restart_from_prior(model: DualStreamModel) -> None:
+    """Sets the image stream's last convolution to zero: with a physics prior, renders are the prior again."""
+    nn.init.zeros_(model.image_unet.conv_out.weight)
+    assert model.image_unet.conv_out.bias is not None
+    nn.init.zeros_(model.image_unet.conv_out.bias)

@@ -5,7 +5,7 @@ The attributes are six pictures in [-1, 1], the paper's layout with the HDR ligh
     material [metallic, roughness, mask], albedo, normal, specular, diffuse, environment
 
 Albedo is sRGB-encoded, normals enter as they are, s, d and the light through `log1p(k x) / log1p(k x_max)`, the image
-premultiplied and sRGB-encoded. Whatever else a stream sees (presence flags, mask, rays, composite) enters as *extra*
+premultiplied and sRGB-encoded. Whatever else a stream sees (presence flags, mask, rays, prior) enters as *extra*
 channels, beside the latents. The torch twins of `unirender.color` stand here, held against it by a test.
 
 Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
@@ -21,9 +21,9 @@ from torch import Tensor
 
 from unirender.camera import Camera
 from unirender.color import HdrCurve
-from unirender.composite import composite
 from unirender.errors import UnirenderError
 from unirender.models.codec import Codec
+from unirender.models.priors import PRIORS, Maps, Prior
 
 TRIPLETS = ("material", "albedo", "normal", "specular", "diffuse", "environment")
 HDR_CURVES: dict[str, tuple[float, float]] = {
@@ -31,10 +31,7 @@ HDR_CURVES: dict[str, tuple[float, float]] = {
     "diffuse": (10.0, 2.0),
     "environment": (20.0, 200.0),
 }
-PRIOR_TRIPLETS = ("material", "albedo", "specular", "diffuse")  # what the composite is made of
 RAY_SCALE = 3.0  # brings the default camera's ray slopes to about [-1, 1]
-
-Maps = dict[str, Tensor]
 
 
 def srgb_encode(linear: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
@@ -122,9 +119,9 @@ def unpack_image(picture: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 H W"]:
     return srgb_decode((0.5 * picture + 0.5).clamp(0, 1))
 
 
-def composite_picture(maps: Maps, mask: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 3 H W"]:
+def prior_picture(prior: Prior, maps: Maps, mask: Float[Tensor, "b 1 H W"], camera: Camera) -> Float[Tensor, "b 3 H W"]:
     """The closed-form image of the maps, packed like an image."""
-    return pack_image(composite(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"]) * mask)
+    return pack_image(prior.radiance(maps, camera) * mask)
 
 
 @dataclass(frozen=True)
@@ -142,14 +139,21 @@ class Conditioning:
 
     codec: Codec
     packing: Packing
-    physics_prior: bool
+    physics_prior: Prior | None
 
     @classmethod
     def of(cls, config: dict, codec: Codec) -> "Conditioning":
-        """The conditioning that a model's config describes."""
+        """The conditioning that a model's config describes.
+
+        Raises:
+            UnirenderError: an unknown physics prior.
+        """
         curves = {name: HdrCurve(*value) for name, value in (config["hdr_curves"] or HDR_CURVES).items()}
         packing = Packing(curves, tuple(config["environment_size"]))
-        return cls(codec, packing, config["physics_prior"])
+        name = config["physics_prior"]
+        if name != "none" and name not in PRIORS:
+            raise UnirenderError(f"physics_prior: got {name!r}, expected 'none' or one of: {', '.join(PRIORS)}")
+        return cls(codec, packing, PRIORS.get(name))
 
     @property
     def attribute_channels(self) -> int:
@@ -196,22 +200,26 @@ class Conditioning:
         Args:
             mask: coverage; always known.
             given: which of the six pictures are given clean as a condition (none in inverse rendering).
-            maps: the given maps, from which the composite is made where `given` has all that it needs.
+            maps: the given maps, from which the physics prior is made where `given` has all that it needs.
             camera: gives the rays; the contract's default if None.
         """
         spatial = F.pixel_unshuffle(mask, self.codec.factor)
         b, _, h, w = spatial.shape
-        rays = torch.from_numpy((camera or Camera()).rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
+        camera = camera or Camera()
+        rays = torch.from_numpy(camera.rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
         flags = given.to(mask)[..., None, None].expand(-1, -1, h, w)
         common = torch.cat([flags, spatial, rays.permute(2, 0, 1).expand(b, -1, -1, -1)], dim=1)
         if not self.physics_prior:
             return Extras(common, common, None)
-        known = given[:, [TRIPLETS.index(name) for name in PRIOR_TRIPLETS]].all(dim=1)
+        known = given[:, [TRIPLETS.index(name) for name in self.physics_prior.triplets]].all(dim=1)
         if maps is None:
             if known.any():
-                raise ValueError("extras: the flags say that the maps of the composite are given, but maps is None")
+                raise ValueError("extras: the flags say that the maps of the prior are given, but maps is None")
             prior = mask.new_zeros(b, self.codec.channels, h, w)
         else:
-            prior = self.codec.encode(composite_picture(maps, mask)) * known.to(mask)[:, None, None, None]
+            prior = (
+                self.codec.encode(prior_picture(self.physics_prior, maps, mask, camera))
+                * known.to(mask)[:, None, None, None]
+            )
         flag = known.to(mask)[:, None, None, None].expand(-1, -1, h, w)
         return Extras(common, torch.cat([common, prior, flag], dim=1), prior)

@@ -90,7 +90,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         patch: int = 2,  # image pixels per latent pixel, one way
         environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
         hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
-        physics_prior: bool = False,  # the image stream sees the composite and predicts what is missing from it
+        physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
     ):
         super().__init__()
         if len(block_out_channels) - 1 not in attention_levels:

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from unirender.color import image_srgb as encode_srgb
 from unirender.color import srgb_decode
-from unirender.composite import composite_image
 from unirender.intrinsics import Intrinsics
+from unirender.models.priors import PRIORS
 from unirender.pipelines.framing import Frame, divide
 from unirender.pipelines.inputs import ready_to_render
 from unirender.pipelines.network import Network, Overflow
@@ -46,8 +46,9 @@ def render_any_size(
     radiance = frame.leave_map(divide(rendered, inside), mask)
     if not {"albedo", "specular", "diffuse"} <= set(intrinsics.present):
         return radiance * mask
-    # The detail of a larger picture is in its composite; the model adds what it lacks, in display values.
-    small_composite = frame.leave_map(divide(composite_image(small), inside), mask)
-    change = encode_srgb(radiance) - encode_srgb(small_composite)
-    large_composite = divide(composite_image(intrinsics), mask)
-    return srgb_decode(np.clip(encode_srgb(large_composite) + change, 0, 1)) * mask
+    # The detail of a larger picture is in its closed form; the model adds what it lacks, in display values.
+    closed_form = network.conditioning.physics_prior or PRIORS["split_sum"]
+    small_image = frame.leave_map(divide(closed_form.image(small), inside), mask)
+    change = encode_srgb(radiance) - encode_srgb(small_image)
+    large_image = divide(closed_form.image(intrinsics), mask)
+    return srgb_decode(np.clip(encode_srgb(large_image) + change, 0, 1)) * mask

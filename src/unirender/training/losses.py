@@ -14,10 +14,12 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from unirender.camera import Camera
 from unirender.diffusion.schedule import add_noise, last_timestep
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras, Maps, composite_picture, pack_image
+from unirender.models.conditioning import TRIPLETS, Conditioning, Extras, Maps, pack_image, prior_picture
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
+from unirender.models.priors import PRIORS
 from unirender.training.presets import LossConfig
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without
@@ -149,7 +151,9 @@ class LossFunction:
 
     def _composite_error(self, predicted: Tensor, batch: Maps) -> Float[Tensor, ""]:
         maps = self.conditioning.decode_attributes(predicted.float())
-        error = (composite_picture(maps, batch["mask"]) - pack_image(batch["image"])).square()
+        error = (
+            prior_picture(PRIORS["composite"], maps, batch["mask"], Camera()) - pack_image(batch["image"])
+        ).square()
         return _weighted_mean(error, self._pixel_weights(batch["mask"]).expand_as(error))
 
     def _pixel_weights(self, mask: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 1 H W"]:

@@ -24,7 +24,8 @@ class ModelConfig:
     cross_attention_dim: int = 16
     prompt_tokens: int = 1
     norm_num_groups: int = 16
-    physics_prior: bool = True  # the image stream predicts what the composite leaves out
+    # the closed-form image to which the image stream adds what it leaves out
+    physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ _TINY = TrainConfig(
         mix=0.4, tint=0.15, permute=0.1, turn=0.05
     ),  # close to natural light: it comes from above
     batch_size=24,
-    p_render=0.25,
+    p_render=0.4,
     p_t=0.15,
     map_dropout=0.03,
 )
@@ -113,7 +114,7 @@ _SD_MODEL = ModelConfig(
     cross_attention_dim=768,
     prompt_tokens=77,
     norm_num_groups=32,
-    physics_prior=False,
+    physics_prior="none",
 )
 _SD = TrainConfig(
     model=_SD_MODEL,
@@ -126,7 +127,8 @@ _SD = TrainConfig(
 
 PRESETS: dict[str, TrainConfig] = {
     "tiny": _TINY,
-    "tiny_plain": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior=False)),
+    "tiny_plain": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="none")),
+    "tiny_composite": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="composite")),
     "tiny_without_cycle": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle=0.0)),
     "tiny_cycle_into_renderer": dataclasses.replace(
         _TINY, loss=dataclasses.replace(_TINY.loss, cycle_into_renderer=True)

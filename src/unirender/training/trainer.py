@@ -21,7 +21,7 @@ from torch import nn
 
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
-from unirender.models.build import build_model
+from unirender.models.build import build_model, restart_from_prior
 from unirender.models.conditioning import Maps
 from unirender.models.dual_stream import DualStreamModel
 from unirender.training.checkpoint import load_state, save_state
@@ -94,6 +94,8 @@ class Trainer:
     def start_from(self, network: DualStreamModel) -> None:
         """Begins with the weights of another network, the average too. A state in the run's folder goes before.
 
+        With another physics prior than the network's the image stream's last convolution starts at zero again.
+
         Raises:
             UnirenderError: the networks differ.
         """
@@ -106,6 +108,8 @@ class Trainer:
                 "expected the same network; choose the preset that the weights were trained with"
             )
         self.model.load_state_dict(network.state_dict())
+        if network.config["physics_prior"] != self.model.config["physics_prior"]:
+            restart_from_prior(self.model)  # what it added to the other closed form is no correction of this one
         self.ema = Ema(self.model, self.config.optimizer.ema_decay)
 
     def train_step(self, batch: Maps) -> dict[str, float]:
