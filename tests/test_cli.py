@@ -14,10 +14,9 @@ from synthetic_shards import write_dataset
 
 from unirender.cli import main
 from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
-from unirender.files import read_result
+from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
-from unirender_evaluation.pipeline_method import weights_hash
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
     f"{name}.png"
@@ -65,7 +64,7 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
         _, header = read_exr(tmp_path / "out" / name)
         expected = {"input": "ball.png", "mode": "mean", "seed": "0", "camera": "fov_deg=36 principal=0.5,0.5"}
         assert expected.items() <= header.items()
-        assert header["checkpoint_sha256"] == meta["checkpoint_sha256"] == weights_hash(SHIPPED_CHECKPOINT)
+        assert header["checkpoint_sha256"] == meta["checkpoint_sha256"] == checkpoint_sha256(SHIPPED_CHECKPOINT)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 

@@ -24,11 +24,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.errors import UsageError
+from unirender.files import checkpoint_sha256
 from unirender_evaluation import bounds, physics_rows
 from unirender_evaluation.engine import Store
 from unirender_evaluation.physics import PHYSICS_TABLE
 from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.pipeline_method import LazyPipeline, weights_hash
+from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.records import Record, RunInfo, write_run
@@ -115,7 +116,7 @@ def build_rows(config: BenchConfig) -> list[Row]:
     if "ours" in config.methods:
         folder = config.checkpoint or shipped_checkpoint()
         pipeline = LazyPipeline(lambda: _load_pipeline(folder, config.device))
-        rows += our_rows(pipeline, weights_hash(folder), config.seed, config.sample_scenes, config.device)
+        rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.sample_scenes, config.device)
     plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
     strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
     if "trivial" in config.methods or strangers:

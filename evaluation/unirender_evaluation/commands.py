@@ -142,6 +142,24 @@ class BenchTruth:
 
 
 @dataclass(frozen=True)
+class BenchReport:
+    """Write the report of a finished run again, from its records and kept pictures. Nothing is measured."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder that `unirender bench run --out` wrote."""
+    suite: str | None = None
+    """A bundled suite, or the path of a suite's TOML file; None: the name that the run recorded."""
+
+    def run(self) -> int:
+        """Writes `report.html` into the folder."""
+        from unirender_evaluation.report import rebuild
+
+        path = rebuild(self.folder, self.suite)
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+        return 0
+
+
+@dataclass(frozen=True)
 class BenchExport:
     """Write a suite's inputs for foreign code: pictures, masks, lights and what is asked of each."""
 
@@ -166,12 +184,13 @@ class BenchExport:
 
 @dataclass(frozen=True)
 class Bench:
-    """The benchmark: score methods, check the truth, export inputs."""
+    """The benchmark: score methods, write the report again, check the truth, export inputs."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[BenchRun, tyro.conf.subcommand("run")]
         | Annotated[BenchCheck, tyro.conf.subcommand("check")]
         | Annotated[BenchExport, tyro.conf.subcommand("export")]
+        | Annotated[BenchReport, tyro.conf.subcommand("report")]
         | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
     ] = field()
 

@@ -2,11 +2,9 @@
 
 import hashlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from unirender.camera import Camera
-from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Image, Mask
 
@@ -107,21 +105,6 @@ class PipelineMethod:
 
     def render(self, intrinsics: Intrinsics) -> Image:
         return self.pipeline.render(intrinsics, **self._options())
-
-
-def weights_hash(folder: Path) -> str:
-    """sha256 over the weights and configurations of a checkpoint folder (not over the account of its training).
-
-    Raises:
-        UnirenderError: there are none.
-    """
-    digest = hashlib.sha256()
-    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
-    if not files:
-        raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
-    for path in files:
-        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 class LazyPipeline:

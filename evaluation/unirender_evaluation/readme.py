@@ -63,14 +63,17 @@ def fill(readme: str, name: str, text: str) -> str:
 def checkpoint_text(folder: Path) -> str:
     """What the shipped checkpoint was trained on, from the files that the training wrote beside its weights."""
     facts = json.loads((folder / "training.json").read_text())
+    runs = [*facts.get("continues", []), facts]
+    minutes, steps, samples = (sum(run[name] for run in runs) for name in ("minutes", "steps", "samples"))
+    parts = f" in {len(runs)} runs, each from the weights of the one before" if len(runs) > 1 else ""
     parameters = 0
     for path in folder.rglob("*.safetensors"):
         with safe_open(path, framework="numpy") as weights:
             parameters += sum(math.prod(weights.get_slice(name).get_shape()) for name in weights.keys())  # noqa: SIM118 - no dict
     return (
         f"The shipped checkpoint has {parameters / 1e6:.1f} million parameters. It was trained for "
-        f"{facts['minutes']:.0f} minutes on {facts['device']} ({facts['autocast']}): {facts['steps']:,} steps, "
-        f"{facts['samples']:,} samples, at {facts['train']['model']['resolution']} pixels."
+        f"{minutes:.0f} minutes on {facts['device']} ({facts['autocast']}): {steps:,} steps, {samples:,} samples"
+        f"{parts}, at {facts['train']['model']['resolution']} pixels."
     )
 
 

@@ -2,16 +2,11 @@
 
 Tables with the published value beside the measured one and the protocol below, the standing of our rows between the
 trivial ones and the noise ceiling, one tick per sample, paired verdicts, and a gallery that begins with the failures.
-This module turns results into view models; `templates/` lays them out.
-
-    python -m unirender_evaluation.report RUN [--suite SUITE]
-
-writes the report of a finished run again, from its records and kept pictures.
+This module turns results into view models; `templates/` lays them out. `unirender bench report RUN` writes the page
+of a finished run again.
 """
 
-import argparse
 import os
-import sys
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -274,24 +269,3 @@ def rebuild(folder: Path, suite: str | None = None) -> Path:
     main_row = next((info.key for info in run.methods if info.kind == "ours"), "")
     items = pictures.items(records, main_row)
     return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; 0, or 1 with one line on standard error."""
-    parser = argparse.ArgumentParser(
-        prog="python -m unirender_evaluation.report", description="Writes the report of a finished run again."
-    )
-    parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote")
-    parser.add_argument("--suite", help="name or TOML file; default: the name that the run recorded")
-    arguments = parser.parse_args(argv)
-    try:
-        path = rebuild(arguments.run, arguments.suite)
-    except (UnirenderError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -127,7 +127,7 @@ def our_rows(
 
     Args:
         pipeline: a `UniRenderPipeline`.
-        weights: `weights_hash` of its checkpoint.
+        weights: `checkpoint_sha256` of its checkpoint.
         seed: of the sampling mode.
         sample_scenes: scenes of the sampling rows; 0 leaves them out.
         device: where it runs.
@@ -152,7 +152,7 @@ def our_rows(
         make_row(mean, "ours", published="Ours", **one),
         make_row(anchored, "ours", protocols=from_image, **one),
         make_row(open_mean, "ours", protocols=decomposes, note="maps as the network predicts them", **one),
-        *(make_row(composite, "ours", protocols=from_image, **one) for composite in composites),
+        *(make_row(composite, "baseline", protocols=from_image, **one) for composite in composites),
     ]
     if sample_scenes:
         sampled = ours("Ours (sample)", mode="sample", steps=SAMPLE_STEPS, samples=SAMPLE_COUNT)

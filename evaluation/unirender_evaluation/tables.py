@@ -83,8 +83,10 @@ class Table:
 
     @property
     def heading(self) -> str:
+        """The title with its protocol, where that says more, and what is counted."""
         suffix = "" if self.subset == "main" else f", {self.subset}"
-        return f"{self.title}: {self.protocol_label} ({self.variant.mask}{suffix})"
+        same = self.protocol_label.casefold() == self.title.casefold()
+        return f"{self.title}{'' if same else f': {self.protocol_label}'} ({self.variant.mask}{suffix})"
 
 
 def build_table(

@@ -23,7 +23,7 @@ from unirender.lighting import resample_environment
 from unirender_evaluation.suite_spec import SuiteSpec, read_spec
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_file import Kind, light_member, member_kind, read_tar, write_tar
-from unirender_evaluation.truth_object import PART, ObjectJob, render_object, shared_scene_hash
+from unirender_evaluation.truth_object import PART, ObjectJob, render_object
 
 CODE = {  # what a rendered part depends on
     "unirender": ("camera.py", "color.py", "exposure.py", "exr.py", "intrinsics.py", "lighting.py"),
@@ -119,6 +119,8 @@ def _fingerprint(spec: SuiteSpec, environments: dict[str, Environment]) -> str:
 
 def pack_truth(spec: SuiteSpec, parts: Iterable[Path], environments: dict[str, Environment]) -> None:
     """Packs rendered objects and their lights into the suite's tar and writes its hash into the TOML file."""
+    from unirender_reference.render import shared_scene_hash
+
     members: dict[str, bytes] = {}
     scenes: list[dict] = []
     hashes: dict[str, list[str]] = {}

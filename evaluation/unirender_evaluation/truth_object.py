@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -69,14 +69,9 @@ def object_hash(obj: Any) -> str:
     return digest.hexdigest()
 
 
-def shared_scene_hash(hashes: Iterable[str]) -> str:
-    """The scene hash of a member that belongs to several scenes: sha256 over theirs, in order (as in data sets)."""
-    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()
-
-
 def render_object(job: ObjectJob) -> Path:
     """Renders all members of one object into `<out>/<seed>-<object hash>.tar`; returns at once if that file exists."""
-    from unirender_reference.render import Renderer, renderer_provenance
+    from unirender_reference.render import Renderer, renderer_provenance, shared_scene_hash
     from unirender_reference.shapes import make_object
 
     spec = job.spec
@@ -150,7 +145,7 @@ def _buffers(
     renderer: Any, spec: SuiteSpec, scene: Scene, environment: Environment, hash_of: dict[Material, str]
 ) -> Iterator[_Buffer]:
     """d, s at the suite's roughness values, and the images of a scene."""
-    from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH
+    from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, shared_scene_hash
 
     common = {
         "light": scene.light,

@@ -5,7 +5,6 @@ with one thread that renders whole groups and encodes its EXR files; the parent 
 plan.
 """
 
-import hashlib
 import json
 import multiprocessing
 import multiprocessing.connection
@@ -13,7 +12,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from unirender_reference import backend, exposure
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
 from unirender_reference.plan import SHARD_GROUPS, DatasetConfig, GroupPlan, plan_groups
-from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hashes
+from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hashes, shared_scene_hash
 from unirender_reference.shapes import make_object
 from unirender_reference.shards import ShardRecord, finished_shards, shard_name, write_manifest, write_shard
 
@@ -146,7 +145,7 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
         for r, m in light_plan.pairs
     }
     scenes = dict(zip(specs, scene_hashes(specs.values()), strict=True))
-    shared = {**header, "spp": str(GEOMETRY_SPP), "scene": _shared_scene(scenes.values())}
+    shared = {**header, "spp": str(GEOMETRY_SPP), "scene": shared_scene_hash(scenes.values())}
     members = {"shared.exr": exr_bytes(intrinsics_channels(geometry), attributes=shared)}
     lights = []
     for i, (light, light_plan) in enumerate(zip(drawn, plan.lights, strict=True)):
@@ -154,7 +153,7 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
         factor = exposure.scene_exposure(renderer, light.environment, light_plan.exposure_seed)
         environment = (light.environment * np.float32(factor)).astype(np.float32)
         attributes = {**header, "light": light.name, "exposure_factor": repr(factor)}
-        lit = {**attributes, "scene": _shared_scene(own.values())}
+        lit = {**attributes, "scene": shared_scene_hash(own.values())}
         members[f"l{i}.environment.exr"] = exr_bytes(image_channels(environment), half=False, attributes=lit)
         seed = derive_seed(plan.render_seed, "light", i)
         diffuse = np.where(covered, renderer.diffuse(environment, config.spp, seed, batches=1).mean, 0)
@@ -162,7 +161,7 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
         for r in dict.fromkeys(pair[0] for pair in light_plan.pairs):
             s_seed = derive_seed(seed, r)
             specular = renderer.specular(environment, r / 100, config.spp, s_seed, batches=1).mean
-            rough = {**attributes, "scene": _shared_scene(own[pair] for pair in own if pair[0] == r)}
+            rough = {**attributes, "scene": shared_scene_hash(own[pair] for pair in own if pair[0] == r)}
             members[f"l{i}.r{r:03d}.specular.exr"] = _buffer("specular", np.where(covered, specular, 0), rough)
         for r, m in light_plan.pairs:
             image = renderer.image(environment, r / 100, m / 100, config.spp, derive_seed(seed, r, m), batches=1)
@@ -194,11 +193,6 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
     counters = renderer.counters
     seconds = time.perf_counter() - start
     return RenderedGroup(key, members, plan.samples, counters.nan_pixels, counters.render_seconds, seconds)
-
-
-def _shared_scene(hashes: Iterable[str]) -> str:
-    """The scene hash of a member that belongs to several scenes: sha256 over their hashes, in the order of the plan."""
-    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()
 
 
 def _buffer(name: str, value: np.ndarray, attributes: dict[str, str]) -> bytes:

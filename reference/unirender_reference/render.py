@@ -257,3 +257,8 @@ def scene_hashes(specs: Iterable[SceneSpec]) -> Iterator[str]:
         values = (spec.roughness, spec.metallic, spec.camera, spec.resolution, spec.exposure_seed)
         digest.update(repr(values).encode())
         yield digest.hexdigest()
+
+
+def shared_scene_hash(hashes: Iterable[str]) -> str:
+    """The scene hash of a member that belongs to several scenes: sha256 over theirs, in order."""
+    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()

@@ -143,10 +143,16 @@ def header_attributes(meta: Mapping[str, Any], camera: Camera | None) -> dict[st
 
 
 def checkpoint_sha256(folder: Path) -> str:
-    """sha256 over the weights and configurations of a checkpoint folder, not over the account of its training."""
+    """sha256 over the weights and configurations of a checkpoint folder, not over the account of its training.
+
+    Raises:
+        UnirenderError: there are none.
+    """
     digest = hashlib.sha256()
-    files = (p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
-    for path in sorted(files):
+    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
+    if not files:
+        raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
+    for path in files:
         digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return digest.hexdigest()
 

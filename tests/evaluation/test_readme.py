@@ -90,3 +90,12 @@ def test_the_projects_own_readme_has_its_places() -> None:
     text = (Path(__file__).resolve().parents[2] / "README.md").read_text()
     for name in ("results", "checkpoint"):
         assert "filled" in readme.fill(text, name, "filled")
+
+
+def test_the_figures_of_a_continued_checkpoint_are_those_of_all_its_runs(tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path / "checkpoint")
+    facts = json.loads((folder / "training.json").read_text())
+    earlier = {"minutes": 20.0, "steps": 1000, "samples": 6000}
+    (folder / "training.json").write_text(json.dumps(facts | {"continues": [earlier, earlier]}))
+    text = readme.checkpoint_text(folder)
+    assert "101 minutes on cpu (bfloat16): 6,000 steps, 60,000 samples in 3 runs" in text

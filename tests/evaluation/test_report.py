@@ -20,7 +20,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map, image_picture, map_pictures, picture_rows
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
-from unirender_evaluation.report import main, write_report
+from unirender_evaluation.report import rebuild, write_report
 from unirender_evaluation.report_plots import Scale, heading, tiles
 from unirender_evaluation.tables import build_tables
 
@@ -251,21 +251,20 @@ def test_the_legend_names_the_kinds_that_are_there(page: str) -> None:
     ]  # fmt: skip
 
 
-def test_a_report_is_made_again_from_its_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_is_made_again_from_its_folder(tmp_path: Path) -> None:
     suite = make_suite(tmp_path / "suite")
     run = replace(RUN, suite=suite.spec.name, suite_hash=suite.sha256)
-    assert main([str(tmp_path / "nothing")]) == 1
+    with pytest.raises(UnirenderError, match=r"no run\.json"):
+        rebuild(tmp_path / "nothing")
     write_run(tmp_path / "run.json", run)
     write_records(tmp_path / "records.jsonl", records())
-    options = ["--suite", str(suite.spec.path)]
-    assert main([str(tmp_path), *options]) == 0
+    assert rebuild(tmp_path, str(suite.spec.path)) == tmp_path / "report.html"
     assert "<table class" in (tmp_path / "report.html").read_text(encoding="utf-8")
     write_run(tmp_path / "run.json", replace(run, suite_hash="of another suite"))
     (tmp_path / "report.html").unlink()
-    assert main([str(tmp_path), *options]) == 1
+    with pytest.raises(UnirenderError, match="name it with --suite"):
+        rebuild(tmp_path, str(suite.spec.path))
     assert not (tmp_path / "report.html").exists()
-    errors = capsys.readouterr().err.splitlines()
-    assert [("no run.json" in errors[0]), ("name it with --suite" in errors[1])] == [True, True]
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -24,8 +24,8 @@ from unirender_evaluation.truth_file import (
     shared_member,
     specular_member,
 )
-from unirender_evaluation.truth_object import shared_scene_hash
 from unirender_evaluation.truth_render import stored_ceiling_db
+from unirender_reference.render import shared_scene_hash
 
 
 @pytest.fixture(scope="module")

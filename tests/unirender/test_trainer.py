@@ -24,7 +24,7 @@ from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.checkpoint import STATE_FILE, load_state, save_state
 from unirender.training.data import iterate_batches
 from unirender.training.ema import Ema
-from unirender.training.export import export_pipeline
+from unirender.training.export import export_pipeline, load_network, read_history
 from unirender.training.live import live_report
 from unirender.training.presets import PRESETS, OptimizerConfig, TrainConfig, get_preset
 from unirender.training.source import ShardSource
@@ -381,6 +381,23 @@ def test_a_run_starts_from_other_weights(tmp_path: Path) -> None:
     for key, value in first.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[key])
     assert torch.equal(second.ema.average[name], first.model.state_dict()[name])
+
+
+def test_a_pipeline_tells_the_runs_that_it_continues(tmp_path: Path) -> None:
+    folders: list[Path] = []
+    for name in ("a", "b", "c"):
+        trainer = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
+        if folders:
+            trainer.start_from(load_network(folders[-1]), read_history(folders[-1]))
+        trainer.fit(SyntheticSource())
+        again = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
+        again.resume(SyntheticSource())
+        folders.append(export_pipeline(again, tmp_path / name / "pipeline"))
+    assert [len(read_history(folder)) for folder in folders] == [1, 2, 3]
+    assert all("continues" not in run and run["steps"] == 2 for run in read_history(folders[-1]))
+    (folders[-1] / "training.json").write_text("[")
+    with pytest.raises(UnirenderError, match="cannot be read as the record of a training"):
+        read_history(folders[-1])
 
 
 def test_another_prior_begins_with_its_own_picture(tmp_path: Path) -> None:

@@ -16,8 +16,9 @@ from torch import Tensor
 from unirender.camera import Camera
 from unirender.diffusion.schedule import last_timestep
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import TRIPLETS, Conditioning, Maps
+from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.priors import Maps
 
 Mode = Literal["mean", "sample"]
 SAMPLE_STEPS = 20  # the paper's

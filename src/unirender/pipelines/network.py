@@ -11,8 +11,9 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.models.conditioning import TRIPLETS, Conditioning, Maps
+from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.priors import Maps
 from unirender.pipelines.settings import Sampling
 
 

@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
 
+from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -29,6 +30,22 @@ def averaged_pipeline(
     return pipeline
 
 
+def read_history(folder: Path) -> list[dict[str, Any]]:
+    """The runs behind the weights of a pipeline folder, oldest first, as their `training.json` tells; [] without one.
+
+    Raises:
+        UnirenderError: the file is broken.
+    """
+    path = folder / TRAINING_FILE
+    if not path.is_file():
+        return []
+    try:
+        facts = json.loads(path.read_text())
+        return [*facts.pop("continues", []), facts]
+    except (ValueError, AttributeError, TypeError) as error:
+        raise UnirenderError(f"{path}: cannot be read as the record of a training ({error})") from error
+
+
 def load_network(folder: Path) -> DualStreamModel:
     """The network of a pipeline folder, in float32.
 
@@ -39,7 +56,9 @@ def load_network(folder: Path) -> DualStreamModel:
 
 
 def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch.float16) -> Path:
-    """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes, presets.
+    """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes and preset.
+
+    The same of the runs that it continues stands there too.
 
     Weights are stored as `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
     """
@@ -54,6 +73,7 @@ def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch
         "device": str(trainer.device),
         "autocast": str(trainer.dtype).removeprefix("torch."),
         "train": trainer.state_dict()["config"],
+        "continues": trainer.continues,
     }
     (folder / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
     return folder

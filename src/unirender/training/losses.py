@@ -17,9 +17,9 @@ from torch import Tensor
 from unirender.camera import Camera
 from unirender.diffusion.schedule import add_noise, last_timestep
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras, Maps, pack_image, prior_picture
+from unirender.models.conditioning import TRIPLETS, Conditioning, Extras, pack_image, prior_picture
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.models.priors import PRIORS
+from unirender.models.priors import PRIORS, Maps
 from unirender.training.presets import LossConfig
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without

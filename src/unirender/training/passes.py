@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
-from unirender.models.conditioning import Maps
+from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction, LossTerms
 from unirender.training.presets import TrainConfig
 

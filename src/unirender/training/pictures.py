@@ -10,7 +10,8 @@ from torch import Tensor
 
 from unirender.color import image_srgb
 from unirender.diffusion.sampling import infer_attributes, infer_image
-from unirender.models.conditioning import TRIPLETS, Maps
+from unirender.models.conditioning import TRIPLETS
+from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
 
 COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "environment")

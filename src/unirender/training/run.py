@@ -97,7 +97,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     from rich.console import Console
 
     from unirender.models.precision import resolve_device, resolve_dtype
-    from unirender.training.export import export_pipeline, load_network
+    from unirender.training.export import export_pipeline, load_network, read_history
     from unirender.training.groups import list_shards
     from unirender.training.live import live_report
     from unirender.training.source import ShardSource
@@ -119,7 +119,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     trainer = Trainer(config, run, device, dtype)
     if options.init is not None:
-        trainer.start_from(load_network(options.init))
+        trainer.start_from(load_network(options.init), read_history(options.init))
     source = ShardSource(options.data, config.batch_size, config.seed, augmentation=config.augmentation)
     console = Console()
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6

@@ -12,7 +12,7 @@ import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,8 @@ from torch import nn
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model, restart_from_prior
-from unirender.models.conditioning import Maps
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.priors import Maps
 from unirender.training.checkpoint import load_state, save_state
 from unirender.training.ema import Ema
 from unirender.training.live import Report
@@ -83,6 +83,7 @@ class Trainer:
         self.gradient = BatchGradient(self.loss, config, run.parallel, self.generator, dtype)
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
+        self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
 
     @property
     def progress(self) -> float:
@@ -91,10 +92,14 @@ class Trainer:
         by_clock = self.seconds / (60 * self.run.minutes) if self.run.minutes else 0.0
         return max(by_steps, by_clock)
 
-    def start_from(self, network: DualStreamModel) -> None:
+    def start_from(self, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:
         """Begins with the weights of another network, the average too. A state in the run's folder goes before.
 
         With another physics prior than the network's the image stream's last convolution starts at zero again.
+
+        Args:
+            network: of the same shape.
+            history: what `unirender.training.export.read_history` says of it.
 
         Raises:
             UnirenderError: the networks differ.
@@ -111,6 +116,7 @@ class Trainer:
         if network.config["physics_prior"] != self.model.config["physics_prior"]:
             restart_from_prior(self.model)  # what it added to the other closed form is no correction of this one
         self.ema = Ema(self.model, self.config.optimizer.ema_decay)
+        self.continues = list(history)
 
     def train_step(self, batch: Maps) -> dict[str, float]:
         """One optimiser step; returns the loss terms."""
@@ -227,6 +233,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "parallel": self.run.parallel,
+            "continues": self.continues,
         }
 
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
@@ -245,6 +252,7 @@ class Trainer:
                 f"{self.run.out}: holds a run with another {', '.join(differing)}; pass another --out, or the preset"
             )
         self.step, self.seconds = state["step"], state["seconds"]
+        self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
         self.model.load_state_dict(state["model"])
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
