@@ -99,13 +99,6 @@ def test_cycle_can_be_off() -> None:
     assert "cycle" not in waiting.terms(make_batch(), inverse(), generator())
 
 
-def test_composite_loss_vanishes_for_the_true_maps() -> None:
-    loss, batch = loss_function(composite=1.0), make_batch()
-    true = loss.conditioning.encode_attributes(batch)
-    assert float(loss._composite_error(true, batch)) < 1e-8
-    assert float(loss._composite_error(true + 0.1, batch)) > 1e-4
-
-
 def test_dropped_maps_reach_the_network_as_noise_only() -> None:
     """With every droppable map withheld, the rendering does not depend on them."""
     batch = make_batch()

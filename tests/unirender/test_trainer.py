@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import math
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,18 @@ from tiny_models import TRAIN, make_batch
 from torch import Tensor, nn
 
 from unirender.diffusion.sampling import infer_attributes, infer_image
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.training.augment import NO_AUGMENTATION
-from unirender.training.checkpoint import STATE_FILE, load_state, save_state
+from unirender.training.checkpoint import STATE_FILE, load_state, replace_folder, restore_folder, save_state
 from unirender.training.data import iterate_batches
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, load_network, read_history
 from unirender.training.live import live_report
 from unirender.training.presets import PRESETS, OptimizerConfig, TrainConfig, get_preset
+from unirender.training.run import Train
 from unirender.training.source import ShardSource
 from unirender.training.trainer import RunConfig, Trainer, learning_rate
 from unirender.training.validation import Validate
@@ -427,3 +429,69 @@ def test_the_augmentation_of_a_config_reaches_the_batches(tmp_path: Path) -> Non
     stored = next(iterate_batches(data, 2, 0, workers=0, augmentation=NO_AUGMENTATION))
     assert torch.equal(batches[0]["image"], stored["image"])
     assert not torch.equal(batches[1]["image"], stored["image"])
+
+
+def test_many_passes_keep_the_weight_of_every_loss(tmp_path: Path) -> None:
+    """More passes than rendering samples: each pass still has a sample of each kind, and the shares add to one."""
+    config = dataclasses.replace(TRAIN, batch_size=8, p_render=0.25)
+    trainer = Trainer(config, RunConfig(tmp_path, steps=2, parallel=6), CPU, torch.float32)
+    passes = list(trainer.gradient._passes(make_batch(8)))
+    assert len(passes) == 2  # rendering samples
+    assert sum(part.share for part in passes) == pytest.approx(1.0)
+    assert all({"image", "albedo"} <= part.terms().keys() for part in passes)
+
+
+def test_data_of_another_size_is_refused(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path, size=32)
+    ShardSource(data, 2, 0, size=32).open()
+    with pytest.raises(UnirenderError, match="got pictures of 32 x 32, expected 64 x 64"):
+        ShardSource(data, 2, 0, size=64).open()
+
+
+def test_only_steps_count_as_training(tmp_path: Path) -> None:
+    naps: list[float] = []
+
+    def slow(pipeline: UniRenderPipeline) -> dict[str, Score]:
+        time.sleep(0.5)
+        naps.append(0.5)
+        return {"error": Score(1.0, higher_is_better=False)}
+
+    before = time.monotonic()
+    fit(tmp_path, 2, slow)
+    elapsed = time.monotonic() - before
+    state = load_state(tmp_path)
+    assert state is not None
+    assert len(naps) >= 3
+    assert 0 < state["seconds"] < elapsed - sum(naps)
+
+
+def test_a_resume_forgets_what_the_log_says_of_later_steps(tmp_path: Path) -> None:
+    run_for(tmp_path, 2)
+    log = tmp_path / "log.jsonl"
+    known = '{"step": 1, "image": 2.0}\n{"step": 2, "image": 1.5}\n'
+    log.write_text(known + json.dumps({"step": 3, "image": 1.0}) + '\n{"step": 4, "ima')  # killed while writing
+    Trainer(TRAIN, RunConfig(tmp_path, steps=4), CPU, torch.float32).resume(SyntheticSource())
+    assert log.read_text() == known
+
+
+def test_a_folder_is_there_before_and_after_its_replacement(tmp_path: Path) -> None:
+    def finished(text: str) -> Path:
+        (tmp_path / "new").mkdir()
+        (tmp_path / "new" / "file").write_text(text)
+        return tmp_path / "new"
+
+    best = tmp_path / "best"
+    for text in ("one", "two"):
+        replace_folder(best, finished(text))
+        assert (best / "file").read_text() == text
+    best.rename(tmp_path / "best.old")  # killed between the two moves
+    restore_folder(best)
+    assert (best / "file").read_text() == "two"
+    replace_folder(best, finished("three"))
+    assert [path.name for path in tmp_path.iterdir()] == ["best"]
+
+
+@pytest.mark.parametrize("preset", ["sd15", "paper"])
+def test_presets_on_latents_say_that_they_cannot_be_trained_yet(preset: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="Stable Diffusion's autoencoder"):
+        Train(data=tmp_path, preset=preset).check()

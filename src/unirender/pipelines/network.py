@@ -111,5 +111,5 @@ class Network:
         return maps, torch.tensor([given], device=self.model.device)
 
     def _tensor(self, array: Float[np.ndarray, "h w c"]) -> torch.Tensor:
-        contiguous = np.ascontiguousarray(np.moveaxis(array, -1, 0), dtype=np.float32)
-        return torch.from_numpy(contiguous)[None].to(self.model.device)
+        copy = np.array(np.moveaxis(array, -1, 0), dtype=np.float32, order="C")  # torch takes no read-only memory
+        return torch.from_numpy(copy)[None].to(self.model.device)

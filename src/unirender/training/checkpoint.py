@@ -1,6 +1,7 @@
 """The training state on disk: one file, written aside, synced and renamed, so that a killed run loses nothing older."""
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -38,3 +39,29 @@ def load_state(folder: Path) -> dict[str, Any] | None:
         raise UnirenderError(
             f"{path}: cannot be read as a training state ({error}); move it away to start anew"
         ) from error
+
+
+def replace_folder(folder: Path, partial: Path) -> Path:
+    """Moves a finished folder into place; the one that was there is gone only after that."""
+    old = _aside(folder)
+    restore_folder(folder)
+    if folder.exists():
+        folder.rename(old)
+    partial.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+    return folder
+
+
+def restore_folder(folder: Path) -> None:
+    """Ends a replacement that was killed between its two moves: the folder is what it was, or the new one."""
+    old = _aside(folder)
+    if not old.exists():
+        return
+    if folder.exists():
+        shutil.rmtree(old)
+    else:
+        old.rename(folder)
+
+
+def _aside(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.old")

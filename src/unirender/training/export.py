@@ -1,7 +1,10 @@
 """From a training run to what users load: the averaged weights as a pipeline folder, and the figures it came from."""
 
 import json
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,6 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.training.checkpoint import replace_folder
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
@@ -55,16 +59,24 @@ def load_network(folder: Path) -> DualStreamModel:
     return UniRenderPipeline.from_pretrained(folder).dual_stream
 
 
-def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch.float16) -> Path:
+def export_pipeline(
+    trainer: "Trainer",
+    folder: Path,
+    dtype: torch.dtype = torch.float16,
+    beside: Mapping[str, str] = MappingProxyType({}),
+) -> Path:
     """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes and preset.
 
     The same of the runs that it continues stands there too.
 
-    Weights are stored as `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
+    Other files, by name, stand in `beside`. The folder is moved into place when it is complete. Weights are stored as
+    `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
     """
+    partial = folder.with_name(f"{folder.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
     pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
-    pipeline.save_pretrained(folder, safe_serialization=True)
-    for path in folder.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
+    pipeline.save_pretrained(partial, safe_serialization=True)
+    for path in partial.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
         path.chmod(0o644)
     facts = {
         "steps": trainer.step,
@@ -75,5 +87,7 @@ def export_pipeline(trainer: "Trainer", folder: Path, dtype: torch.dtype = torch
         "train": trainer.state_dict()["config"],
         "continues": trainer.continues,
     }
-    (folder / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
-    return folder
+    (partial / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+    for name, text in beside.items():
+        (partial / name).write_text(text)
+    return replace_folder(folder, partial)

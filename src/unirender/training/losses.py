@@ -14,12 +14,11 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unirender.camera import Camera
 from unirender.diffusion.schedule import add_noise, last_timestep
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras, pack_image, prior_picture
+from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.models.priors import PRIORS, Maps
+from unirender.models.priors import Maps
 from unirender.training.presets import LossConfig
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without
@@ -125,8 +124,6 @@ class LossFunction:
         """The losses that compare what the predicted attributes look like with the true image."""
         assert predicted is not None
         terms: LossTerms = {}
-        if self.config.composite:
-            terms["composite"] = self._composite_error(predicted, batch)
         count = round(self.config.cycle_share * len(predicted))
         if not self.config.cycle or self.cycle_scale == 0 or not count:
             return terms
@@ -148,13 +145,6 @@ class LossFunction:
         noise = _noise_like(clean_i, generator)
         output = self._forward(predicted, noise, Timesteps(torch.zeros_like(t), t), extras, None, slice(None))
         return self._image_error(output.image, clean_i, mask)
-
-    def _composite_error(self, predicted: Tensor, batch: Maps) -> Float[Tensor, ""]:
-        maps = self.conditioning.decode_attributes(predicted.float())
-        error = (
-            prior_picture(PRIORS["composite"], maps, batch["mask"], Camera()) - pack_image(batch["image"])
-        ).square()
-        return _weighted_mean(error, self._pixel_weights(batch["mask"]).expand_as(error))
 
     def _pixel_weights(self, mask: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 1 H W"]:
         return self.config.background + (1 - self.config.background) * mask

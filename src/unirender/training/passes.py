@@ -34,7 +34,7 @@ class BatchGradient:
     Args:
         loss: of the model.
         config: batch and timestep rule.
-        parallel: parts that run side by side.
+        parallel: parts that run side by side, at most; none is without a row of each kind that the batch has.
         generator: on the CPU; of timesteps, noise and dropped maps.
         dtype: of the autocast; float32: none.
     """
@@ -73,14 +73,13 @@ class BatchGradient:
         drawn = draw_timesteps(c.timestep_rule, size, last, c.p_render, c.p_t, self.generator)
         if c.timestep_rule == "conditional":  # rendering samples come first; every part gets its share of both kinds
             count = int((drawn.attributes == 0).sum())
-            kinds = torch.arange(count), torch.arange(count, size)
-            parts = [torch.cat(rows) for rows in zip(*(k.tensor_split(self.parallel) for k in kinds), strict=True)]
+            kinds = [rows for rows in (torch.arange(count), torch.arange(count, size)) if len(rows)]
         else:
-            parts = list(torch.arange(size).tensor_split(self.parallel))
+            kinds = [torch.arange(size)]
+        number = min(self.parallel, *map(len, kinds))  # a part without a kind would drop its share of that kind's loss
+        parts = [torch.cat(rows) for rows in zip(*(rows.tensor_split(number) for rows in kinds), strict=True)]
         terms = self.loss.terms if c.timestep_rule == "conditional" else self.loss.joint_terms
         for rows in parts:
-            if not len(rows):
-                continue
             part = {name: value[rows] for name, value in batch.items()}
             device = batch["image"].device
             t = Timesteps(drawn.attributes[rows].to(device), drawn.image[rows].to(device))

@@ -45,7 +45,6 @@ class LossConfig:
     cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
-    composite: float = 0.0  # weight of the closed-form image of the predicted maps (ours)
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ _SD_MODEL = ModelConfig(
 _SD = TrainConfig(
     model=_SD_MODEL,
     optimizer=OptimizerConfig(
-        learning_rate=1e-5, beta1=0.8, beta2=0.999, warmup_steps=0, final_lr=1.0, ema_decay=0.9999
+        learning_rate=1e-5, beta1=0.8, beta2=0.999, weight_decay=0.0, warmup_steps=0, final_lr=1.0, ema_decay=0.9999
     ),
     batch_size=4,
     steps=150_000,

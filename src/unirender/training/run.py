@@ -77,6 +77,11 @@ class Train:
         if self.learning_rate is not None:
             optimizer = dataclasses.replace(config.optimizer, learning_rate=self.learning_rate)
             config = dataclasses.replace(config, optimizer=optimizer)
+        if config.model.codec == "kl":
+            raise UsageError(
+                f"--preset {self.preset}: its network works on latents of Stable Diffusion's autoencoder, which this "
+                "command cannot load yet; choose a preset with the pixel codec, such as tiny or small"
+            )
         return config
 
     def run(self, make_validation: MakeValidation) -> int:
@@ -120,7 +125,10 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     trainer = Trainer(config, run, device, dtype)
     if options.init is not None:
         trainer.start_from(load_network(options.init), read_history(options.init))
-    source = ShardSource(options.data, config.batch_size, config.seed, augmentation=config.augmentation)
+    source = ShardSource(
+        options.data, config.batch_size, config.seed, augmentation=config.augmentation, size=config.model.resolution
+    )
+    source.open()
     console = Console()
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     console.print(

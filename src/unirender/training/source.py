@@ -45,21 +45,40 @@ class ShardSource:
         seed: int,
         workers: int = 1,
         augmentation: Augmentation = DEFAULT_AUGMENTATION,
+        size: int | None = None,
     ) -> None:
         self.folder, self.batch_size, self.seed, self.workers = Path(folder), batch_size, seed, workers
-        self.augmentation = augmentation
+        self.augmentation, self.size = augmentation, size
         self.consumed = 0
         self.dataset: GroupDataset | None = None
         self._batches: Iterator[Batch] | None = None
 
     def next(self) -> Batch:
         if self._batches is None:
-            self.dataset = self.dataset or GroupDataset(self.folder)
             self._batches = iterate_batches(
-                self.dataset, self.batch_size, self.seed, self.consumed, self.workers, self.augmentation
+                self.open(), self.batch_size, self.seed, self.consumed, self.workers, self.augmentation
             )
         self.consumed += self.batch_size
         return next(self._batches)
+
+    def open(self) -> GroupDataset:
+        """Opens the folder, unless it is open.
+
+        Raises:
+            UnirenderError: no usable shards, or pictures of another size than `size`, where that is given.
+        """
+        self.dataset = self.dataset or self._open()
+        return self.dataset
+
+    def _open(self, shards: tuple[str, ...] | None = None) -> GroupDataset:
+        dataset = GroupDataset(self.folder, shards)
+        height, width = dataset.resolution
+        if self.size is not None and (height, width) != (self.size, self.size):
+            raise UnirenderError(
+                f"{self.folder}: got pictures of {height} x {width}, expected {self.size} x {self.size}, the size that "
+                f"the network is made for; render data with --resolution {self.size}, or choose another preset"
+            )
+        return dataset
 
     def state_dict(self) -> dict[str, Any]:
         shards = list(self.dataset.shard_names) if self.dataset else None
@@ -76,7 +95,7 @@ class ShardSource:
         self.consumed, self.seed = state["consumed"], state["seed"]
         if state["shards"] is None:
             return
-        self.dataset = GroupDataset(self.folder, tuple(state["shards"]))
+        self.dataset = self._open(tuple(state["shards"]))
         if self.dataset.fingerprint != state["fingerprint"]:
             raise UnirenderError(
                 f"{self.folder}: the shards differ from those that this run was trained on, expected the same data; "
@@ -86,7 +105,7 @@ class ShardSource:
     def refresh(self) -> str | None:
         if self.dataset is None:
             return None
-        dataset = GroupDataset(self.folder)
+        dataset = self._open()
         if dataset.fingerprint == self.dataset.fingerprint:
             return None
         grown = f"data: {len(self.dataset.shard_names)} -> {len(dataset.shard_names)} shards at sample {self.consumed}"

@@ -169,13 +169,13 @@ class Trainer:
         look()
         clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
         while self.progress < 1:
+            clock["step"] = time.monotonic()  # pictures, validation and saves are no training
             batch = source.next()
             fixed = batch if fixed is None else fixed
             for name, value in (self.train_step(batch) | self.overflow(batch)).items():
                 sums[name].append(value)
             now = time.monotonic()
             self.seconds += now - clock["step"]
-            clock["step"] = now
             if self.step % self.run.log_every == 0 or self.progress >= 1:
                 means = {name: sum(values) / len(values) for name, values in sums.items()}
                 count = max(len(values) for values in sums.values())
@@ -258,6 +258,7 @@ class Trainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
         source.load_state_dict(state["source"])
+        self._forget_newer()
         parallel = state.get("parallel", self.run.parallel)  # states of version 0.1.0 do not say
         if parallel != self.run.parallel:
             news = f"{parallel} -> {self.run.parallel}: from here on other noise is drawn than without the change"
@@ -272,6 +273,17 @@ class Trainer:
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
         self.run.out.mkdir(parents=True, exist_ok=True)
         (self.run.out / "config.json").write_text(text + "\n")
+
+    def _forget_newer(self) -> None:
+        """Drops the lines of the log that a killed run wrote after its last state: their steps come again."""
+        path = self.run.out / "log.jsonl"
+        if not path.is_file():
+            return
+        lines = path.read_text().splitlines(keepends=True)
+        kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= self.step]
+        partial = path.with_name(f"{path.name}.partial")
+        partial.write_text("".join(kept))
+        partial.replace(path)
 
     def _log(self, line: dict[str, Any]) -> None:
         self.run.out.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,6 @@ with `keep_best` the pipeline that scored best stands in the run's folder `best/
 
 import dataclasses
 import json
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
+from unirender.training.checkpoint import restore_folder
 from unirender.training.export import averaged_pipeline, export_pipeline
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ class Validation:
 
 def best_score(folder: Path, name: str) -> Score | None:
     """The named score of the pipeline in `best/`; None where there is none."""
+    restore_folder(folder)
     path = folder / SCORES_FILE
     if not path.is_file():
         return None
@@ -73,10 +74,5 @@ def best_score(folder: Path, name: str) -> Score | None:
 
 
 def _replace_best(trainer: "Trainer", folder: Path, scores: Mapping[str, Score]) -> None:
-    partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    export_pipeline(trainer, partial)
     record = {"step": trainer.step, "scores": {name: dataclasses.asdict(score) for name, score in scores.items()}}
-    (partial / SCORES_FILE).write_text(json.dumps(record, indent=2) + "\n")
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.rename(folder)
+    export_pipeline(trainer, folder, beside={SCORES_FILE: json.dumps(record, indent=2) + "\n"})
