@@ -7,9 +7,7 @@ plan.
 
 import json
 import multiprocessing
-import multiprocessing.connection
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -25,6 +23,7 @@ from unirender_reference import backend, exposure
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
 from unirender_reference.plan import SHARD_GROUPS, DatasetConfig, GroupPlan, plan_groups
+from unirender_reference.processes import exit_with_parent
 from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hashes, shared_scene_hash
 from unirender_reference.shapes import make_object
 from unirender_reference.shards import ShardRecord, finished_shards, shard_name, write_manifest, write_shard
@@ -82,6 +81,8 @@ def generate(config: DatasetConfig, progress: Progress | None = None) -> Generat
         UnirenderError: the folder is unusable or holds another data set, or a render failed.
     """
     start = time.perf_counter()
+    if config.out.exists() and not config.out.is_dir():
+        raise UnirenderError(f"{config.out}: is a file, expected a folder to write shards to; choose another --out")
     try:
         config.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -225,12 +226,5 @@ def _render_groups(config: DatasetConfig, plans: list[GroupPlan], workers: int) 
 
 def _start_worker() -> None:
     """One thread per worker; a worker ends with its parent, even if that is killed."""
+    exit_with_parent()
     backend.set_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()

@@ -5,6 +5,7 @@ comes from the spread between passes (Mitsuba's `moment` integrator gives XYZ, n
 """
 
 import hashlib
+import itertools
 import math
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from unirender_reference.backend import mitsuba
 TRUTH_BATCHES = 8
 SAMPLES_PER_PASS = 1 << 23  # wavefront size: memory grows with it
 NAN_ATTEMPTS = 8
+MOST_SPLITS = 8  # passes to make of one that is no full grid: small passes are hardly stratified
 
 
 @dataclass(frozen=True)
@@ -128,14 +130,33 @@ def pass_count(spp: int, batches: int, most: int) -> int:
         spp: samples per pixel in all.
         batches: least number of passes.
         most: largest number of samples per pixel in one pass.
+
+    Raises:
+        UnirenderError: fewer samples than batches, or more than `MOST_SPLITS` times as many passes as `batches` and
+            `most` ask for (67 samples in one batch are 67 passes of one sample).
     """
     if spp < 1 or batches < 1 or batches > spp:
         raise UnirenderError(f"spp: got {spp} in {batches} batches, expected at least one sample in each")
-    for count in range(batches, spp + 1):
+    if (count := _grid_passes(spp, batches, most)) is not None:
+        return count
+    below = next(n for n in range(spp - 1, 0, -1) if n < batches or _grid_passes(n, batches, most) is not None)
+    above = next(n for n in itertools.count(spp + 1) if _grid_passes(n, batches, most) is not None)
+    advice = f"use {below} or {above}" if below >= batches else f"use {above}"
+    raise UnirenderError(
+        f"spp: got {spp} in {batches} batches, expected a number that divides into a few full multi-jittered grids "
+        f"(4, 6, 9, 16, 64, ... samples a pass); {advice}"
+    )
+
+
+def _grid_passes(spp: int, batches: int, most: int) -> int | None:
+    """`pass_count`, or None where there are too many."""
+    most = max(most, 1)
+    needed = max(batches, -(-spp // most))
+    for count in range(needed, min(spp, needed * MOST_SPLITS) + 1):
         size = spp // count
-        if spp % count == 0 and size <= max(most, 1) and size % math.isqrt(size) == 0:
+        if spp % count == 0 and size % math.isqrt(size) == 0:
             return count
-    raise UnirenderError(f"spp: got {spp} in {batches} batches, expected one that can be divided; use a power of 2")
+    return None
 
 
 def derive_seed(*parts: int | str) -> int:

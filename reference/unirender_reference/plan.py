@@ -20,12 +20,13 @@ from typing import Literal
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender_reference.passes import derive_seed
+from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, pass_count
 
 Vary = Literal["basis", "independent", "one-at-a-time", "paper"]
 MAX_LIGHTS = 8
 METALLIC_NODES = (0, 50, 100)
-GRID = tuple(range(0, 101, 10))
+PERCENTS = 101  # 0 .. 100
+GRID = tuple(range(0, PERCENTS, 10))
 OBJECT_BLOCK = 8  # objects that share a light and a material in "one-at-a-time"
 SHARD_GROUPS = 16
 
@@ -61,8 +62,10 @@ class DatasetConfig:
         for name in ("objects", "pairs", "resolution", "spp"):
             if getattr(self, name) < 1:
                 raise UnirenderError(f"dataset {name}: got {getattr(self, name)}, expected at least 1")
-        if self.seed < 0:
-            raise UnirenderError(f"dataset seed: got {self.seed}, expected 0 or more")
+        for name in ("seed", "workers"):
+            if getattr(self, name) < 0:
+                raise UnirenderError(f"dataset {name}: got {getattr(self, name)}, expected 0 or more")
+        pass_count(self.spp, 1, SAMPLES_PER_PASS // self.resolution**2)
         if self.vary not in ("basis", "independent", "one-at-a-time", "paper"):
             raise UnirenderError(
                 f"dataset vary: got {self.vary!r}, expected basis, independent, one-at-a-time or paper"
@@ -71,8 +74,16 @@ class DatasetConfig:
             basis_shape(self.pairs)
         if self.vary == "paper" and self.pairs != len(GRID) ** 2:
             raise UnirenderError(f"dataset pairs: got {self.pairs}, expected {len(GRID) ** 2} with --vary paper")
-        if self.vary == "one-at-a-time" and self.pairs < 3:
-            raise UnirenderError(f"dataset pairs: got {self.pairs}, expected at least 3 with --vary one-at-a-time")
+        if self.vary == "independent" and self.pairs > PERCENTS**2:
+            raise UnirenderError(
+                f"dataset pairs: got {self.pairs}, expected at most {PERCENTS**2} materials of whole percents with "
+                "--vary independent"
+            )
+        if self.vary == "one-at-a-time" and not 3 <= self.pairs <= 3 * PERCENTS**2:
+            raise UnirenderError(
+                f"dataset pairs: got {self.pairs}, expected at least 3 and at most {3 * PERCENTS**2} with "
+                "--vary one-at-a-time"
+            )
 
     def content(self) -> dict[str, object]:
         """The part that decides the bytes of a group, JSON-serialisable; `objects` may grow later."""
@@ -82,11 +93,14 @@ class DatasetConfig:
 
 @dataclass(frozen=True)
 class LightPlan:
-    """A light of a group and its pictures, (roughness, metallic) in percent."""
+    """A light of a group and its pictures, distinct (roughness, metallic) in percent: they name the members."""
 
     seed: int
     exposure_seed: int
     pairs: tuple[tuple[int, int], ...]
+
+    def __post_init__(self) -> None:
+        assert len(set(self.pairs)) == len(self.pairs), f"pairs of a light occur twice: {self.pairs}"
 
 
 @dataclass(frozen=True)
@@ -162,7 +176,7 @@ def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, lis
         material = _materials(rng, 1)
         for pairs in _chunks(material * (config.pairs - 2 * each), MAX_LIGHTS):
             yield "object material", [_light(rng, (pair,)) for pair in pairs]
-        yield "object light", [_light(rng, tuple(dict.fromkeys(_materials(rng, each))))]
+        yield "object light", [_light(rng, tuple(_materials(rng, each)))]
         block = np.random.default_rng(derive_seed(config.seed, "block", config.split, index // OBJECT_BLOCK))
         for pairs in _chunks(_materials(block, each), MAX_LIGHTS):
             yield "light material", [_light(block, (pair,)) for pair in pairs]
@@ -173,15 +187,21 @@ def _light(rng: np.random.Generator, pairs: tuple[tuple[int, int], ...]) -> Ligh
 
 
 def _stratified(rng: np.random.Generator, levels: int) -> list[int]:
-    """One roughness (percent) from each of `levels` equal strata of [0, 100], ends included."""
-    values = (np.arange(levels) + rng.random(levels)) / levels * 101 - 0.5
-    return [int(value) for value in np.clip(np.round(values), 0, 100)]
+    """One roughness (percent) from each of `levels` equal strata of [0, 100], ends included; all distinct.
+
+    Draws just below and just above a border of strata can round to the same percent: the upper one is then one more.
+    """
+    values = (np.arange(levels) + rng.random(levels)) / levels * PERCENTS - 0.5
+    percents = [int(value) for value in np.clip(np.round(values), 0, 100)]
+    for upper in range(1, levels):
+        percents[upper] = max(percents[upper], percents[upper - 1] + 1)
+    return percents
 
 
 def _materials(rng: np.random.Generator, count: int) -> list[tuple[int, int]]:
     """`count` distinct materials, uniform in (roughness, metallic)."""
-    cells = rng.choice(101 * 101, size=count, replace=False)
-    return [(int(cell // 101), int(cell % 101)) for cell in cells]
+    cells = rng.choice(PERCENTS**2, size=count, replace=False)
+    return [(int(cell // PERCENTS), int(cell % PERCENTS)) for cell in cells]
 
 
 def _chunks(items: list[tuple[int, int]], size: int) -> Iterator[list[tuple[int, int]]]:

@@ -230,12 +230,11 @@ def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer |
 def renderer_provenance(renderer: Renderer) -> dict[str, str]:
     """What rendered, of what, through which camera: header attributes of every file made from it."""
     mi = mitsuba()
-    camera = renderer.camera
     return {
         "mitsuba": mi.__version__,
         "variant": mi.variant(),
         "object": renderer.obj.name,
-        "camera": f"fov_deg={camera.fov_deg:g} principal={camera.principal[0]:g},{camera.principal[1]:g}",
+        "camera": renderer.camera.describe(),
         "resolution": str(renderer.resolution),
     }
 

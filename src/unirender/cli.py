@@ -104,8 +104,8 @@ class Dataset:
             )
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task("groups", total=None)
-            report = generate(config, lambda done, total: bar.update(task, completed=done, total=total))
+            task = bar.add_task("groups", total=None, visible=False)  # until there is something to do
+            report = generate(config, lambda done, total: bar.update(task, completed=done, total=total, visible=True))
         if report.groups == 0:
             print(
                 f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"

@@ -2,8 +2,9 @@
 
 Channel names: `R,G,B[,A]` (the image, premultiplied), `albedo.R/G/B`, `normal.X/Y/Z`, `roughness.Y`, `metallic.Y`,
 `specular.R/G/B`, `diffuse.R/G/B`; the mask is `A`, or `mask.Y` where there is no image. Half precision by default; an
-environment is a file of its own in float32, since the sun overflows half. Provenance stands in string attributes
-`unirender:*`. Equal content gives equal bytes.
+environment is a file of its own in float32, since the sun overflows half, and says that it stands on the grid of
+`unirender.lighting`: most lat-long maps do not. Provenance stands in string attributes `unirender:*`. Equal content
+gives equal bytes.
 """
 
 import io
@@ -24,6 +25,8 @@ Channels = dict[str, Float[np.ndarray, "h w"]]
 
 HALF_MAX = 65504.0
 ATTRIBUTE_PREFIX = "unirender:"
+GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
+GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
 
 
@@ -56,6 +59,26 @@ def write_exr(
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def write_environment(
+    path: str | Path, environment: Float[np.ndarray, "h w 3"], attributes: Mapping[str, str] | None = None
+) -> None:
+    """Writes an environment of the contract (rows on the poles, `unirender.lighting`) in float32, marked as one.
+
+    `on_pole_grid` knows it again. Arguments and errors as `write_exr`.
+    """
+    marked = {**(attributes or {}), GRID_ATTRIBUTE: POLE_GRID}
+    write_exr(path, image_channels(environment), half=False, attributes=marked)
+
+
+def on_pole_grid(attributes: Mapping[str, str]) -> bool:
+    """Whether a lat-long map with these attributes is an environment of the contract, to be taken as it is.
+
+    True for files of `write_environment` and for those of data sets and suites, which carry their exposure factor.
+    Every other map is taken as areas: its first and last row end at the poles.
+    """
+    return attributes.get(GRID_ATTRIBUTE) == POLE_GRID or GAUGE_ATTRIBUTE in attributes
 
 
 def exr_bytes(

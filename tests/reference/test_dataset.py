@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 import webdataset
 
+from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr_bytes
 from unirender_reference.dataset import generate
 from unirender_reference.lights import make_light
-from unirender_reference.plan import GRID, DatasetConfig, basis_shape, plan_groups
+from unirender_reference.passes import derive_seed
+from unirender_reference.plan import GRID, DatasetConfig, LightPlan, basis_shape, plan_groups
 from unirender_reference.render import SceneSpec, scene_hash
 from unirender_reference.shapes import make_object
 from unirender_reference.shards import shard_name, write_shard
@@ -29,7 +31,7 @@ SPP = 16
 
 
 def config(out: Path, objects: int = 2, pairs: int = 3, vary: str = "basis", **changes: object) -> DatasetConfig:
-    return DatasetConfig(objects, pairs, SIZE, vary, out, spp=SPP, workers=1, **changes)  # type: ignore[arg-type] - from tests
+    return DatasetConfig(objects, pairs, SIZE, vary, out, **{"spp": SPP, "workers": 1, **changes})  # type: ignore[arg-type] - from tests
 
 
 def read_back(folder: Path) -> list[dict[str, bytes]]:
@@ -66,6 +68,23 @@ def test_plan_has_the_pairs_asked_for(vary: str, pairs: int, tmp_path: Path) -> 
     assert [group.index for group in groups] == list(range(len(groups)))
     assert groups == plan_groups(config(tmp_path, 3, pairs, vary))
     assert groups[: len(plan_groups(config(tmp_path, 2, pairs, vary)))] == plan_groups(config(tmp_path, 2, pairs, vary))
+
+
+def test_roughness_values_of_a_group_are_distinct(tmp_path: Path) -> None:
+    """Draws on both sides of a border of strata may round to the same percent: members would then be merged."""
+    groups = plan_groups(config(tmp_path, 600, 48))
+    levels = np.array([sorted({r for r, _ in group.lights[0].pairs}) for group in groups])
+    assert levels.shape == (600, 4)
+    assert all(group.samples == 48 for group in groups)
+    assert levels[89].tolist() == [25, 26, 60, 94]  # the lower two draws round to 25
+    rng = np.random.default_rng(derive_seed(0, "plan", "train", "basis", 88))  # where none collide, they stay
+    drawn = np.round((np.arange(4) + rng.random(4)) / 4 * 101 - 0.5)
+    assert levels[88].tolist() == drawn.tolist()
+
+
+def test_a_pair_twice_is_no_plan() -> None:
+    with pytest.raises(AssertionError, match="occur twice"):
+        LightPlan(0, 0, ((25, 0), (25, 50), (25, 0)))
 
 
 def test_basis_covers_low_and_high_roughness_evenly(tmp_path: Path) -> None:
@@ -110,7 +129,11 @@ def test_one_at_a_time_shares_all_but_one(tmp_path: Path) -> None:
         ({"pairs": 4}, "pairs: got 4"),
         ({"vary": "paper"}, "expected 121"),
         ({"vary": "one-at-a-time", "pairs": 2}, "at least 3"),
+        ({"vary": "one-at-a-time", "pairs": 40000}, "at most 30603"),
+        ({"vary": "independent", "pairs": 10202}, "at most 10201"),
         ({"seed": -1}, "seed: got -1"),
+        ({"workers": -1}, "workers: got -1"),
+        ({"spp": 67}, "use 64 or 70"),
     ],
 )
 def test_bad_configurations_are_refused(changes: dict, message: str, tmp_path: Path) -> None:
@@ -250,6 +273,35 @@ def test_killed_run_resumes_to_the_same_manifest(whole: Path, tmp_path: Path) ->
     assert generate(config(out, pairs=6)).groups == 2
     assert (out / "manifest.json").read_bytes() == (whole / "manifest.json").read_bytes()
     assert sorted(path.name for path in out.iterdir()) == ["manifest.json", "shard-000000.tar"]
+
+
+def test_a_file_is_no_folder_for_shards(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(UnirenderError, match="file: is a file, expected a folder"):
+        generate(config(tmp_path / "file"))
+    with pytest.raises(UnirenderError, match="cannot be made"):
+        generate(config(tmp_path / "file" / "below"))
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (("--workers", "-1"), 2, "workers: got -1"),
+        (("--spp", "67"), 2, "use 64 or 70"),
+        ((), 1, "is a file"),
+    ],
+)
+def test_wrong_arguments_are_one_line(
+    arguments: tuple[str, ...], status: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(SystemExit) as stop:
+        main(["dataset", "--out", str(tmp_path / "file"), *arguments])
+    assert stop.value.code == status
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert words in line
+    assert "internal" not in line
 
 
 def test_keys_with_dots_or_twice_are_refused(tmp_path: Path) -> None:

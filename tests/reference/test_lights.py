@@ -271,6 +271,45 @@ def test_a_picture_seen_in_the_window_stands_upright_and_unmirrored(tmp_path):
     assert brightest[0] > 0.3
 
 
+def test_a_phones_photograph_is_turned_upright(tmp_path):
+    """Its pixels lie on the side, and EXIF orientation 6 says: turn a quarter clockwise to see it."""
+    upright = np.random.default_rng(0).integers(0, 256, (90, 180, 3), np.uint8)
+    Image.fromarray(upright).save(tmp_path / "upright.png")
+    lying, exif = Image.fromarray(np.rot90(upright, 1)), Image.Exif()
+    exif[0x0112] = 6
+    lying.save(tmp_path / "phone.png", exif=exif)
+    lying.save(tmp_path / "sideways.png")
+    maps = {name: lights.load_light(tmp_path / f"{name}.png").environment for name in ("upright", "phone", "sideways")}
+    np.testing.assert_array_equal(maps["phone"], maps["upright"])
+    assert np.abs(maps["sideways"] - maps["upright"]).max() > 0.1
+
+
+def test_16_bit_grey_keeps_its_range(tmp_path):
+    grey = np.linspace(0, 65535, 180).round().astype(np.uint16)[None].repeat(90, 0)
+    Image.fromarray(grey).save(tmp_path / "deep.png")
+    Image.fromarray((grey / 257).round().astype(np.uint8)).save(tmp_path / "eight.png")
+    deep, eight = (
+        lights.load_light(tmp_path / f"{name}.png", normalise=False).environment for name in ("deep", "eight")
+    )
+    np.testing.assert_allclose(deep, eight, rtol=0.02, atol=0.1)  # 8 bits: half a step of 1/255 near white is 7 %
+    assert np.median(deep) < 0.5
+
+
+def test_alpha_of_a_photograph_is_dropped(tmp_path):
+    rgba = np.random.default_rng(0).integers(0, 256, (90, 180, 4), np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "alpha.png")
+    Image.fromarray(np.ascontiguousarray(rgba[..., :3])).save(tmp_path / "plain.png")
+    alpha, plain = (lights.load_light(tmp_path / f"{name}.png").environment for name in ("alpha", "plain"))
+    np.testing.assert_array_equal(alpha, plain)
+
+
+@pytest.mark.parametrize(("width", "words"), [(12000, "expected at most"), (20000, "decompression bomb")])
+def test_a_picture_of_too_many_pixels_is_refused(tmp_path, width, words):
+    Image.new("1", (width, 10000)).save(tmp_path / "large.png")
+    with pytest.raises(UnirenderError, match=rf"large\.png: .*{words}"):
+        lights.load_light(tmp_path / "large.png")
+
+
 def bad_file(tmp_path, name: str, data: bytes):
     (tmp_path / name).write_bytes(data)
     return tmp_path / name

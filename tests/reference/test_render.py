@@ -17,6 +17,7 @@ from unirender_reference.render import (
     Renderer,
     SceneSpec,
     render_sample,
+    renderer_provenance,
     scene_hash,
     scene_hashes,
 )
@@ -272,6 +273,30 @@ def test_passes_divide_the_samples_into_full_grids(spp: int, batches: int, count
 
 def test_passes_bound_the_wavefront() -> None:
     assert passes.pass_count(1 << 14, 1, 1 << 10) == 1 << 4
+
+
+@pytest.mark.parametrize(
+    ("spp", "batches", "most", "advice"),
+    [(67, 1, 1 << 20, "use 64 or 70"), (8 * 67, 8, 1 << 20, "use 531 or 539"), (11, 1, 1 << 20, "use 10 or 12")],
+)
+def test_samples_that_fall_apart_into_many_passes_are_refused(spp: int, batches: int, most: int, advice: str) -> None:
+    """67 samples would be 67 passes of one sample each, not stratified at all."""
+    with pytest.raises(UnirenderError, match=advice):
+        passes.pass_count(spp, batches, most)
+    for better in (int(word) for word in advice.split() if word.isdigit()):
+        assert passes.pass_count(better, batches, most) <= passes.MOST_SPLITS * batches
+
+
+def test_small_passes_that_the_wavefront_asks_for_are_not_refused() -> None:
+    assert passes.pass_count(67, 1, 1) == 67
+
+
+def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
+    camera = Camera(100 / 3, (0.25, 2 / 3))
+    for given, text in ((Camera(), "fov_deg=36 principal=0.5,0.5"), (camera, camera.describe())):
+        header = renderer_provenance(Renderer(scenes.sphere(), given, resolution=8))["camera"]
+        assert header == text
+        assert Camera.parse(header) == given
 
 
 @pytest.mark.parametrize(

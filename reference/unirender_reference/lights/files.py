@@ -10,17 +10,23 @@
    multiplied by `FLOOR` as it fades (a floor is darker than what stands on it).
 
 A lat-long LDR panorama (`photograph=False`) gets step 1 only.
+
+**Lat-long maps.** The pixels of a map are areas: its first row ends at the pole, and it is resampled to the contract's
+grid, whose first row lies on it. An EXR that unirender wrote is on that grid already (`unirender.exr.on_pole_grid`) and
+taken as it is.
 """
 
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr
+from unirender.exr import channels_rgb, on_pole_grid, read_exr
+from unirender.lighting import resample_environment
+from unirender.pictures import display_values, open_picture
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
@@ -43,7 +49,8 @@ def load_light(
         path: a lat-long HDR/EXR/PFM map, or an LDR picture.
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
             None: by suffix (HDR formats are lat-long, others are photographs).
-        shape: rows and columns of the result; None: the file's own for lat-long maps, 128 x 256 for photographs.
+        shape: rows and columns of the result; None: the file's own for lat-long maps (bit for bit where it is on the
+            contract's grid), 128 x 256 for photographs.
         normalise: scale to mean luminance 1; False keeps the radiance of the file (of a photograph: white is `PEAK`).
 
     Returns:
@@ -58,7 +65,7 @@ def load_light(
     if not path.is_file():
         raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
     hdr = path.suffix.lower() in HDR_SUFFIXES
-    pixels = _read_hdr(path) if hdr else expand_range(srgb_decode(_read_ldr(path)))
+    pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     if not np.isfinite(pixels).all():
         raise UnirenderError(
             f"light {path}: {(~np.isfinite(pixels)).sum()} values are NaN or infinite, expected finite radiance; "
@@ -76,7 +83,11 @@ def load_light(
                 f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; "
                 "pass photograph=True for an ordinary picture"
             )
-        environment = area_resampled(pixels, shape or (h, w))
+        if on_pole_grid(attributes):
+            provenance["rule"] = "lat-long on the contract's grid"
+            environment = pixels if shape in (None, (h, w)) else resample_environment(pixels, shape)
+        else:
+            environment = area_resampled(pixels, shape or (h, w))
     total = np.abs(environment).sum(dtype=np.float64)
     negative = float(-np.minimum(environment, 0).sum(dtype=np.float64) / max(total, 1e-30))
     if negative > NEGATIVE_MOST:
@@ -130,18 +141,14 @@ def _box_resize(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 
 def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
-    try:
-        with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"), np.float32) / 255
-    except (UnidentifiedImageError, OSError) as error:
-        raise UnirenderError(
-            f"light {path}: not a readable picture ({error}); expected PNG, JPG, HDR or EXR"
-        ) from error
+    """Display values of a picture, upright; an alpha channel is dropped."""
+    return np.ascontiguousarray(display_values(open_picture(path), f"light {path}")[..., :3])
 
 
-def _read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
+def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
+    """Radiance, and the attributes of an EXR's header."""
     if path.suffix.lower() == ".exr":
-        channels, _ = read_exr(path)
+        channels, attributes = read_exr(path)
         if "R" not in channels and "Y" in channels and not {"RY", "BY"} & channels.keys():
             channels = dict.fromkeys("RGB", channels["Y"])
         if not channels.keys() >= set("RGB"):
@@ -149,11 +156,11 @@ def _read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
                 f"light {path}: got EXR channels {', '.join(sorted(channels))}, expected R, G, B, or Y alone (grey); "
                 "convert the file"
             )
-        return channels_rgb(channels)
+        return channels_rgb(channels), attributes
     mi = mitsuba()
     try:
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
         reason = str(error).strip().splitlines()[-1]
         raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
-    return np.array(bitmap)
+    return np.array(bitmap), {}

@@ -1,0 +1,100 @@
+"""Environments that unirender wrote, read back as lights: the same light, where any other lat-long map is resampled."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.cli import read_light
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, on_pole_grid, read_exr, write_environment, write_exr
+from unirender.files import new_folder, write_result
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import diffuse_light, resample_environment, specular_light
+from unirender_reference.dataset import render_group
+from unirender_reference.lights import load_light
+from unirender_reference.lights.light import area_resampled
+from unirender_reference.plan import DatasetConfig, plan_groups
+
+Environment = Float[np.ndarray, "h w 3"]
+
+
+def peaked_environment() -> Environment:
+    """16 x 32, as the model predicts: a dim random sky and one bright texel."""
+    environment = np.random.default_rng(0).uniform(0, 1, (16, 32, 3)).astype(np.float32)
+    environment[3, 20] = 100
+    return environment
+
+
+def written_result(folder: Path, environment: Environment) -> Path:
+    with new_folder(folder / "out") as temporary:
+        write_result(temporary, Intrinsics(environment=environment, camera=Camera()), {"command": "decompose"})
+    return folder / "out" / "environment.exr"
+
+
+def written_environment(folder: Path, environment: Environment) -> Path:
+    write_environment(folder / "light.exr", environment)
+    return folder / "light.exr"
+
+
+@pytest.mark.parametrize("write", [written_result, written_environment])
+def test_a_written_environment_is_read_as_the_same_light(
+    write: Callable[[Path, Environment], Path], tmp_path: Path
+) -> None:
+    environment = peaked_environment()
+    np.testing.assert_array_equal(read_light(write(tmp_path, environment)), environment)
+
+
+def test_an_environment_of_a_data_set_is_read_as_the_same_light(tmp_path: Path) -> None:
+    config = DatasetConfig(1, 3, 8, "basis", tmp_path, spp=4, workers=1)
+    data = render_group(config, plan_groups(config)[0]).members["l0.environment.exr"]
+    (tmp_path / "light.exr").write_bytes(data)
+    channels, _ = read_exr(tmp_path / "light.exr")
+    np.testing.assert_array_equal(read_light(tmp_path / "light.exr"), np.stack([channels[c] for c in "RGB"], -1))
+
+
+def test_any_other_map_is_taken_as_areas(tmp_path: Path) -> None:
+    """The failing twin: without the mark the same pixels are another light, by far more than rounding."""
+    environment = peaked_environment()
+    write_exr(tmp_path / "map.exr", image_channels(environment), half=False, attributes={"author": "someone"})
+    read = read_light(tmp_path / "map.exr")
+    np.testing.assert_array_equal(read, area_resampled(environment, (16, 32)))
+    assert read.max() < 0.6 * environment.max()
+    normal = np.zeros((4, 4, 3), np.float32)
+    normal[..., 2] = 1
+    for buffer in (
+        lambda light: diffuse_light(normal, light),
+        lambda light: specular_light(normal, 0.2, light, Camera()),
+    ):
+        assert np.abs(buffer(read) / buffer(environment) - 1).max() > 0.01
+
+
+def test_the_scale_and_another_shape_of_a_written_environment(tmp_path: Path) -> None:
+    environment = peaked_environment()
+    path = written_environment(tmp_path, environment)
+    light = load_light(path)
+    np.testing.assert_allclose(light.environment, environment * float(light.provenance["scale"]), rtol=1e-6)
+    assert "contract" in light.provenance["rule"]
+    small = load_light(path, shape=(8, 16), normalise=False).environment
+    np.testing.assert_array_equal(small, resample_environment(environment, (8, 16)))
+
+
+def test_a_written_environment_is_checked_like_any_map(tmp_path: Path) -> None:
+    write_environment(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
+    with pytest.raises(UnirenderError, match="got 8x8, expected a lat-long map"):
+        load_light(tmp_path / "square.exr")
+    with pytest.raises(UnirenderError, match="expected finite values"):
+        write_environment(tmp_path / "nan.exr", np.full((8, 16, 3), np.nan, np.float32))
+
+
+def test_the_mark_stands_in_the_header_beside_the_others(tmp_path: Path) -> None:
+    write_environment(tmp_path / "light.exr", peaked_environment(), {"command": "decompose"})
+    channels, attributes = read_exr(tmp_path / "light.exr")
+    assert set(channels) == set("RGB")
+    assert {"command": "decompose", "grid": "poles"}.items() <= attributes.items()
+    assert on_pole_grid(attributes)
+    assert on_pole_grid({"exposure_factor": "1"})
+    assert not on_pole_grid({"command": "decompose", "grid": "areas"})

@@ -1,0 +1,79 @@
+"""Workers end with their parent, even if that is killed; without the guard they do not."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from unirender_reference.processes import exit_with_parent
+
+PARENT = """
+import multiprocessing, os, sys, time
+from concurrent.futures import ProcessPoolExecutor
+from unirender_reference.processes import exit_with_parent
+
+def hang():
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+
+if __name__ == "__main__":
+    context = multiprocessing.get_context("spawn")
+    initializer = exit_with_parent if sys.argv[2] == "guarded" else None
+    if sys.argv[1] == "executor":
+        pool = ProcessPoolExecutor(1, mp_context=context, initializer=initializer)
+        pool.submit(hang).result()
+    else:
+        pool = context.Pool(1, initializer=initializer)
+        pool.apply(hang)
+"""
+
+
+def orphan(folder: Path, pool: str, guard: str) -> int:
+    """The id of a busy worker whose parent was just killed."""
+    (folder / "parent.py").write_text(PARENT)
+    command = [sys.executable, str(folder / "parent.py"), pool, guard]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.stdout.close()  # or the context waits for the worker, which holds the pipe
+    return worker
+
+
+def running(pid: int) -> bool:
+    """Whether the process is there and no zombie."""
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_text())
+    except OSError:
+        return False
+
+
+def ends(pid: int, seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while running(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not running(pid)
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
+@pytest.mark.parametrize("pool", ["executor", "pool"])
+def test_a_guarded_worker_ends_with_its_parent(pool: str, tmp_path: Path) -> None:
+    assert ends(orphan(tmp_path, pool, "guarded"), 10)
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
+def test_an_unguarded_worker_lives_on(tmp_path: Path) -> None:
+    worker = orphan(tmp_path, "executor", "unguarded")
+    try:
+        assert not ends(worker, 2)
+    finally:
+        os.kill(worker, signal.SIGKILL)
+
+
+def test_the_main_process_has_no_such_parent() -> None:
+    with pytest.raises(RuntimeError, match="expected a worker"):
+        exit_with_parent()
