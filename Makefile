@@ -1,5 +1,5 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
-# make bench-full  the same with the slow rows on the whole suite
+# make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
 # make docs        the HTML documentation (docs/_build/html)
 #

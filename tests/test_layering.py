@@ -23,6 +23,7 @@ VOCABULARY = {
         "intrinsics",
         "lighting",
         "paths",
+        "pictures",
         "score",
         "symmetries",
     )

@@ -23,20 +23,18 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.files import checkpoint_sha256
 from unirender_evaluation import bounds, physics_rows
 from unirender_evaluation.engine import Store
-from unirender_evaluation.physics import PHYSICS_TABLE
-from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.records import Record, RunInfo, write_run
-from unirender_evaluation.report import write_report
-from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, trivial_rows
+from unirender_evaluation.report import ALL_TABLES, report_run
+from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
-from unirender_evaluation.specs import TABLES
+from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.tasks import scene_ids
@@ -47,6 +45,12 @@ from unirender_evaluation.workers import Run, run_in_workers
 
 GROUPS = ("ours", "trivial", "plugins")
 FEW = 100  # records: fewer are not worth starting processes
+BOUNDS = (  # keys that no row of a stranger may have
+    bounds.CEILING_KEY,
+    bounds.REFERENCE_KEY,
+    slug(bounds.Shade.name),
+    *(info.key for info in physics_rows.INFOS),
+)
 
 
 @dataclass(frozen=True)
@@ -66,8 +70,8 @@ class BenchConfig:
         check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
         recheck: render them again also where the folder holds the same check.
         jobs: worker processes, each with one thread; 0 = all in this one.
-        device: of our model.
-        sample_scenes: scenes of the sampling rows; 0 = leave them out.
+        device: of our model: auto, cpu, cuda or mps.
+        subsets: scenes of the slow parts.
     """
 
     suite: str = "tiny"
@@ -83,7 +87,7 @@ class BenchConfig:
     recheck: bool = False
     jobs: int = 2
     device: str = "cpu"
-    sample_scenes: int = 4
+    subsets: Subsets = STANDARD
 
 
 @dataclass(frozen=True)
@@ -107,23 +111,26 @@ def build_rows(config: BenchConfig) -> list[Row]:
     """The rows that a configuration asks for.
 
     Raises:
-        UnirenderError: unknown group, no checkpoint, broken plug-in or predictions folder, or two rows of one name.
+        UnirenderError: unknown group, no checkpoint, a device that is not there, broken plug-in or predictions folder,
+            two rows of one name, or one with that of a bound.
     """
     unknown = sorted(set(config.methods) - set(GROUPS))
     if unknown:
         raise UsageError(f"methods: got {', '.join(unknown)}, expected some of {', '.join(GROUPS)}")
     rows: list[Row] = []
     if "ours" in config.methods:
-        folder = config.checkpoint or shipped_checkpoint()
-        pipeline = LazyPipeline(lambda: _load_pipeline(folder, config.device))
-        rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.sample_scenes, config.device)
+        from unirender.models.precision import resolve_device
+
+        folder, device = config.checkpoint or shipped_checkpoint(), str(resolve_device(config.device))
+        pipeline = LazyPipeline(lambda: _load_pipeline(folder, device))
+        rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
     plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
     strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
     if "trivial" in config.methods or strangers:
         rows += trivial_rows()
     if "trivial" in config.methods:
-        rows.append(bounds.shade_row())
-    return check_rows(rows + strangers)
+        rows.append(bounds.shade_row(config.subsets.shade))
+    return check_rows(rows + strangers, BOUNDS)
 
 
 def _load_pipeline(folder: Path, device: str) -> Any:
@@ -138,8 +145,8 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     """Runs or continues a benchmark and writes its folder (see the module).
 
     Raises:
-        UnirenderError: unusable suite, checkpoint, plug-in or predictions; nothing has run then. A failed truth check
-            or claim is no error: the verdict says so.
+        UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions; nothing has run then. A failed
+            truth check or claim is no error: the verdict says so.
     """
     from unirender_evaluation.lpips import available
 
@@ -147,9 +154,12 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     suite, rows = load_suite(config.suite), build_rows(config)
     scenes = scene_ids(suite, config.limit)
     check_predictions(rows, suite)
-    config.out.mkdir(parents=True, exist_ok=True)
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnirenderError(f"{config.out}: cannot be made ({error.strerror}); choose another --out") from error
     backbones = tuple(available())
-    here = Run(suite, rows, scenes, versions(backbones), backbones, config.out / "pictures")
+    here = Run(suite, rows, scenes, versions(backbones), backbones, config.out / "pictures", config.subsets)
     store = Store.open(config.out / "records.jsonl")
     before = set(store.known)
     request = CheckRequest(config.out / "truth_check.json", config.check_scenes, config.check_seed, config.recheck)
@@ -160,14 +170,11 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     records = [record for record in store.close() if record.values]
     info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
-    specs = {**TABLES, "physics": PHYSICS_TABLE}
-    tables = build_tables(records, info, specs)
+    tables = build_tables(records, info, ALL_TABLES)
     verdict = verdict_text(records, info, check)
     result = BenchResult(tuple(records), info, tuple(tables), verdict, check, len({r.key for r in records} - before))
     write_outputs(config.out, result)
-    pictures = Pictures(config.out / "pictures", suite, scenes)
-    main = next((row.info.key for kind in ("ours", "external") for row in rows if row.info.kind == kind), "")
-    write_report(config.out / "report.html", tables, pictures.items(records, main), info, records, specs=specs)
+    report_run(config.out, suite, info, records, tables)
     return result
 
 
@@ -193,7 +200,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
 def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: list[Record]) -> RunInfo:
     suite, scenes = here.suite, here.scenes
     used = {record.method for record in records}
-    infos = [row.info for row in here.rows] + [
+    infos = [row.described(len(scenes)) for row in here.rows] + [
         bounds.ceiling_info(suite),
         reference_row(check, scenes),
         *physics_rows.INFOS,

@@ -3,13 +3,15 @@
 import json
 import secrets
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.options import Device
+from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 
 
 @dataclass(frozen=True)
@@ -38,26 +40,44 @@ class BenchRun:
     """Chooses them; None: drawn anew in a new folder, kept in one that is continued."""
     recheck: bool = False
     """Render them again also where the folder holds a check of the same truth, code and seed."""
-    sample_scenes: int = 4
-    """Scenes of the sampling rows; 0 leaves them out."""
+    sample_scenes: int | None = None
+    """Scenes of the sampling rows; 0 leaves them out. None: 4, with `--full` all."""
     jobs: int = 2
     """Worker processes of one thread each; 0: all in this one."""
-    device: str = "cpu"
-    """Where our model runs."""
+    device: Device = "cpu"
+    """Where our model runs. auto: cuda, then mps, then cpu, whichever is there."""
     full: bool = False
-    """Run the slow rows on the whole suite instead of on their fixed subset."""
+    """Run what is slow on all scenes instead of on its fixed subset: sampling rows, `shade(true maps)`, the physics
+    table."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range, or of another form.
+        """
+        at_least(1, limit=self.limit, check_scenes=self.check_scenes)
+        at_least(0, check_seed=self.check_seed, sample_scenes=self.sample_scenes, jobs=self.jobs)
+        if not -(2**63) <= self.seed < 2**64:
+            raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
+        named_folders(self.predictions)
+
+    @property
+    def subsets(self) -> Subsets:
+        """On how many scenes the slow rows run."""
+        subsets = WHOLE if self.full else STANDARD
+        return subsets if self.sample_scenes is None else replace(subsets, sample=self.sample_scenes)
 
     def run(self) -> int:
         """Returns the exit status: 1 where predictions cannot be scored or the truth does not stand up to Mitsuba."""
+        self.check()
         from rich.console import Console
 
         from unirender_evaluation import benchmark
         from unirender_evaluation.prediction_check import PredictionError
-        from unirender_evaluation.suites import load_suite
         from unirender_evaluation.table_formats import print_table
 
         console = Console()
-        whole = len(load_suite(self.suite).scenes)
         config = benchmark.BenchConfig(
             suite=self.suite,
             out=self.out,
@@ -72,7 +92,7 @@ class BenchRun:
             recheck=self.recheck,
             jobs=self.jobs,
             device=self.device,
-            sample_scenes=whole if self.full else self.sample_scenes,
+            subsets=self.subsets,
         )
         try:
             result = benchmark.run(config, console)
@@ -97,8 +117,14 @@ class BenchCheck:
     seed: int | None = None
     """Chooses the scenes and the render seeds; None: drawn anew and printed."""
 
+    def check(self) -> None:
+        """Looks at the values; `UsageError` where one is outside its range."""
+        at_least(1, scenes=self.scenes)
+        at_least(0, seed=self.seed)
+
     def run(self) -> int:
         """Returns 1 where a test fails."""
+        self.check()
         from rich.console import Console
 
         from unirender_evaluation.suites import load_suite
@@ -126,8 +152,13 @@ class BenchTruth:
     workers: int = 2
     """Processes."""
 
+    def check(self) -> None:
+        """Looks at the values; `UsageError` where one is outside its range."""
+        at_least(1, workers=self.workers)
+
     def run(self) -> int:
         """Renders what is missing."""
+        self.check()
         from rich.progress import track
 
         from unirender.paths import cache_dir
@@ -170,8 +201,13 @@ class BenchExport:
     limit: int | None = None
     """Scenes; None: all."""
 
+    def check(self) -> None:
+        """Looks at the values; `UsageError` where one is outside its range."""
+        at_least(1, limit=self.limit)
+
     def run(self) -> int:
         """Writes the folder."""
+        self.check()
         from unirender.files import new_folder
         from unirender_evaluation.export import export_inputs
         from unirender_evaluation.suites import load_suite
@@ -197,6 +233,17 @@ class Bench:
     def run(self) -> int:
         """Runs the chosen command."""
         return self.command.run()
+
+
+def at_least(low: int, **options: int | None) -> None:
+    """Looks at options that have a least value; None is one that was not given.
+
+    Raises:
+        UsageError: one is below `low`.
+    """
+    for name, value in options.items():
+        if value is not None and value < low:
+            raise UsageError(f"--{name.replace('_', '-')} {value}: expected at least {low}")
 
 
 def named_folders(pairs: tuple[str, ...]) -> dict[str, Path]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from unirender.exr import intrinsics_channels, write_exr
+from unirender.exr import intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, Task, scene_ids, tasks
@@ -61,8 +61,7 @@ def _write_question(task: Task, folder: Path) -> dict[str, Any]:
             write_exr(folder / task.answer / "given.exr", channels)
         if given.environment is not None:
             (folder / task.answer).mkdir(exist_ok=True)
-            light = {c: given.environment[..., i] for i, c in enumerate("RGB")}
-            write_exr(folder / task.answer / "environment.exr", light, half=False)
+            write_environment(folder / task.answer / "environment.exr", given.environment)
     return question
 
 

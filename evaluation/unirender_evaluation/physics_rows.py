@@ -16,7 +16,6 @@ from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture, scene_ids
 from unirender_evaluation.versions import REFERENCE
 
-SCENES = 12
 TRUE_MAPS = MethodInfo(
     "true-maps",
     "True maps",
@@ -36,9 +35,11 @@ def shade_under(maps: Intrinsics, environment: Any) -> Any:
 SHADERS = {"shade": shade_under, "composite": composite_shader}
 
 
-def physics_scenes(suite: Suite, scenes: list[Scene]) -> list[Scene]:
-    """The scenes of the physics table: at most `SCENES` of the run's, evenly spaced."""
-    return scenes if len(scenes) <= SCENES else [s for s in scene_ids(suite, SCENES) if s in scenes] or scenes[:SCENES]
+def physics_scenes(suite: Suite, scenes: list[Scene], most: int | None) -> list[Scene]:
+    """The scenes of the physics table: at most `most` of the run's, evenly spaced; None = all of them."""
+    if most is None or len(scenes) <= most:
+        return scenes
+    return [s for s in scene_ids(suite, most) if s in scenes] or scenes[:most]
 
 
 def renderer_values(render: Callable[[Intrinsics], Any], suite: Suite, scene: Scene) -> dict[str, float]:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -33,6 +33,9 @@ from unirender_evaluation.table_formats import (
     to_json,
 )
 from unirender_evaluation.tables import Cell, Row, Table, build_tables
+
+if TYPE_CHECKING:
+    from unirender_evaluation.suites import Suite
 
 TEMPLATES = Path(__file__).parent / "templates"
 ALL_TABLES = {**TABLES, PHYSICS_TABLE.name: PHYSICS_TABLE}
@@ -254,9 +257,7 @@ def rebuild(folder: Path, suite: str | None = None) -> Path:
     Raises:
         UnirenderError: no run in the folder, or the suite is not the one that it scored.
     """
-    from unirender_evaluation.pictures import Pictures  # what runs need, a report alone does not
-    from unirender_evaluation.suites import load_suite
-    from unirender_evaluation.tasks import scene_ids
+    from unirender_evaluation.suites import load_suite  # what runs need, a report alone does not
 
     run, records, tables = read_results(folder)
     loaded = load_suite(suite or run.suite)
@@ -265,7 +266,19 @@ def rebuild(folder: Path, suite: str | None = None) -> Path:
             f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
             f"{folder} scored; name it with --suite"
         )
-    pictures = Pictures(folder / "pictures", loaded, scene_ids(loaded, run.limit))
-    main_row = next((info.key for info in run.methods if info.kind == "ours"), "")
-    items = pictures.items(records, main_row)
+    return report_run(folder, loaded, run, records, tables)
+
+
+def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Record], tables: Sequence[Table]) -> Path:
+    """Writes `report.html` of a run, with the gallery from its kept pictures; returns its path."""
+    from unirender_evaluation.pictures import Pictures
+    from unirender_evaluation.tasks import scene_ids
+
+    pictures = Pictures(folder / "pictures", suite, scene_ids(suite, run.limit))
+    items = pictures.items(records, leading_row(run))
     return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES)
+
+
+def leading_row(run: RunInfo) -> str:
+    """Key of the row whose scores choose the gallery's samples: our first, else the first stranger's, else empty."""
+    return next((info.key for kind in ("ours", "external") for info in run.methods if info.kind == kind), "")

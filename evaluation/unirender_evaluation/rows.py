@@ -2,14 +2,14 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import (
     Composite,
@@ -31,8 +31,8 @@ from unirender_evaluation.suites import Scene
 from unirender_evaluation.tasks import Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
-SAMPLE_SCENES = 4  # the sampling mode costs steps x samples: it runs on a stated subset
 SAMPLE_STEPS, SAMPLE_COUNT = 20, 5
+KEY_LETTERS = "a letter from a to z or a digit: its key is made of them"
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,16 @@ class Row:
             return self.predictions.has(task)
         return any(name in capabilities(self.method) for name in task.asks)
 
+    def described(self, scenes: int) -> MethodInfo:
+        """How a run of that many scenes names it: where the row had fewer, its note says how many."""
+        if self.scenes is None or self.scenes >= scenes:
+            return self.info
+        only = f"{self.scenes} scenes only"
+        return replace(self.info, note=f"{self.info.note}; {only}" if self.info.note else only)
+
 
 def slug(name: str) -> str:
-    """A row's key: lower case, words joined by hyphens."""
+    """A row's key: lower case, words joined by hyphens; empty where the name has no letter from a to z and no digit."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
@@ -87,11 +94,11 @@ def make_row(method: Any, kind: MethodKind, label: str | None = None, **options:
     """A row of a method; `options` are fields of :class:`Row` or of :class:`MethodInfo`.
 
     Raises:
-        UnirenderError: the method's name has no letter or digit, or its config is no JSON object.
+        UnirenderError: the method's name has nothing for a key, or its config is no JSON object.
     """
     fields = {name: options.pop(name) for name in ("protocols", "scenes", "uses") if name in options}
     if not isinstance(method.name, str) or not slug(method.name):
-        raise UnirenderError(f"{method!r}: got the name {method.name!r}, expected a string with a letter or digit")
+        raise UnirenderError(f"{method!r}: got the name {method.name!r}, expected a string with {KEY_LETTERS}")
     try:
         config = json.loads(json.dumps(dict(method.config)))
     except (TypeError, ValueError) as error:
@@ -121,7 +128,7 @@ def trivial_rows() -> list[Row]:
 
 
 def our_rows(
-    pipeline: Any, weights: str, seed: int = 0, sample_scenes: int = SAMPLE_SCENES, device: str = "cpu"
+    pipeline: Any, weights: str, seed: int = 0, sample_scenes: int | None = None, device: str = "cpu"
 ) -> list[Row]:
     """Our rows: `mean` plain, anchored and not closed, composites of its decomposition, `sample` on a subset of scenes.
 
@@ -129,7 +136,7 @@ def our_rows(
         pipeline: a `UniRenderPipeline`.
         weights: `checkpoint_sha256` of its checkpoint.
         seed: of the sampling mode.
-        sample_scenes: scenes of the sampling rows; 0 leaves them out.
+        sample_scenes: scenes of the sampling rows; None = all, 0 = leave them out.
         device: where it runs.
     """
     from_image = frozenset(
@@ -154,18 +161,24 @@ def our_rows(
         make_row(open_mean, "ours", protocols=decomposes, note="maps as the network predicts them", **one),
         *(make_row(composite, "baseline", protocols=from_image, **one) for composite in composites),
     ]
-    if sample_scenes:
+    if sample_scenes != 0:
         sampled = ours("Ours (sample)", mode="sample", steps=SAMPLE_STEPS, samples=SAMPLE_COUNT)
         subset = frozenset({("rendering", "from-image"), ("inverse", "single-image")})
-        note = f"{sample_scenes} scenes only"
-        rows.append(make_row(sampled, "ours", scenes=sample_scenes, protocols=subset, note=note, **many))
+        rows.append(make_row(sampled, "ours", scenes=sample_scenes, protocols=subset, **many))
     return rows
 
 
 def prediction_rows(folders: Mapping[str, Path]) -> list[Row]:
-    """One row per `--predictions name=folder`."""
+    """One row per `--predictions name=folder`.
+
+    Raises:
+        UsageError: a name has nothing for a key.
+        UnirenderError: a folder is not one of predictions.
+    """
     rows = []
     for name, folder in folders.items():
+        if not slug(name):
+            raise UsageError(f"--predictions {name}={folder}: got the name {name!r}, expected {KEY_LETTERS}")
         predictions = PredictionFolder(Path(folder))
         info = MethodInfo(
             slug(name), name, "external", config={"name": name, "predictions": predictions.sha256()}, mask="pasted"
@@ -183,10 +196,27 @@ def plugin_rows(plugins: Sequence[Plugin]) -> list[Row]:
     return rows
 
 
-def check_rows(rows: list[Row]) -> list[Row]:
-    """Refuses two rows of one key."""
+def check_rows(rows: list[Row], reserved: Collection[str] = ()) -> list[Row]:
+    """The rows as they are.
+
+    Args:
+        rows: of a run.
+        reserved: keys that no row of a stranger may have: those of the bounds.
+
+    Raises:
+        UnirenderError: two rows have one key, or a stranger's has a reserved one (`UsageError` where `--predictions`
+            gave the name).
+    """
     keys = [row.info.key for row in rows]
-    double = sorted({key for key in keys if keys.count(key) > 1})
+    double = [
+        row
+        for row in rows
+        if keys.count(row.info.key) > 1 or (row.info.kind == "external" and row.info.key in reserved)
+    ]
     if double:
-        raise UnirenderError(f"rows: {', '.join(double)} occur twice, expected unique names; rename one")
+        names = ", ".join(sorted({row.info.key for row in double}))
+        from_command_line = any(row.predictions is not None for row in double)
+        raise (UsageError if from_command_line else UnirenderError)(
+            f"rows: {names} occur twice, expected unique names, none of them that of a bound; rename one"
+        )
     return [replace(row) for row in rows]

@@ -30,6 +30,7 @@ CODE = {  # what a rendered part depends on
     "unirender_reference": ("**/*.py",),
     "unirender_evaluation": ("truth_object.py", "truth_render.py", "truth_file.py", "ceiling.py"),
 }
+SHA256_LINE = re.compile(r"""^([ \t]*sha256[ \t]*=[ \t]*)(?:"[^"\n]*"|'[^'\n]*')""", re.MULTILINE)
 Environment = Float[np.ndarray, "h w 3"]
 
 
@@ -73,11 +74,17 @@ def make_truth(suite_toml: str | Path, work: Path, workers: int = 1) -> Iterator
 
     Yields:
         (objects done, objects).
+
+    Raises:
+        UnirenderError: the suite's file, its lights or the work folder cannot be used; nothing was rendered then.
     """
     spec = read_spec(suite_toml)
     environments = suite_lights(spec)
     folder = work / _fingerprint(spec, environments)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnirenderError(f"{work}: cannot be written ({error.strerror}); choose another --work") from error
     lights, materials, n = assign_lights(spec, list(environments)), spec.materials(), spec.lights_per_object
     jobs = [
         ObjectJob(
@@ -100,13 +107,15 @@ def make_truth(suite_toml: str | Path, work: Path, workers: int = 1) -> Iterator
 
 def _start_worker() -> None:
     from unirender_reference.backend import set_threads
+    from unirender_reference.processes import exit_with_parent
 
+    exit_with_parent()
     set_threads(1)
 
 
 def _fingerprint(spec: SuiteSpec, environments: dict[str, Environment]) -> str:
     """Names the work folder: the suite file but for the truth's hash, the lights, the code, Mitsuba."""
-    digest = hashlib.sha256(re.sub(r'sha256 = ".*"', "", spec.path.read_text(encoding="utf-8")).encode())
+    digest = hashlib.sha256(with_sha256(spec.path, "").encode())
     for name, environment in environments.items():
         digest.update(name.encode() + environment.tobytes())
     for package, patterns in CODE.items():
@@ -158,8 +167,22 @@ def pack_truth(spec: SuiteSpec, parts: Iterable[Path], environments: dict[str, E
     members["suite.json"] = json.dumps(provenance, indent=1).encode()
     write_tar(spec.truth_path, members)
     digest = hashlib.sha256(spec.truth_path.read_bytes()).hexdigest()
-    text = re.sub(r'sha256 = ".*"', f'sha256 = "{digest}"', spec.path.read_text(encoding="utf-8"))
-    spec.path.write_text(text, encoding="utf-8")
+    spec.path.write_text(with_sha256(spec.path, digest), encoding="utf-8")
+
+
+def with_sha256(path: Path, digest: str) -> str:
+    """The text of a suite's TOML file with another hash of its truth; comments and layout stay.
+
+    Raises:
+        UnirenderError: there is not exactly one line `sha256 = "..."`.
+    """
+    text, count = SHA256_LINE.subn(rf'\g<1>"{digest}"', path.read_text(encoding="utf-8"))
+    if count != 1:
+        raise UnirenderError(
+            f'{path}: got {count} lines like sha256 = "...", expected exactly one, in [truth], for the hash of the '
+            "truth file"
+        )
+    return text
 
 
 def quality_summary(suite: Suite) -> dict[str, dict[str, float]]:

@@ -43,7 +43,17 @@ class Part:
 
 # Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
 # the records anew at the end of every run.
-COMMANDS = ("benchmark", "commands", "export", "lpips_convert", "prediction_check", "truth", "validation", "workers")
+COMMANDS = (
+    "benchmark",
+    "commands",
+    "export",
+    "lpips_convert",
+    "prediction_check",
+    "subsets",
+    "truth",
+    "validation",
+    "workers",
+)
 FROM_RECORDS = ("claims", "comparisons", "protocol", "published", "readme", "statistics", "table*", "verdict")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
 PARTS: Mapping[str, Part] = {
@@ -59,7 +69,7 @@ PARTS: Mapping[str, Part] = {
     REFERENCE: Part(
         {"unirender_reference": ("**/*.py", "data/**/*.*")},
         ("mitsuba", "drjit", "karellen-llvm-core"),
-        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in ("dataset", "plan", "shards"))),
+        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in ("dataset", "plan", "processes", "shards"))),
         ("UNIRENDER_MITSUBA_VARIANT",),
     ),
 }

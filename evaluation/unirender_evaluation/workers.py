@@ -12,6 +12,7 @@ from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
+from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions
 
@@ -27,6 +28,7 @@ class Run:
         versions: of the code and of what it depends on; part of every content key.
         backbones: LPIPS backbones.
         pictures: folder of the gallery's predictions.
+        subsets: scenes of the slow parts.
     """
 
     suite: Suite
@@ -35,6 +37,7 @@ class Run:
     versions: Versions
     backbones: tuple[str, ...]
     pictures: Path
+    subsets: Subsets = STANDARD
 
     def jobs(self, scene: Scene) -> Iterator[Job]:
         """Every record that the run wants of one scene."""
@@ -45,7 +48,7 @@ class Run:
         keeper = Pictures(self.pictures, self.suite, self.scenes)
         yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.versions, self.backbones, keeper)
         yield from ceiling_jobs(self.suite, scene, key_of, self.backbones)
-        if scene in physics_scenes(self.suite, self.scenes):
+        if scene in physics_scenes(self.suite, self.scenes, self.subsets.physics):
             yield from physics_jobs(self.suite, scene, self.rows, key_of)
 
 
@@ -59,14 +62,18 @@ def _start(
     versions: Versions,
     backbones: tuple[str, ...],
     pictures: Path,
+    subsets: Subsets,
     known: frozenset[str],
 ) -> None:
+    from unirender_reference.processes import exit_with_parent
+
+    exit_with_parent()
     import torch
 
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
     loaded = load_suite(suite)
-    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures)
+    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     _here = run, known
 
 
@@ -87,6 +94,7 @@ def run_in_workers(
         run.versions,
         run.backbones,
         run.pictures,
+        run.subsets,
         known,
     )
     with ProcessPoolExecutor(jobs, get_context("spawn"), _start, arguments) as pool:

@@ -17,12 +17,15 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map, image_picture, map_pictures, picture_rows
 from unirender_evaluation.metrics import Variant, metric_key
+from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
-from unirender_evaluation.report import rebuild, write_report
+from unirender_evaluation.report import ALL_TABLES, leading_row, rebuild, report_run, write_report
 from unirender_evaluation.report_plots import Scale, heading, tiles
 from unirender_evaluation.tables import build_tables
+from unirender_evaluation.tasks import tasks
 
 SIZE = 24
 RUN = RunInfo(
@@ -265,6 +268,36 @@ def test_a_report_is_made_again_from_its_folder(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="name it with --suite"):
         rebuild(tmp_path, str(suite.spec.path))
     assert not (tmp_path / "report.html").exists()
+
+
+def test_the_gallery_is_led_by_our_row_else_by_a_strangers() -> None:
+    trivial, ours = RUN.methods[1], RUN.methods[0]
+    strangers = tuple(MethodInfo(key, key, "external") for key in ("theirs", "others"))
+    assert leading_row(replace(RUN, methods=(trivial, *strangers, ours))) == ours.key
+    assert leading_row(replace(RUN, methods=(trivial, *strangers))) == "theirs"
+    assert leading_row(replace(RUN, methods=(trivial,))) == ""
+
+
+def test_a_report_made_again_is_the_same_without_a_row_of_ours(tmp_path: Path) -> None:
+    """The gallery's order and leader are those of the run: the stranger's."""
+    suite = make_suite(tmp_path / "suite")
+    method = MethodInfo("theirs", "Theirs", "external")
+    keeper, made = Pictures(tmp_path / "pictures", suite, list(suite.scenes)), []
+    for place, task in enumerate(tasks(suite, "inverse", "single-image", list(suite.scenes))):
+        for row, level in (("input", 10.0 + place), ("theirs", 30.0 - place)):
+            record = Record(
+                task.table, task.protocol, row, task.sample, task.scene.object, {metric_key("albedo", "psnr"): level}
+            )
+            keeper.keep(task, row, row, Prediction(maps=task.truth_maps))
+            made.append(record)
+    run = replace(RUN, suite="ball", suite_hash=suite.sha256, limit=None, methods=(RUN.methods[1], method))
+    report_run(tmp_path, suite, run, made, build_tables(made, run, ALL_TABLES))
+    first = (tmp_path / "report.html").read_text(encoding="utf-8")
+    write_run(tmp_path / "run.json", run)
+    write_records(tmp_path / "records.jsonl", made)
+    rebuild(tmp_path, str(suite.spec.path))
+    assert "ranked by Theirs" in first
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == first
 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

@@ -1,6 +1,7 @@
 """Making truth: how noise is measured, stored and brought down to a target, and the generator end to end."""
 
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender.color import image_srgb
+from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
 from unirender_evaluation.ceiling import similarity_ceiling
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.suites import load_suite, read_spec, suite_path
-from unirender_evaluation.truth import make_truth, quality_summary
+from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
 from unirender_evaluation.truth_render import (
     TruthBuffer,
@@ -141,6 +143,31 @@ def test_similarity_ceiling_lies_between_a_noisy_render_and_a_perfect_score(tmp_
             assert value == pytest.approx(same[key], rel=1e-12)
         else:
             assert worse[key] > value > 0
+
+
+@pytest.mark.parametrize("line", ['sha256 = "old"', 'sha256="old"', "  sha256\t= 'old'", 'sha256 = "old"  # of "it"'])
+def test_the_hash_is_written_however_the_line_is_set(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "suite.toml"
+    path.write_text(f'[truth]\nfile = "it.tar"\n{line}\n# sha256 = "a comment"\n')
+    text = with_sha256(path, "new")
+    assert tomllib.loads(text) == {"truth": {"file": "it.tar", "sha256": "new"}}
+    assert text == path.read_text().replace("'old'", '"old"').replace("old", "new")
+
+
+@pytest.mark.parametrize(("body", "count"), [('truth = { sha256 = "" }', 0), ('sha256 = ""\n[truth]\nsha256 = ""', 2)])
+def test_a_suite_whose_hash_cannot_be_written_is_refused(body: str, count: int, tmp_path: Path) -> None:
+    path = tmp_path / "suite.toml"
+    path.write_text(body)
+    with pytest.raises(UnirenderError, match=rf"suite.toml: got {count} lines like .* expected exactly one"):
+        with_sha256(path, "new")
+
+
+def test_nothing_is_rendered_for_a_suite_whose_hash_cannot_be_written(tmp_path: Path) -> None:
+    path = tmp_path / "odd.toml"
+    path.write_text(suite_path("tiny").read_text().replace("\nsha256 =", '\n"sha256" ='))
+    with pytest.raises(UnirenderError, match="got 0 lines"):
+        next(make_truth(path, tmp_path / "work"))
+    assert not (tmp_path / "work").exists()
 
 
 @pytest.mark.slow

@@ -41,7 +41,8 @@ def test_scores_are_the_benchmarks_own_means_with_their_directions(suite: str) -
 
 
 def test_a_good_renderer_scores_better_than_a_random_one(suite: str) -> None:
-    validate, random, composite = suite_validation(suite, 2), make_pipeline(), make_pipeline()
+    validate = suite_validation(suite, 2)
+    random, composite = (make_pipeline(physics_prior="composite") for _ in range(2))
     for p in composite.dual_stream.image_unet.conv_out.parameters():
         torch.nn.init.zeros_(p)  # with the prior alone it renders the composite, which is this suite's truth
     good, bad = (validate(pipeline)["render.psnr"] for pipeline in (composite, random))

@@ -1,0 +1,22 @@
+"""On how many of a run's scenes the slow rows run: a stated subset, or the whole suite (`bench run --full`)."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Subsets:
+    """Scenes of each slow part of a run, evenly spaced; None = all of the run's.
+
+    Attributes:
+        sample: of the sampling rows, which cost steps x samples; 0 = leave them out.
+        shade: of `shade(true maps)`, which renders with Mitsuba.
+        physics: of the physics table: renderer tests and closed loops.
+    """
+
+    sample: int | None = 4
+    shade: int | None = 12
+    physics: int | None = 12
+
+
+STANDARD = Subsets()
+WHOLE = Subsets(sample=None, shade=None, physics=None)

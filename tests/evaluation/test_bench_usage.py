@@ -1,0 +1,107 @@
+"""`unirender bench ...` with arguments that cannot be right: one line and status 2, before anything is done."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from tiny_suites import write_suite
+
+from unirender.cli import main
+from unirender.errors import UnirenderError
+from unirender.models.precision import resolve_device
+from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.truth import make_truth
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[object, str]:
+    """(exit status, what was printed to stderr)."""
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    return stopped.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value", "expected"),
+    [
+        ("run", "--limit", "0", "at least 1"),
+        ("run", "--check-scenes", "0", "at least 1"),
+        ("run", "--check-seed", "-1", "at least 0"),
+        ("run", "--sample-scenes", "-1", "at least 0"),
+        ("run", "--jobs", "-1", "at least 0"),
+        ("run", "--seed", str(2**64), "an integer of 64 bits"),
+        ("check", "--seed", "-1", "at least 0"),
+        ("check", "--scenes", "0", "at least 1"),
+        ("truth", "--workers", "0", "at least 1"),
+        ("export", "--limit", "-1", "at least 1"),
+    ],
+)
+def test_values_outside_their_range(
+    command: str, option: str, value: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = {"truth": ["--suite", "tiny"], "check": []}.get(command, ["--out", str(tmp_path / "out")])
+    status, printed = refused(["bench", command, option, value, *more], capsys)
+    assert (status, printed) == (2, f"unirender: error: {option} {value}: expected {expected}\n")
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_unknown_device_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, printed = refused(["bench", "run", "--device", "foo", "--out", str(tmp_path / "out")], capsys)
+    assert status == 2
+    assert "internal error" not in printed
+
+
+def test_the_device_of_our_rows_is_resolved_before_anything_runs() -> None:
+    rows = build_rows(BenchConfig(methods=("ours",), device="auto"))
+    assert {row.config["device"] for row in rows if "device" in row.config} == {str(resolve_device("auto"))}
+    here = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    absent = next(name for name, available in here.items() if not available)
+    with pytest.raises(UnirenderError, match=f"device: {absent} is not available here"):
+        build_rows(BenchConfig(methods=("ours",), device=absent))
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("我们",), "got the name '我们', expected a letter from a to z or a digit"),
+        (("Noise ceiling",), "rows: noise-ceiling occur twice"),
+        (("Reference (other seed)",), "rows: reference-other-seed occur twice"),
+        (("true maps",), "rows: true-maps occur twice"),
+        (("shade(true maps)",), "rows: shade-true-maps occur twice"),
+        (("Composite",), "rows: composite occur twice"),
+        (("Mine A", "mine-a"), "rows: mine-a occur twice"),
+    ],
+)
+def test_predictions_need_a_name_that_makes_a_key_of_its_own(
+    names: tuple[str, ...], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine" / "picture").mkdir(parents=True)
+    given = [f"{name}={tmp_path / 'mine'}" for name in names]
+    command = ["bench", "run", "--methods", "plugins", "--predictions", *given, "--out", str(tmp_path / "out")]
+    status, printed = refused(command, capsys)
+    assert status == 2
+    assert expected in printed
+    assert printed.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_plugin_may_not_take_the_name_of_a_bound(tmp_path: Path) -> None:
+    text = (
+        "class Method:\n    name, config = {name!r}, {{}}\n    def render(self, intrinsics): return intrinsics.albedo\n"
+    )
+    for name in ("Noise ceiling", "Quiet ceiling"):
+        (tmp_path / f"{name[0]}.py").write_text(text.format(name=name))
+    with pytest.raises(UnirenderError, match="noise-ceiling occur twice, expected unique names"):
+        build_rows(BenchConfig(methods=(), method=(f"{tmp_path / 'N.py'}:Method",)))
+    rows = build_rows(BenchConfig(methods=(), method=(f"{tmp_path / 'Q.py'}:Method",)))
+    assert "quiet-ceiling" in {row.info.key for row in rows}
+
+
+def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
+    suite, file = write_suite(tmp_path / "suite", objects=1), tmp_path / "file"
+    file.write_text("kept")
+    with pytest.raises(UnirenderError, match=r"file: cannot be made \(File exists\); choose another --out"):
+        run(BenchConfig(suite=str(suite), out=file, methods=()), Console(quiet=True))
+    with pytest.raises(UnirenderError, match=r"cannot be written \(Not a directory\); choose another --work"):
+        next(make_truth(suite, file))
+    assert file.read_text() == "kept"

@@ -1,0 +1,89 @@
+"""Worker processes end with their parent, even if that is killed: each holds torch and Mitsuba."""
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tiny_suites import write_suite
+
+SECONDS = 120  # to start a worker, and to see it end: a busy machine takes its time
+
+HOLD = """
+import fcntl, os, sys, time
+
+def hold(*_):
+    "A worker's endless task: holds a lock, which ends with the process, and writes its id."
+    lock = open(os.environ["HELD"], "a")
+    fcntl.flock(lock, fcntl.LOCK_EX)
+    print(os.getpid(), file=lock, flush=True)
+    time.sleep(600)
+"""
+BENCH = """
+from pathlib import Path
+from hold import hold
+from unirender_evaluation.suites import load_suite
+from unirender_evaluation.versions import Versions
+from unirender_evaluation.workers import Run, run_in_workers
+
+if __name__ == "__main__":
+    suite = load_suite(sys.argv[1])
+    run = Run(suite, (), list(suite.scenes), Versions("test"), (), Path(sys.argv[2]) / "pictures")
+    next(run_in_workers(run, hold, [suite.scenes[0]], frozenset(), 1))
+"""
+TRUTH = """
+from pathlib import Path
+from hold import hold
+from unirender_evaluation import truth
+
+if __name__ == "__main__":
+    truth.render_object = hold
+    next(truth.make_truth(sys.argv[1], Path(sys.argv[2]) / "work"))
+"""
+
+
+def locked(path: Path) -> bool:
+    """Whether a process holds the lock; one that is dead but not yet reaped does not."""
+    with path.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", [BENCH, TRUTH], ids=["bench", "truth"])
+def test_a_worker_ends_with_a_killed_parent(script: str, tmp_path: Path) -> None:
+    held = tmp_path / "held"
+    held.touch()
+    (tmp_path / "hold.py").write_text(HOLD)
+    (tmp_path / "parent.py").write_text("import sys\n" + script)
+    command = [sys.executable, str(tmp_path / "parent.py"), str(write_suite(tmp_path / "suite")), str(tmp_path)]
+    parent = subprocess.Popen(command, env=os.environ | {"HELD": str(held)})
+    try:
+        wait_until(lambda: parent.poll() is not None or held.read_text().endswith("\n"))
+        assert parent.poll() is None
+        assert locked(held)
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    try:
+        wait_until(lambda: not locked(held))
+    except TimeoutError:
+        os.kill(int(held.read_text()), signal.SIGKILL)
+        raise
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Raises: TimeoutError."""
+    end = time.monotonic() + SECONDS
+    while not condition():
+        if time.monotonic() > end:
+            raise TimeoutError(f"waited {SECONDS} s")
+        time.sleep(0.1)
