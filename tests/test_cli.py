@@ -95,6 +95,23 @@ def test_render_takes_one_file_and_the_camera_in_its_header(
     assert not (tmp_path / "out" / "environment.exr").exists()  # one file is that file
 
 
+def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path: Path) -> None:
+    assert run("decompose", ball, "--output", tmp_path / "maps") == 0
+    maps = read_result(tmp_path / "maps")
+    bare = intrinsics_channels(maps.replace(mask=None, environment=None, specular=None, diffuse=None))
+    write_exr(tmp_path / "bare.exr", bare)
+    lights = {"dim": 0.2, "bright": 0.9}
+    for name, value in lights.items():
+        write_exr(tmp_path / f"{name}.exr", image_channels(np.full((8, 16, 3), value, dtype=np.float32)), half=False)
+        arguments = ("--environment", tmp_path / f"{name}.exr", "--exposure", "0", "--output", tmp_path / name)
+        assert run("render", tmp_path / "bare.exr", *arguments) == 0
+    assert run("render", tmp_path / "bare.exr", "--output", tmp_path / "none") == 0
+    inside = maps.require("mask")["mask"][..., 0] == 1
+    means = [np.array(Image.open(tmp_path / name / "image.png"))[inside, :3].mean() for name in lights]
+    assert means[0] < 0.7 * means[1]
+    assert (read_result(tmp_path / "dim").require("mask")["mask"] == 1).all()  # the whole frame
+
+
 def test_what_lies_outside_the_models_range_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], ball: Path
 ) -> None:
@@ -197,6 +214,16 @@ def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.C
     assert run("decompose", ball, "--output", tmp_path / "out", "--overwrite") == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == DECOMPOSED
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_working_directory_is_no_output(
+    ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert run("decompose", ball, "--output", ".") == 2
+    assert "folder that you are in" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    assert run("decompose", ball, "--output", "out") == 0
 
 
 USAGE = {

@@ -74,6 +74,7 @@ class Render:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
         from unirender.pipelines.editing import under_light
+        from unirender.pipelines.inputs import with_mask
 
         self.model.check()
         check_exposure(self.exposure)
@@ -84,7 +85,7 @@ class Render:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
             if self.environment is not None:
                 light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
-                intrinsics = under_light(intrinsics, light, "auto" if self.exposure is None else "keep")
+                intrinsics = under_light(with_mask(intrinsics), light, "auto" if self.exposure is None else "keep")
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
             pipeline = self.model.load()
             image = pipeline.render(intrinsics, **self.model.sampling())

@@ -23,18 +23,21 @@ from PIL import Image
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, unpremultiply
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
     channels_rgb,
     image_channels,
     intrinsics_channels,
     intrinsics_from_channels,
     read_exr,
+    write_environment,
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
+
+ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
 
 CAMERA_ATTRIBUTE = "camera"
 
@@ -48,42 +51,59 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     Only a result folder (one with `meta.json`) is ever replaced.
 
     Raises:
+        UsageError: `path` is the working directory or lies around it.
         UnirenderError: `path` exists and is not empty, and `overwrite` is not given or it is no result folder; or it
-            cannot be made.
+            cannot be made or replaced.
     """
-    path = Path(path)
+    shown, path = path, Path(path).resolve()
+    if path == Path.cwd() or path in Path.cwd().parents:
+        raise UsageError(
+            f"{shown}: is the folder that you are in (or one around it), expected a new one; name --output"
+        )
     if path.exists() and not path.is_dir():
-        raise UnirenderError(f"{path}: is a file, expected a folder to write to")
+        raise UnirenderError(f"{shown}: is a file, expected a folder to write to")
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            raise UnirenderError(f"{path}: exists and is not empty; choose another --output or pass --overwrite")
+            raise UnirenderError(f"{shown}: exists and is not empty; choose another --output or pass --overwrite")
         if not (path / META_FILE).is_file():
             raise UnirenderError(
-                f"{path}: has no {META_FILE}, expected an earlier result to overwrite; choose another --output"
+                f"{shown}: has no {META_FILE}, expected an earlier result to overwrite; choose another --output"
             )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
-        raise UnirenderError(f"{path}: cannot be written ({error.strerror}); choose another --output") from error
+        raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another --output") from error
     try:
         yield temporary
         os.chmod(temporary, 0o755)
-        if path.is_dir():
-            old = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-            os.rename(path, old / "old")
-            try:
-                os.rename(temporary, path)
-            except BaseException:
-                os.rename(old / "old", path)
-                raise
-            finally:
-                shutil.rmtree(old)
-        else:
-            os.rename(temporary, path)
+        try:
+            _move_into_place(temporary, path)
+        except OSError as error:
+            raise UnirenderError(f"{shown}: cannot be replaced ({error.strerror}); choose another --output") from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def _move_into_place(temporary: Path, path: Path) -> None:
+    """Renames a folder to `path`, in place of the folder that may be there; where that fails, all is as before."""
+    if not path.is_dir():
+        os.rename(temporary, path)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+    try:
+        os.rename(path, aside / "old")
+    except BaseException:
+        aside.rmdir()
+        raise
+    try:
+        os.rename(temporary, path)
+    except BaseException:
+        os.rename(aside / "old", path)
+        aside.rmdir()
+        raise
+    shutil.rmtree(aside)
 
 
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
@@ -122,8 +142,7 @@ def write_result(
         if any(name in IMAGE_MAPS for name in intrinsics.present):
             write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=attributes)
         if intrinsics.environment is not None:
-            environment = image_channels(intrinsics.environment)
-            write_exr(folder / ENVIRONMENT_FILE, environment, half=False, attributes=attributes)
+            write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
             write_png(folder / f"{name}.png", map_picture(name, value))
     if image_linear is not None:
@@ -149,7 +168,7 @@ def checkpoint_sha256(folder: Path) -> str:
         UnirenderError: there are none.
     """
     digest = hashlib.sha256()
-    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name != "training.json")
+    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name not in ACCOUNTS)
     if not files:
         raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
     for path in files:

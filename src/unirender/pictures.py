@@ -14,6 +14,7 @@ from unirender.exr import channels_rgb, read_exr
 
 MAX_PIXELS = 100_000_000
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
+DISPLAY_MAX_16_BIT = 65535  # display white of 16-bit grey
 
 
 @dataclass(frozen=True)
@@ -52,14 +53,14 @@ def read_picture(path: str | Path) -> Picture:
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
-    """Coverage from a picture file: its alpha channel if it varies, else its luminance.
+    """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours.
 
     Raises:
         UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty.
     """
     picture = read_picture(path)
-    has_alpha = picture.mask is not None and picture.mask.min() < 1
-    mask = picture.mask if has_alpha and picture.mask is not None else picture.image_srgb.mean(axis=-1, keepdims=True)
+    channels = [picture.image_srgb] if picture.mask is None else [picture.image_srgb, picture.mask]
+    mask = coverage(np.concatenate(channels, axis=-1))
     if mask.shape[:2] != size:
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
@@ -79,7 +80,12 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     return np.clip(mask, 0, 1).astype(np.float32)
 
 
-def _read_display_picture(path: Path) -> Picture:
+def open_picture(path: str | Path) -> Image.Image:
+    """A picture file in a format of Pillow's, decoded and turned as its EXIF orientation says.
+
+    Raises:
+        UnirenderError: no readable picture, or one of more than `MAX_PIXELS`.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -90,20 +96,46 @@ def _read_display_picture(path: Path) -> Picture:
                         f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
                     )
                 file.load()
-                image = ImageOps.exif_transpose(file)
+                return ImageOps.exif_transpose(file)
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"{path}: not a readable picture ({error}), expected PNG, JPG or EXR") from error
-    has_alpha = "A" in image.getbands() or "transparency" in image.info
-    if image.mode.startswith("I;16") or image.mode in ("I", "F"):  # 16-bit grey
+
+
+def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
+    """The pixels of a PIL picture of any mode as display values in [0, 1], not premultiplied: RGB, or RGBA where the
+    picture has an alpha channel. 16-bit grey keeps its 16 bits (Pillow's own conversion saturates it).
+
+    Args:
+        image: the picture; its EXIF orientation is not looked at.
+        name: what to call it in messages.
+
+    Raises:
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white.
+    """
+    if image.mode.startswith("I;16") or image.mode in ("I", "F"):
         values = np.asarray(image, dtype=np.float32)
-        if image.mode == "F" or values.max(initial=0) > 65535:
-            raise UnirenderError(f"{path}: a {image.mode} picture has no display values; save linear radiance as EXR")
-        rgb = np.repeat(values[..., None] / 65535, 3, axis=-1)
-        return Picture(rgb.astype(np.float32), None, path.name)
-    pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
-    mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if has_alpha else None
+        if image.mode == "F" or values.min(initial=0) < 0 or values.max(initial=0) > DISPLAY_MAX_16_BIT:
+            raise UnirenderError(
+                f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
+                "grey; save linear radiance as EXR"
+            )
+        return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+    has_alpha = "A" in image.getbands() or "transparency" in image.info
+    return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
+
+
+def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
+    """What RGB or RGBA values say as a mask: the alpha channel if it varies, else the mean of the colours."""
+    if values.shape[-1] == 4 and values[..., 3].min() < 1:
+        return values[..., 3:]
+    return values[..., :3].mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def _read_display_picture(path: Path) -> Picture:
+    pixels = display_values(open_picture(path), str(path))
+    mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
     return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name)
 
 

@@ -1,15 +1,16 @@
 """Result folders: what is written reads back, and what goes wrong leaves nothing behind."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from unirender.camera import Camera
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.exr import intrinsics_channels, read_exr, write_exr
-from unirender.files import new_folder, read_result, write_result
+from unirender.files import checkpoint_sha256, new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
 
 RNG = np.random.default_rng(0)
@@ -56,6 +57,68 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
     (tmp_path / "file").write_text("")
     with pytest.raises(UnirenderError, match="is a file"), new_folder(tmp_path / "file"):
         pass
+
+
+@pytest.mark.parametrize("given", [".", "..", "inside/.."])
+def test_the_working_directory_is_not_replaced(given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "work").mkdir()
+    (tmp_path / "meta.json").write_text("{}")
+    monkeypatch.chdir(tmp_path / "work")
+    with pytest.raises(UsageError, match="folder that you are in"), new_folder(given, overwrite=True):
+        pass
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["meta.json", "work"]
+    assert not list(Path.cwd().iterdir())
+    with new_folder("new") as folder:  # the twin: a folder inside is fine
+        (folder / "a").write_text("")
+    assert [path.name for path in Path.cwd().iterdir()] == ["new"]
+
+
+def test_an_empty_folder_and_a_link_to_one_are_filled(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with new_folder(tmp_path / "link") as folder:
+        (folder / "a").write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "a").read_text() == "new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "real"]
+
+
+@pytest.mark.parametrize("failing", ["old", "new"])
+def test_a_folder_that_cannot_be_moved_stays_and_leaves_no_rest(
+    failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "meta.json").write_text("old")
+    rename, refused = os.rename, []
+
+    def busy(source: Path, target: Path) -> None:
+        if (source if failing == "old" else target) == out and not refused:
+            refused.append(source)
+            raise OSError(16, "Device or resource busy")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "rename", busy)
+    with pytest.raises(UnirenderError, match="cannot be replaced"), new_folder(out, overwrite=True) as folder:
+        (folder / "meta.json").write_text("new")
+    assert refused
+    assert (out / "meta.json").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_checkpoints_hash_is_of_weights_and_configuration(tmp_path: Path) -> None:
+    (tmp_path / "net").mkdir()
+    (tmp_path / "net" / "model.safetensors").write_bytes(b"weights")
+    (tmp_path / "model_index.json").write_text("{}")
+    before = checkpoint_sha256(tmp_path)
+    for name in ("training.json", "validation.json"):
+        (tmp_path / name).write_text("{}")
+        assert checkpoint_sha256(tmp_path) == before, name
+    seen = {before}
+    for name in ("model_index.json", "net/model.safetensors", "net/config.json"):  # the twin
+        (tmp_path / name).write_text("other")
+        seen.add(checkpoint_sha256(tmp_path))
+    assert len(seen) == 4
 
 
 def test_headers_say_where_a_file_comes_from(tmp_path: Path) -> None:

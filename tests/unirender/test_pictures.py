@@ -10,6 +10,7 @@ from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.pictures import MAX_PIXELS, read_mask, read_picture
+from unirender.pipelines.inputs import as_mask, as_picture
 
 RNG = np.random.default_rng(0)
 
@@ -82,3 +83,48 @@ def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_mask(tmp_path / "m.png", (1, 2))[..., 0], [[0, 1]])
     Image.fromarray(np.array([[[9, 9, 9, 255], [9, 9, 9, 0]]], dtype=np.uint8)).save(tmp_path / "a.png")
     np.testing.assert_allclose(read_mask(tmp_path / "a.png", (1, 2))[..., 0], [[1, 0]])
+
+
+def ramp() -> tuple[np.ndarray, np.ndarray]:
+    """16-bit grey, and the display values that it means."""
+    values = np.linspace(0, 65535, 256).round().astype(np.uint16).reshape(16, 16)
+    return values, (values / 65535).astype(np.float32)
+
+
+def test_sixteen_bit_pil_pictures_and_masks_keep_their_values() -> None:
+    values, expected = ramp()
+    for grey in (Image.fromarray(values), Image.fromarray(values.astype(np.int32))):
+        assert grey.mode in ("I;16", "I")
+        picture, _ = as_picture(grey)
+        mask = as_mask(grey, (16, 16))
+        np.testing.assert_allclose(picture, expected[..., None].repeat(3, axis=-1), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(mask[..., 0], expected, rtol=0, atol=1e-6)
+        saturated = np.asarray(grey.convert("L"), dtype=np.float32) / 255  # the twin: Pillow's own conversion
+        assert np.abs(saturated - expected).max() > 0.4
+
+
+def test_the_same_pixels_from_a_file_and_from_pil(tmp_path: Path) -> None:
+    rgba = RNG.integers(0, 256, (9, 12, 4), dtype=np.uint8)
+    rgba[0, 0, 3] = 255
+    pictures = [Image.fromarray(rgba), Image.fromarray(rgba[..., :3]), Image.fromarray(ramp()[0])]
+    pictures += [Image.fromarray(rgba[..., 0]), Image.fromarray(rgba[..., :3]).convert("P")]
+    for image in pictures:
+        image.save(tmp_path / "a.png")
+        read, (values, mask) = read_picture(tmp_path / "a.png"), as_picture(image)
+        np.testing.assert_array_equal(read.image_srgb, values)
+        np.testing.assert_array_equal(1 if read.mask is None else read.mask, mask)
+        np.testing.assert_array_equal(read_mask(tmp_path / "a.png", mask.shape[:2]), as_mask(image, mask.shape[:2]))
+
+
+def test_grey_masks_are_exact() -> None:
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    np.testing.assert_array_equal(as_mask(Image.fromarray(grey), (16, 16))[..., 0], grey.astype(np.float32) / 255)
+
+
+@pytest.mark.parametrize("values", [np.full((8, 8), 0.5, np.float32), np.full((8, 8), 70000, np.int32)])
+def test_values_without_a_display_white_are_refused(values: np.ndarray, tmp_path: Path) -> None:
+    image = Image.fromarray(values)
+    image.save(tmp_path / "a.tiff")
+    for use in (lambda: as_picture(image), lambda: as_mask(image, (8, 8)), lambda: read_picture(tmp_path / "a.tiff")):
+        with pytest.raises(UnirenderError, match="has no display values"):
+            use()

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, specular_light
+from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
@@ -31,8 +31,8 @@ def specular_for_roughness(
         s_1, and the share of the covered values where the bound held the ratio.
     """
     maps = before.require("normal", "roughness", "specular", "environment", "mask")
-    old = specular_light(maps["normal"], maps["roughness"], maps["environment"], before.camera)
-    new = specular_light(maps["normal"], roughness, maps["environment"], before.camera)
+    old = derived_specular(before, maps["environment"])
+    new = derived_specular(before.replace(roughness=roughness), maps["environment"])
     ratio = (new + LOBE_FLOOR) / (old + LOBE_FLOOR)
     bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
     inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
@@ -62,6 +62,7 @@ def under_light(
     exposure: str,
     specular: Float[np.ndarray, "h w 3"] | None = None,
     diffuse: Float[np.ndarray, "h w 3"] | None = None,
+    mirrors: bool = True,
 ) -> Intrinsics:
     """The intrinsics under another light: s and d from its own resolution (without shadows), unless they are given.
 
@@ -71,6 +72,7 @@ def under_light(
         exposure: `auto` scales the light by the rule of the training data, to the middle of its range; `keep` does not.
         specular: s under that light, if known; not scaled.
         diffuse: the same for d.
+        mirrors: as for `derived_specular`; not worth its time for predicted maps.
 
     Raises:
         UnirenderError: another exposure, a map is missing, or the object receives no light.
@@ -78,11 +80,11 @@ def under_light(
     if exposure not in ("auto", "keep"):
         raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
     maps = intrinsics.require("normal", "roughness", "mask")
-    derived = diffuse_light(maps["normal"], environment)
+    derived = derived_diffuse(intrinsics, environment)
     factor = exposure_factor(derived, maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
     environment = (environment * factor).astype(np.float32)
     if specular is None:
-        specular = specular_light(maps["normal"], maps["roughness"], environment, intrinsics.camera)
+        specular = derived_specular(intrinsics, environment, mirrors)
     return intrinsics.replace(
         environment=environment, specular=specular, diffuse=derived * factor if diffuse is None else diffuse
     )

@@ -86,15 +86,20 @@ class Frame:
             value = divide(self.leave(value * inside), self.leave(inside))
         return np.where(mask > 0, value, 0).astype(np.float32)
 
-    def enter_intrinsics(self, intrinsics: Intrinsics, environment_size: tuple[int, int]) -> Intrinsics:
-        """All maps and the camera -> square, the environment at its own size; the mask has to be known."""
+    def enter_intrinsics(self, intrinsics: Intrinsics, environment_size: tuple[int, int] | None = None) -> Intrinsics:
+        """All maps and the camera -> square; the mask has to be known.
+
+        Args:
+            intrinsics: at the picture's size.
+            environment_size: rows and columns that the environment gets; None: it stays as it is.
+        """
         mask = intrinsics.require("mask")["mask"]
         maps = {name: value for name, value in intrinsics.maps.items() if name not in ("mask", "environment")}
         changes = {name: self.enter_map(value, mask) for name, value in maps.items()}
         if "normal" in changes:
             changes["normal"] = unit_normal(changes["normal"])
         environment = intrinsics.environment
-        if environment is not None and environment.shape[:2] != environment_size:
+        if environment is not None and environment_size and environment.shape[:2] != environment_size:
             environment = resample_environment(environment, environment_size)
         mask, camera = np.clip(self.enter(mask), 0, 1), self.camera(intrinsics.camera)
         return Intrinsics(mask=mask, environment=environment, camera=camera).replace(**changes)

@@ -8,7 +8,8 @@ from PIL import Image
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, specular_light
+from unirender.pictures import coverage, display_values
+from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 MIN_SIDE = 8  # pixels
@@ -22,9 +23,8 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         UnirenderError: wrong type, shape or range, NaN, or an empty mask.
     """
     if isinstance(image, Image.Image):
-        rgba = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
-        has_alpha = "A" in image.getbands() or "transparency" in image.info
-        picture, alpha = rgba[..., :3], rgba[..., 3:] if has_alpha else None
+        values = display_values(image, "image")
+        picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):
         picture, alpha = image, None
     else:
@@ -42,13 +42,13 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
 
 
 def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
-    """Coverage of the given size.
+    """Coverage of the given size; of a PIL picture its alpha channel if it varies, else the mean of its colours.
 
     Raises:
         UnirenderError: wrong type, shape or range, NaN, or nothing covered by at least one half.
     """
     if isinstance(mask, Image.Image):
-        mask = np.asarray(mask.convert("L"), dtype=np.float32) / 255
+        mask = coverage(display_values(mask, "mask"))
     if not isinstance(mask, np.ndarray):
         raise UnirenderError(f"mask: got {type(mask).__name__}, expected a numpy array [h w 1] or a PIL picture")
     mask = mask[..., None] if mask.ndim == 2 else mask
@@ -87,19 +87,23 @@ def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
         raise UnirenderError(
             f"render: got maps of shape {intrinsics.roughness.shape}, expected one picture [height, width, channels]"
         )
-    if intrinsics.mask is None:
-        ones = np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32)
-        intrinsics = intrinsics.replace(mask=ones)
+    intrinsics = with_mask(intrinsics)
     as_mask(intrinsics.mask, (intrinsics.height, intrinsics.width))
     if intrinsics.environment is None:
         return intrinsics
-    light, maps = as_environment(intrinsics.environment), intrinsics.require("normal", "roughness")
+    light = as_environment(intrinsics.environment)
     if intrinsics.diffuse is None:
-        intrinsics = intrinsics.replace(diffuse=diffuse_light(maps["normal"], light))
+        intrinsics = intrinsics.replace(diffuse=derived_diffuse(intrinsics, light))
     if intrinsics.specular is None:
-        specular = specular_light(maps["normal"], maps["roughness"], light, intrinsics.camera)
-        intrinsics = intrinsics.replace(specular=specular)
+        intrinsics = intrinsics.replace(specular=derived_specular(intrinsics, light))
     return intrinsics
+
+
+def with_mask(intrinsics: Intrinsics) -> Intrinsics:
+    """The intrinsics with a mask: the whole frame where none is known."""
+    if intrinsics.mask is not None:
+        return intrinsics
+    return intrinsics.replace(mask=np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32))
 
 
 def unit_value(name: str, value: Any) -> Float[np.ndarray, "..."]:

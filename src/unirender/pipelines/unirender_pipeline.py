@@ -257,7 +257,7 @@ class UniRenderPipeline(DiffusionPipeline):
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
         before = decomposition.intrinsics
         if environment is not None:
-            edited = under_light(before, environment, exposure, specular, diffuse)
+            edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False)
         else:
             edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
         image = self._rerender(picture, cover, before, edited, anchored, sampling)

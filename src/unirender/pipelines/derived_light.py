@@ -1,0 +1,90 @@
+"""s and d of a surface under a known light, at a cost that does not grow with the picture.
+
+A lobe costs up to 0.1 ms a pixel, and light varies far more slowly over a surface than its colour does. Pictures whose
+longer side exceeds `LIGHT_SIDE` are therefore lit at that size and the light is interpolated. It is derived at the
+picture's own size
+
+- where the surface has detail that the small size does not show: its normal or roughness is not the interpolated one;
+- for s, on request, where a reflection is sharper than the small size shows: roughness below `MIRROR_ROUGHNESS`, under
+  a light of more than `COARSE_ROWS` rows. It is worth its time for maps that somebody made, not for predicted ones: the
+  normals of a small model have no such sharpness.
+"""
+
+import logging
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import diffuse_light, specular_light
+from unirender.pipelines.framing import Frame, unit_normal
+
+LIGHT_SIDE = 256  # pixels along the longer side up to which every pixel is lit by itself
+NORMAL_DETAIL = 0.03  # distance of unit vectors, 1.7 degrees
+ROUGHNESS_DETAIL = 0.02
+MIRROR_ROUGHNESS = 0.15  # a lobe of 3 degrees; over a ball that fills `LIGHT_SIDE`, reflections step by 1 degree
+COARSE_ROWS = 64  # texels of 3 degrees: no reflection of them is sharper
+MANY_PIXELS = 500_000  # lit one by one they take about a minute
+
+logger = logging.getLogger(__name__)
+
+Light = Callable[[Intrinsics], Float[np.ndarray, "h w 3"]]
+
+
+def derived_diffuse(intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
+    """d without shadows; 0 where the normal is 0.
+
+    Args:
+        intrinsics: with normal and mask.
+        environment: lat-long radiance in camera axes, any resolution.
+    """
+    surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
+
+    def light(surface: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+        return diffuse_light(surface.require("normal")["normal"], environment)
+
+    return _lit(surface, light)
+
+
+def derived_specular(
+    intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"], mirrors: bool = True
+) -> Float[np.ndarray, "h w 3"]:
+    """s without shadows; 0 where the normal is 0.
+
+    Args:
+        intrinsics: with normal, roughness and mask; the camera gives the view directions.
+        environment: lat-long radiance in camera axes, any resolution.
+        mirrors: whether sharp reflections are derived at the picture's own size.
+    """
+    maps = intrinsics.require("normal", "roughness", "mask")
+    surface = Intrinsics(**maps, camera=intrinsics.camera)
+
+    def light(surface: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+        maps = surface.require("normal", "roughness")
+        return specular_light(maps["normal"], maps["roughness"], environment, surface.camera)
+
+    sharp = (maps["roughness"][..., 0] < MIRROR_ROUGHNESS) & (mirrors and environment.shape[0] > COARSE_ROWS)
+    return _lit(surface, light, sharp)
+
+
+def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | bool = False) -> np.ndarray:
+    """`light` of a surface `[h w 3]`; `sharp`: pixels whose light the small size does not show."""
+    if max(surface.height, surface.width) <= LIGHT_SIDE:
+        return light(surface)
+    normal, mask = surface.require("normal", "mask").values()
+    frame = Frame(surface.height, surface.width, LIGHT_SIDE)
+    small = frame.enter_intrinsics(surface)
+    maps = {name: frame.leave_map(value, mask) for name, value in small.maps.items() if name != "mask"}
+    distance = np.linalg.norm(unit_normal(maps["normal"]) - normal, axis=-1)
+    exact = sharp | (distance > NORMAL_DETAIL)
+    if surface.roughness is not None:
+        exact |= (np.abs(maps["roughness"] - surface.roughness) > ROUGHNESS_DETAIL)[..., 0]
+    seen = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
+    exact = (exact & seen)[..., None]
+    interpolated = np.where(seen[..., None], frame.leave_map(light(small), mask), 0)
+    if not exact.any():
+        return interpolated
+    if (count := int(exact.sum())) > MANY_PIXELS:
+        logger.warning("the light of %d pixels with fine detail is derived one by one, which takes minutes", count)
+    return np.where(exact, light(surface.replace(normal=np.where(exact, normal, 0))), interpolated)

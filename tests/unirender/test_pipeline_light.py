@@ -1,0 +1,162 @@
+"""Derived s and d of large pictures: the interpolated light against the light of every pixel, and what it costs."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import diffuse_light, environment_directions, specular_light
+from unirender.pipelines import derived_light
+from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
+from unirender.pipelines.editing import specular_for_roughness, under_light
+from unirender.pipelines.inputs import ready_to_render
+
+CAMERA = Camera(fov_deg=50.0, principal=(0.35, 0.6))
+TOLERANCE = 0.03  # of the light's mean
+
+
+def surface(height: int, width: int, roughness: float = 0.5) -> Intrinsics:
+    """A ball with its mask, beside the middle of the frame."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    radius = 0.3 * min(height, width)
+    x, y = (x - 0.4 * width) / radius, -(y - 0.5 * height) / radius
+    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    mask = (x**2 + y**2 < 1)[..., None].astype(np.float32)
+    normal = np.stack([x, y, z], axis=-1) * mask
+    return Intrinsics(normal=normal, roughness=roughness * mask, mask=mask, camera=CAMERA)
+
+
+@functools.cache
+def light(rows: int) -> np.ndarray:
+    """A lopsided sky with a lamp."""
+    directions = environment_directions(rows, 2 * rows)
+    lamp = np.exp(20 * (directions @ np.array([0.6, 0.48, 0.64]) - 1))
+    sky = 0.5 + 0.4 * directions @ np.array([0.8, 0.6, 0.0])
+    return (sky[..., None] * np.array([0.6, 0.8, 1.0]) + 4 * lamp[..., None]).astype(np.float32)
+
+
+def slice_of(given: Intrinsics) -> Intrinsics:
+    """The middle rows of the ball, so that a test of every pixel is quick."""
+    mask = given.require("mask")["mask"].copy()
+    middle = given.height // 2
+    mask[: middle - 20] = mask[middle + 20 :] = 0
+    return given.replace(**{name: value * mask for name, value in given.maps.items()})
+
+
+def every_pixel(given: Intrinsics, environment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """s and d, each pixel lit by itself."""
+    maps = given.require("normal", "roughness")
+    s = specular_light(maps["normal"], maps["roughness"], environment, given.camera)
+    return s, diffuse_light(maps["normal"], environment)
+
+
+def interior(given: Intrinsics) -> np.ndarray:
+    """The ball without its rim, where the normal turns fastest."""
+    return given.require("normal")["normal"][..., 2] > 0.3
+
+
+@pytest.mark.parametrize("size", [(120, LIGHT_SIDE), (LIGHT_SIDE, 80), (64, 64)])
+def test_small_pictures_have_the_light_of_every_pixel(size: tuple[int, int]) -> None:
+    given, environment = surface(*size), light(16)
+    s, d = every_pixel(given, environment)
+    assert np.array_equal(derived_specular(given, environment), s)
+    assert np.array_equal(derived_diffuse(given, environment), d)
+
+
+@pytest.mark.parametrize("size", [(240, 300), (300, 220)])
+def test_large_pictures_have_nearly_the_light_of_every_pixel(size: tuple[int, int]) -> None:
+    given, environment = surface(*size), light(16)
+    inside = interior(given)
+    s, d = every_pixel(given, environment)
+    derived = derived_specular(given, environment), derived_diffuse(given, environment)
+    for value, exact in zip(derived, (s, d), strict=True):
+        assert np.abs(value - exact)[inside].max() < TOLERANCE * exact[inside].mean()
+        assert not np.array_equal(value, exact)
+        assert not value[given.require("mask")["mask"][..., 0] == 0].any()
+        assert value.dtype == np.float32
+    # the twin: the view directions of another camera are told apart
+    wrong = derived_specular(given.replace(camera=Camera()), environment)
+    assert np.abs(wrong - s)[inside].max() > 2 * TOLERANCE * s[inside].mean()
+
+
+def test_a_light_too_small_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    given, environment = surface(240, 300), light(16)
+    inside = interior(given)
+    s, _ = every_pixel(given, environment)
+    monkeypatch.setattr(derived_light, "LIGHT_SIDE", 24)
+    monkeypatch.setattr(derived_light, "NORMAL_DETAIL", 2.0)
+    assert np.abs(derived_specular(given, environment) - s)[inside].max() > TOLERANCE * s[inside].mean()
+
+
+def test_the_cost_is_bounded_by_the_small_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    lit: list[int] = []
+
+    def counted(normal: np.ndarray, *others: object) -> np.ndarray:
+        lit.append(int(np.any(normal != 0, axis=-1).sum()))
+        return specular_light(normal, *others)  # type: ignore[arg-type]  # as they came
+
+    monkeypatch.setattr(derived_light, "specular_light", counted)
+    given = surface(560, 700)
+    derived_specular(given, light(16))
+    pixels = int(given.require("mask")["mask"].sum())
+    share = (LIGHT_SIDE / 700) ** 2
+    assert lit[0] == pytest.approx(share * pixels, rel=0.05)
+    assert sum(lit[1:]) < 0.1 * pixels  # the rim, whose normals the small size does not show
+
+
+def test_detail_of_the_surface_is_lit_by_itself() -> None:
+    given, environment = surface(300, 300), light(16)
+    maps = given.require("normal", "roughness")
+    rng, patch = np.random.default_rng(0), (slice(140, 160), slice(110, 130))
+    normal, roughness = maps["normal"].copy(), maps["roughness"].copy()
+    normal[patch] += rng.normal(0, 0.3, (20, 20, 3)).astype(np.float32)
+    normal[patch] /= np.linalg.norm(normal[patch], axis=-1, keepdims=True)
+    roughness[190:200, 110:130] = rng.choice([0.3, 0.6], (10, 20, 1))
+    detailed = given.replace(normal=normal, roughness=roughness)
+    s, d = every_pixel(detailed, environment)
+    derived = derived_specular(detailed, environment), derived_diffuse(detailed, environment)
+    for value, exact in zip(derived, (s, d), strict=True):
+        same = (value == exact).all(axis=-1)
+        assert same[patch].mean() > 0.95
+        assert same[interior(detailed)].mean() < 0.3  # elsewhere it is interpolated
+        error = np.abs(value - exact)[interior(detailed)] / exact[interior(detailed)].mean()
+        assert (error > TOLERANCE).mean() < 0.005  # beside the patch
+    assert (derived[0] == s)[190:200, 110:130].mean() > 0.95
+    assert (derived[1] == d)[190:200, 110:130].mean() < 0.1  # d knows no roughness
+
+
+def test_mirrors_are_lit_pixel_by_pixel_under_a_light_with_detail(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    mirror = slice_of(surface(280, 280, roughness=0.05))
+    inside = interior(mirror)
+    fine, coarse = (every_pixel(mirror, light(rows))[0][inside] for rows in (2 * COARSE_ROWS, 16))
+    assert np.array_equal(derived_specular(mirror, light(2 * COARSE_ROWS))[inside], fine)
+    assert not np.array_equal(derived_specular(mirror, light(2 * COARSE_ROWS), mirrors=False)[inside], fine)
+    assert not np.array_equal(derived_specular(mirror, light(16))[inside], coarse)
+    assert not caplog.records
+    monkeypatch.setattr(derived_light, "MANY_PIXELS", 1000)
+    under_light(mirror, light(2 * COARSE_ROWS), "keep")
+    assert "one by one" in caplog.text
+
+
+def test_edits_relighting_and_rendering_use_it() -> None:
+    given, environment = slice_of(surface(280, 340, roughness=0.6)), light(16)
+    mask = given.require("mask")["mask"]
+    s, d = derived_specular(given, environment), derived_diffuse(given, environment)
+    relit = under_light(given, environment, "keep").require("specular", "diffuse")
+    ready = ready_to_render(given.replace(environment=environment, metallic=mask)).require("specular", "diffuse")
+    for maps in (relit, ready):
+        assert np.array_equal(maps["specular"], s)
+        assert np.array_equal(maps["diffuse"], d)
+    before = given.replace(environment=environment, specular=0.5 * mask.repeat(3, axis=-1))
+    edited, held = specular_for_roughness(before, 0.4 * mask)
+    old, new = (every_pixel(given.replace(roughness=r * mask), environment)[0] for r in (0.6, 0.4))
+    inside = interior(given)
+    assert held == 0
+    np.testing.assert_allclose(edited[inside], 0.5 * ((new + 0.02) / (old + 0.02))[inside], rtol=2 * TOLERANCE)
+    assert not np.allclose(edited[inside], 0.5, rtol=4 * TOLERANCE)  # the twin: something changes
+    same, _ = specular_for_roughness(before, given.require("roughness")["roughness"])
+    np.testing.assert_allclose(same, before.require("specular")["specular"], rtol=1e-5)
