@@ -1,5 +1,6 @@
 """The command line end to end, with the shipped checkpoint: results, or one clear line; never a partial folder."""
 
+import importlib.metadata
 import itertools
 import json
 import subprocess
@@ -329,3 +330,10 @@ def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "3 pairs in 1 groups" in capsys.readouterr().out
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
     assert "complete" in capsys.readouterr().out
+
+
+def test_the_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        main(["--version"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out == f"unirender {importlib.metadata.version('unirender')}\n"

@@ -26,9 +26,10 @@ class BenchRun:
     """Folder of our model; None: the shipped tiny."""
     methods: tuple[str, ...] = ("ours", "trivial", "plugins")
     """Groups of rows; plugins: what is installed. The trivial rows also run whenever there is a row of yours."""
-    method: tuple[str, ...] = ()
-    """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class."""
-    predictions: tuple[str, ...] = ()
+    method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class;
+    repeatable."""
+    predictions: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=FOLDER of somebody's predictions (`unirender bench export` writes the inputs); repeatable."""
     limit: int | None = None
     """Scenes; the tables of a partial run carry a watermark."""

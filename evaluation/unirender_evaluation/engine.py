@@ -78,12 +78,15 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     """Calls one capability of a row's method.
 
     Raises:
-        UnirenderError: a stranger's method fails, or returns something else than maps or a finite picture.
+        UnirenderError: a stranger's method fails, or returns something else than maps or a finite picture of the
+            question's size.
     """
     function = getattr(row.method, capability)
     if row.info.kind != "external":
         return function(**inputs)
     name = f"method {row.info.label!r}, {capability} ({what})"
+    asked = inputs.get("intrinsics")
+    size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
         result = function(**inputs)
     except Exception as error:
@@ -91,11 +94,14 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     if capability == "decompose":
         if not isinstance(result, Intrinsics):
             raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
+        if (result.height, result.width) != size:
+            raise UnirenderError(f"{name}: got maps of size {(result.height, result.width)}, expected {size}")
         return result
     picture = np.asarray(result)
-    if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype.kind != "f" or not np.isfinite(picture).all():
+    if picture.shape != (*size, 3) or picture.dtype.kind != "f" or not np.isfinite(picture).all():
         raise UnirenderError(
-            f"{name}: got {picture.dtype} of shape {picture.shape}, expected finite linear radiance, floats (h, w, 3)"
+            f"{name}: got {picture.dtype} of shape {picture.shape}, expected finite linear radiance, floats of shape "
+            f"{(*size, 3)}"
         )
     return picture.astype(np.float32)
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from unirender.exr import intrinsics_channels, write_environment, write_exr
+from unirender.files import CAMERA_ATTRIBUTE
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, Task, scene_ids, tasks
@@ -58,7 +59,9 @@ def _write_question(task: Task, folder: Path) -> dict[str, Any]:
         channels = intrinsics_channels(given)
         if channels:
             (folder / task.answer).mkdir(exist_ok=True)
-            write_exr(folder / task.answer / "given.exr", channels)
+            camera = inputs.get("camera") or given.camera
+            attributes = {CAMERA_ATTRIBUTE: camera.describe()}
+            write_exr(folder / task.answer / "given.exr", channels, attributes=attributes)
         if given.environment is not None:
             (folder / task.answer).mkdir(exist_ok=True)
             write_environment(folder / task.answer / "environment.exr", given.environment)

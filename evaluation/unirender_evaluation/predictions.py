@@ -53,8 +53,8 @@ class PredictionFolder:
     def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
         if not folder.is_dir() or not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
-                f"predictions: {folder} is not a folder with one subfolder per picture; "
-                "`unirender bench export` writes the inputs and their names"
+                f"predictions: {folder} has no subfolders, expected one per picture, each named as in the inputs "
+                "that `unirender bench export` writes"
             )
         self.folder = folder
         self._conventions = conventions

@@ -201,7 +201,7 @@ def check_rows(rows: list[Row], reserved: Collection[str] = ()) -> list[Row]:
 
     Args:
         rows: of a run.
-        reserved: keys that no row of a stranger may have: those of the bounds.
+        reserved: keys that no row of a stranger may have: those of the bounds. Nor may they begin with ours.
 
     Raises:
         UnirenderError: two rows have one key, or a stranger's has a reserved one (`UsageError` where `--predictions`
@@ -211,12 +211,14 @@ def check_rows(rows: list[Row], reserved: Collection[str] = ()) -> list[Row]:
     double = [
         row
         for row in rows
-        if keys.count(row.info.key) > 1 or (row.info.kind == "external" and row.info.key in reserved)
+        if keys.count(row.info.key) > 1
+        or (row.info.kind == "external" and (row.info.key in reserved or row.info.key.split("-")[0] == "ours"))
     ]
     if double:
         names = ", ".join(sorted({row.info.key for row in double}))
         from_command_line = any(row.predictions is not None for row in double)
         raise (UsageError if from_command_line else UnirenderError)(
-            f"rows: {names} occur twice, expected unique names, none of them that of a bound; rename one"
+            f"rows: {names} occur twice or are taken, expected unique names, none that of a bound and none that "
+            "begins with 'ours'; rename one"
         )
     return [replace(row) for row in rows]

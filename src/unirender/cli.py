@@ -8,6 +8,7 @@ option, a value outside its range, options that contradict each other, nothing t
 what it was asked for. An error is one line.
 """
 
+import importlib.metadata
 import logging
 import os
 import sys
@@ -165,8 +166,11 @@ class NoticeHandler(logging.Handler):
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script; exits with 0, 1 (failure), 2 (usage) or 130 (interrupted).
 
-    `UNIRENDER_DEBUG=1` shows the traceback of an error.
+    `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
+    if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+        print(f"unirender {importlib.metadata.version('unirender')}")
+        sys.exit(0)
     command = tyro.cli(
         Command, args=argv, prog="unirender", description="A physics-checked renderer and inverse renderer."
     )

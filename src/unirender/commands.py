@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UsageError
-from unirender.options import InputOptions, ModelOptions, OutputOptions
+from unirender.options import InputOptions, ModelOptions, OutputOptions, notice
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,6 +87,8 @@ class Render:
                 light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
                 intrinsics = under_light(with_mask(intrinsics), light, "auto" if self.exposure is None else "keep")
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
+            if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
+                notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
             pipeline = self.model.load()
             image = pipeline.render(intrinsics, **self.model.sampling())
             meta |= {**self.model.provenance(pipeline), **overflow(pipeline, intrinsics)}

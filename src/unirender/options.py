@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 
+MOST_STEPS = 1000  # timesteps of the diffusion (`unirender.diffusion.schedule.NUM_TIMESTEPS`, which needs torch)
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
 
 
@@ -64,9 +65,10 @@ class ModelOptions:
         Raises:
             UsageError: one is outside its range.
         """
-        if self.samples < 1 or (self.steps is not None and self.steps < 1):
+        if self.samples < 1 or (self.steps is not None and not 1 <= self.steps <= MOST_STEPS):
             raise UsageError(
-                f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each (or no --steps)"
+                f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each, and at "
+                f"most {MOST_STEPS} steps"
             )
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")

@@ -76,7 +76,10 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
         UnirenderError: no pixel is covered by at least one half.
     """
     if not (mask >= 0.5).any():
-        raise UnirenderError(f"{name}: the mask is empty, expected white (or opaque) pixels on the object")
+        raise UnirenderError(
+            f"{name}: the mask is empty: no pixel is covered by half or more, expected white (or opaque) pixels on the "
+            "object"
+        )
     return np.clip(mask, 0, 1).astype(np.float32)
 
 

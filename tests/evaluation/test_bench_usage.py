@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import tyro
 from rich.console import Console
 from tiny_suites import write_suite
 
@@ -11,6 +12,7 @@ from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.truth import make_truth
 
 
@@ -64,20 +66,21 @@ def test_the_device_of_our_rows_is_resolved_before_anything_runs() -> None:
     ("names", "expected"),
     [
         (("我们",), "got the name '我们', expected a letter from a to z or a digit"),
-        (("Noise ceiling",), "rows: noise-ceiling occur twice"),
-        (("Reference (other seed)",), "rows: reference-other-seed occur twice"),
-        (("true maps",), "rows: true-maps occur twice"),
-        (("shade(true maps)",), "rows: shade-true-maps occur twice"),
-        (("Composite",), "rows: composite occur twice"),
-        (("Mine A", "mine-a"), "rows: mine-a occur twice"),
+        (("Noise ceiling",), "rows: noise-ceiling occur twice or are taken"),
+        (("Reference (other seed)",), "rows: reference-other-seed occur twice or are taken"),
+        (("true maps",), "rows: true-maps occur twice or are taken"),
+        (("shade(true maps)",), "rows: shade-true-maps occur twice or are taken"),
+        (("Composite",), "rows: composite occur twice or are taken"),
+        (("Ours (mean)",), "rows: ours-mean occur twice or are taken"),
+        (("Mine A", "mine-a"), "rows: mine-a occur twice or are taken"),
     ],
 )
 def test_predictions_need_a_name_that_makes_a_key_of_its_own(
     names: tuple[str, ...], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine" / "picture").mkdir(parents=True)
-    given = [f"{name}={tmp_path / 'mine'}" for name in names]
-    command = ["bench", "run", "--methods", "plugins", "--predictions", *given, "--out", str(tmp_path / "out")]
+    given = [word for name in names for word in ("--predictions", f"{name}={tmp_path / 'mine'}")]
+    command = ["bench", "run", "--methods", "plugins", *given, "--out", str(tmp_path / "out")]
     status, printed = refused(command, capsys)
     assert status == 2
     assert expected in printed
@@ -91,7 +94,7 @@ def test_a_plugin_may_not_take_the_name_of_a_bound(tmp_path: Path) -> None:
     )
     for name in ("Noise ceiling", "Quiet ceiling"):
         (tmp_path / f"{name[0]}.py").write_text(text.format(name=name))
-    with pytest.raises(UnirenderError, match="noise-ceiling occur twice, expected unique names"):
+    with pytest.raises(UnirenderError, match="noise-ceiling occur twice or are taken, expected unique names"):
         build_rows(BenchConfig(methods=(), method=(f"{tmp_path / 'N.py'}:Method",)))
     rows = build_rows(BenchConfig(methods=(), method=(f"{tmp_path / 'Q.py'}:Method",)))
     assert "quiet-ceiling" in {row.info.key for row in rows}
@@ -105,3 +108,9 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match=r"cannot be written \(Not a directory\); choose another --work"):
         next(make_truth(suite, file))
     assert file.read_text() == "kept"
+
+
+def test_repeated_options_add_up(tmp_path: Path) -> None:
+    words = ["--predictions", "a=x", "--method", "m:A", "--predictions", "b=y", "--method", "m:B"]
+    command = tyro.cli(BenchRun, args=words)
+    assert (command.predictions, command.method) == (("a=x", "b=y"), ("m:A", "m:B"))

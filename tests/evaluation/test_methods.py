@@ -166,5 +166,5 @@ def test_answer_asks_only_for_what_a_method_can(suite: Suite) -> None:
 def test_predictions_folder_is_needed(tmp_path: Path) -> None:
     from unirender_evaluation.predictions import PredictionFolder
 
-    with pytest.raises(UnirenderError, match="one subfolder per picture"):
+    with pytest.raises(UnirenderError, match="has no subfolders, expected one per picture"):
         PredictionFolder(tmp_path)

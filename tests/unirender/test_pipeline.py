@@ -12,9 +12,11 @@ from tiny_models import SIZE, make_pipeline
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
 from unirender.composite import split_sum_image
+from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import specular_light
+from unirender.options import MOST_STEPS
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
 from unirender.pipelines.framing import Frame
@@ -314,3 +316,15 @@ def test_diffusers_conventions(pipeline: UniRenderPipeline, tmp_path: Path) -> N
     assert np.abs(get(rough, "albedo") - get(first, "albedo")).mean() < 0.05
     with pytest.raises(UnirenderError, match="no pipeline folder"):
         UniRenderPipeline.from_pretrained(tmp_path / "missing")
+
+
+def test_the_folder_of_a_run_names_its_pipeline(tmp_path: Path) -> None:
+    make_pipeline().save_pretrained(tmp_path / "pipeline")
+    with pytest.raises(UnirenderError, match=r"folder of a training run; its pipeline is .*pipeline"):
+        UniRenderPipeline.from_pretrained(tmp_path)
+
+
+def test_more_steps_than_timesteps_are_refused() -> None:
+    assert MOST_STEPS == NUM_TIMESTEPS
+    with pytest.raises(UnirenderError, match="num_inference_steps: got 1001, expected 1 to 1000"):
+        make_pipeline().decompose(*picture(), mode="sample", num_inference_steps=MOST_STEPS + 1)

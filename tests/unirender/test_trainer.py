@@ -87,7 +87,7 @@ def test_resume_is_exact(tmp_path: Path, parallel: int) -> None:
 
 def test_state_of_another_config_is_refused(tmp_path: Path) -> None:
     run_for(tmp_path, 1)
-    with pytest.raises(UnirenderError, match="another batch_size"):
+    with pytest.raises(UnirenderError, match="holds a run with batch_size 4 instead of 2; repeat the options"):
         run_for(tmp_path, 2, config=dataclasses.replace(TRAIN, batch_size=2))
 
 

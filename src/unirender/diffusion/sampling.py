@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.schedule import last_timestep
+from unirender.diffusion.schedule import NUM_TIMESTEPS, last_timestep
 from unirender.errors import UnirenderError
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
@@ -32,12 +32,12 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
     """Number of steps of a mode: always 1 for `mean`; for `sample` as asked, or the paper's 20.
 
     Raises:
-        UnirenderError: unknown mode, a number of steps below 1, or several steps in mode `mean`.
+        UnirenderError: unknown mode, a number of steps outside [1, 1000], or several steps in mode `mean`.
     """
     if mode not in ("mean", "sample"):
         raise UnirenderError(f"mode: got {mode!r}, expected 'mean' (one step, E[x0 | condition]) or 'sample'")
-    if num_inference_steps is not None and num_inference_steps < 1:
-        raise UnirenderError(f"num_inference_steps: got {num_inference_steps}, expected at least 1")
+    if num_inference_steps is not None and not 1 <= num_inference_steps <= NUM_TIMESTEPS:
+        raise UnirenderError(f"num_inference_steps: got {num_inference_steps}, expected 1 to {NUM_TIMESTEPS}")
     if mode == "mean":
         if num_inference_steps not in (None, 1):
             raise UnirenderError(f"mode mean takes 1 step, got num_inference_steps {num_inference_steps}; use 'sample'")

@@ -83,6 +83,9 @@ class UniRenderPipeline(DiffusionPipeline):
         """
         path = Path(pretrained_model_name_or_path or SHIPPED_CHECKPOINT)
         if not (path / "model_index.json").is_file():
+            inside = path / "pipeline"
+            if (inside / "model_index.json").is_file():
+                raise UnirenderError(f"{path}: is the folder of a training run; its pipeline is {inside}")
             raise UnirenderError(
                 f"{path}: no pipeline folder (model_index.json is missing), expected one written by `unirender train`"
             )

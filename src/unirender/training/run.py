@@ -92,7 +92,8 @@ class Train:
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
+        pipeline = train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
+        print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
 
 

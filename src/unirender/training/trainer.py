@@ -248,8 +248,9 @@ class Trainer:
         config = self.state_dict()["config"]
         differing = sorted(key for key in config if key != "steps" and state["config"].get(key) != config[key])
         if differing:
+            held = ", ".join(f"{key} {state['config'].get(key)!r} instead of {config[key]!r}" for key in differing)
             raise UnirenderError(
-                f"{self.run.out}: holds a run with another {', '.join(differing)}; pass another --out, or the preset"
+                f"{self.run.out}: holds a run with {held}; repeat the options of that run, or pass another --out"
             )
         self.step, self.seconds = state["step"], state["seconds"]
         self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
