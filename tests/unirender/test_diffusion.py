@@ -166,6 +166,10 @@ def test_noise_of_a_row_does_not_depend_on_the_batch() -> None:
 
 def test_modes() -> None:
     assert (steps_of("mean", None), steps_of("sample", None), steps_of("sample", 4)) == (1, 20, 4)
-    for mode, steps, words in (("mode", None, "'sample'"), ("mean", 5, "takes 1 step"), ("sample", 0, "at least 1")):
+    for mode, steps, words in (
+        ("mode", None, "'sample'"),
+        ("mean", 5, "takes 1 step"),
+        ("sample", 0, "expected 1 to 1000"),
+    ):
         with pytest.raises(UnirenderError, match=words):
             steps_of(mode, steps)
