@@ -17,7 +17,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
+from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record, append_record, write_records
 from unirender_evaluation.rows import Row
@@ -94,7 +94,7 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     if capability == "decompose":
         if not isinstance(result, Intrinsics):
             raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
-        if (result.height, result.width) != size:
+        if any(name in IMAGE_MAPS for name in result.present) and (result.height, result.width) != size:
             raise UnirenderError(f"{name}: got maps of size {(result.height, result.width)}, expected {size}")
         return result
     picture = np.asarray(result)

@@ -38,7 +38,12 @@ def fresnel(albedo: Any, metallic: Any) -> Any:
 
 def composite(albedo: Any, metallic: Any, diffuse: Any, specular: Any) -> Any:
     """Radiance from maps in linear units; not multiplied by the mask."""
-    return (1 - metallic) * albedo * diffuse + fresnel(albedo, metallic) * specular
+    return lobes(albedo, metallic, diffuse, specular, fresnel(albedo, metallic))
+
+
+def lobes(albedo: Any, metallic: Any, diffuse: Any, specular: Any, reflectance: Any) -> Any:
+    """The diffuse and the specular lobe at a given reflectance of the latter; not multiplied by the mask."""
+    return (1 - metallic) * albedo * diffuse + reflectance * specular
 
 
 def composite_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
@@ -62,7 +67,7 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
     n_v = np.sum(maps["normal"] * view, axis=-1, keepdims=True)
     reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
-    radiance = (1 - maps["metallic"]) * maps["albedo"] * maps["diffuse"] + reflectance * maps["specular"]
+    radiance = lobes(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"], reflectance)
     return (radiance * maps["mask"]).astype(np.float32)
 
 

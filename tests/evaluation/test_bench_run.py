@@ -1,6 +1,7 @@
 """`bench run`: which rows a configuration asks for, what stops it, and a whole run with Mitsuba, twice."""
 
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from rich.console import Console
 from tiny_suites import make_suite
 
+from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
@@ -57,6 +59,23 @@ def test_what_a_strangers_method_does_wrong_is_named(body: str, message: str) ->
     maps = Intrinsics(albedo=np.full((2, 2, 3), 0.5, np.float32))
     with np.errstate(divide="ignore"), pytest.raises(UnirenderError, match=message):
         engine.ask(make_row(scope["Wild"](), "external"), "render", "x", intrinsics=maps)
+
+
+def test_the_maps_of_a_stranger_have_the_size_of_the_picture_and_a_light_has_its_own() -> None:
+    class Light:
+        name, config = "light", MappingProxyType({})
+
+        def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+            if mask.all():
+                return Intrinsics(environment=np.ones((16, 32, 3), np.float32))
+            return Intrinsics(albedo=np.ones((8, 8, 3), np.float32))
+
+    row, picture = make_row(Light(), "external"), np.ones((4, 4, 3), np.float32)
+    inputs = {"image_srgb": picture, "camera": Camera()}
+    light = engine.ask(row, "decompose", "x", mask=np.ones((4, 4, 1), np.float32), **inputs)
+    assert light.present == ("environment",)
+    with pytest.raises(UnirenderError, match=r"decompose \(x\): got maps of size \(8, 8\), expected \(4, 4\)"):
+        engine.ask(row, "decompose", "x", mask=np.zeros((4, 4, 1), np.float32), **inputs)
 
 
 def test_nothing_runs_before_all_predictions_are_sound(suite: Suite, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.composite import composite, composite_image, environment_brdf_tables, fresnel, split_sum_image
+from unirender.composite import composite, composite_image, environment_brdf_tables, fresnel, lobes, split_sum_image
 from unirender.intrinsics import Intrinsics
 
 Maps = dict[str, Tensor]
@@ -52,7 +52,7 @@ def split_sum_radiance(maps: Maps, camera: Camera) -> Float[Tensor, "b 3 H W"]:
     n_v = (F.normalize(maps["normal"], dim=1, eps=SHORT) * view).sum(dim=1, keepdim=True)
     a, b = _environment_brdf(n_v, roughness).chunk(2, dim=1)
     reflectance = (fresnel(maps["albedo"], metallic) * a + b) / (a + b)
-    return (1 - metallic) * maps["albedo"] * maps["diffuse"] + reflectance * maps["specular"]
+    return lobes(maps["albedo"], metallic, maps["diffuse"], maps["specular"], reflectance)
 
 
 PRIORS = {
