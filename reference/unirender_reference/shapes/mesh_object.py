@@ -1,8 +1,8 @@
 """The one shape that the reference renders: a triangle mesh in a unit sphere with its base colour.
 
-Convention of the texture: `uv` lies in [0, 1]^2, u runs along the columns and v along the rows of `albedo` *from its
+Convention of the textures: `uv` lies in [0, 1]^2, u runs along the columns and v along the rows of a texture *from its
 first row*, texel (i, j) has its centre at ((j + 0.5) / w, (i + 0.5) / h). (This is how Mitsuba's `bitmap` reads `uv`;
-glTF stores it like this too, OBJ upside down.)
+glTF stores it like this too, OBJ upside down.) All textures of an object share its `uv`; their sizes may differ.
 """
 
 from collections.abc import Mapping
@@ -28,6 +28,10 @@ class MeshObject:
         normals: (n, 3) float32 unit shading normals.
         uv: (n, 2) float32 or None when `albedo` is one colour.
         albedo: (3,) or (h, w, 3) float32, linear Rec.709 in [0, 1].
+        roughness: (h, w) float32, perceptual, [0, 1]; None: the object has no roughness of its own, scenes give it.
+        metallic: (h, w) float32, [0, 1]; None as for roughness.
+        normal_map: (h, w, 3) float32 unit vectors in tangent space, or None: x along +u, y against +v (up in the
+            picture, as glTF and OpenGL have it), z along the shading normal.
         provenance: how the object was made, as text.
     """
 
@@ -38,6 +42,9 @@ class MeshObject:
     normals: Float[np.ndarray, "n 3"]
     uv: Float[np.ndarray, "n 2"] | None
     albedo: Float[np.ndarray, "3"] | Float[np.ndarray, "h w 3"]
+    roughness: Float[np.ndarray, "hr wr"] | None = None
+    metallic: Float[np.ndarray, "hm wm"] | None = None
+    normal_map: Float[np.ndarray, "hn wn 3"] | None = None
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,12 +73,31 @@ class MeshObject:
             )
         if self.albedo.dtype != np.float32 or not (self.albedo.min() >= 0 and self.albedo.max() <= 1):
             raise UnirenderError(f"{self.name}: albedo must be float32, linear, within [0, 1]")
+        for label, texture in (("roughness", self.roughness), ("metallic", self.metallic)):
+            if texture is not None:
+                self._check_texture(label, texture, 2)
+                if not (texture.min() >= 0 and texture.max() <= 1):
+                    raise UnirenderError(f"{self.name}: {label} must lie within [0, 1], got up to {texture.max():.4g}")
+        if self.normal_map is not None:
+            self._check_texture("normal_map", self.normal_map, 3)
+            if np.abs(np.linalg.norm(self.normal_map, axis=-1) - 1).max() > UNIT_TOLERANCE:
+                raise UnirenderError(f"{self.name}: normal_map must hold unit vectors; normalise it")
         length = np.linalg.norm(self.normals, axis=1)
         if np.abs(length - 1).max() > UNIT_TOLERANCE:
             raise UnirenderError(f"{self.name}: normals must be unit vectors, got lengths down to {length.min():.4f}")
         radius = float(np.linalg.norm(self.vertices, axis=1).max())
         if abs(radius - 1) > UNIT_TOLERANCE:
             raise UnirenderError(f"{self.name}: bounding sphere must have radius 1, got {radius:.4f}")
+
+    def _check_texture(self, label: str, texture: np.ndarray, dimensions: int) -> None:
+        """A texture of the right type, on an object that has texture coordinates."""
+        finite = texture.dtype == np.float32 and texture.ndim == dimensions and np.isfinite(texture).all()
+        if not finite or texture.size == 0 or (dimensions == 3 and texture.shape[2] != 3) or self.uv is None:
+            size = "(h, w, 3)" if dimensions == 3 else "(h, w)"
+            raise UnirenderError(
+                f"{self.name}: {label} must be finite float32 {size} with uv, got {texture.dtype} {texture.shape}, "
+                f"uv {'absent' if self.uv is None else 'present'}"
+            )
 
     @property
     def signed_volume(self) -> float:
