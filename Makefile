@@ -31,7 +31,7 @@ $(VENV)/.runtime: $(REQUIREMENTS)
 
 $(VENV)/.dev: $(REQUIREMENTS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[dev,docs]'
+	$(INSTALL) --editable '.[dev,docs,cluster,denoise]'
 	touch $(VENV)/.runtime $@
 
 setup: $(VENV)/.dev

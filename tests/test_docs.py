@@ -37,7 +37,7 @@ def problems(text: str) -> list[str]:
     """What of the commands in a text does not exist."""
     found = []
     for words in shown_commands(text):
-        command = words[:2] if words[0] == "bench" else words[:1]
+        command = words[:2] if words[0] in ("bench", "reference") else words[:1]
         if command[0].startswith("-") or command == ["..."]:
             continue
         shown = help_text(*command)

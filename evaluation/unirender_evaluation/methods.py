@@ -28,7 +28,7 @@ from unirender.color import srgb_decode, unpremultiply
 from unirender.composite import composite_image, split_sum_image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, specular_light
+from unirender.surface_light import diffuse_light, specular_light
 from unirender_evaluation.training_statistics import training_statistics
 
 CAPABILITIES = ("decompose", "edit", "relight", "render")

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import MIN_ALPHA
+from unirender.surface_light import MIN_ALPHA
 
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
 COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced over [0, 1]

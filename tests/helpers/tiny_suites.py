@@ -11,7 +11,7 @@ import numpy as np
 from unirender.camera import Camera
 from unirender.composite import composite
 from unirender.exr import exr_bytes, image_channels
-from unirender.lighting import diffuse_light, specular_light
+from unirender.surface_light import diffuse_light, specular_light
 from unirender_evaluation.suites import Scene, Suite, SuiteSpec, load_suite, read_spec
 from unirender_evaluation.truth_file import (
     CEILING,

@@ -10,7 +10,8 @@ import reference_scenes as scenes
 
 from unirender.camera import Camera
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import diffuse_light, mirror_environment, sample_environment, specular_light
+from unirender.lighting import mirror_environment, sample_environment
+from unirender.surface_light import diffuse_light, specular_light
 from unirender_reference import backend
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.scene import load_scene, sensor_dict

@@ -13,7 +13,8 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, on_pole_grid, read_exr, write_environment, write_exr
 from unirender.files import new_folder, write_result
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, resample_environment, specular_light
+from unirender.lighting import resample_environment
+from unirender.surface_light import diffuse_light, specular_light
 from unirender_reference.dataset import render_group
 from unirender_reference.lights import load_light
 from unirender_reference.lights.light import area_resampled

@@ -14,8 +14,9 @@ from webdataset.compat import WebDataset
 from unirender.composite import composite_image
 from unirender.errors import UnirenderError
 from unirender.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
-from unirender.lighting import diffuse_light, mean_radiance, resample_environment, rotate_environment
+from unirender.lighting import mean_radiance, resample_environment, rotate_environment
 from unirender.paths import cache_dir
+from unirender.surface_light import diffuse_light
 from unirender.symmetries import turn_rotation
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,

@@ -9,16 +9,15 @@ from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.lighting import (
-    diffuse_light,
     environment_directions,
     mean_radiance,
     mirror_environment,
     resample_environment,
     rotate_environment,
     sample_environment,
-    specular_light,
     texel_solid_angles,
 )
+from unirender.surface_light import diffuse_light, specular_light
 
 RNG = np.random.default_rng(3)
 

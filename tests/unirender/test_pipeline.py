@@ -15,12 +15,12 @@ from unirender.composite import split_sum_image
 from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import specular_light
 from unirender.options import MOST_STEPS
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.surface_light import specular_light
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,12 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, environment_directions, specular_light
+from unirender.lighting import environment_directions
 from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
 from unirender.pipelines.editing import specular_for_roughness, under_light
 from unirender.pipelines.inputs import ready_to_render
+from unirender.surface_light import diffuse_light, specular_light
 
 CAMERA = Camera(fov_deg=50.0, principal=(0.35, 0.6))
 TOLERANCE = 0.03  # of the light's mean

@@ -5,7 +5,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light
+from unirender.surface_light import diffuse_light
 from unirender.symmetries import LIGHT_MAPS, mirror, quarter_turn, scale_light, turn_rotation
 
 

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import diffuse_light, specular_light
 from unirender.pipelines.framing import Frame, unit_normal
+from unirender.surface_light import diffuse_light, specular_light
 
 LIGHT_SIDE = 256  # pixels along the longer side up to which every pixel is lit by itself
 NORMAL_DETAIL = 0.03  # distance of unit vectors, 1.7 degrees
