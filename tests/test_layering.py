@@ -25,6 +25,7 @@ VOCABULARY = {
         "paths",
         "pictures",
         "score",
+        "surface_light",
         "symmetries",
     )
 }

@@ -6,6 +6,7 @@ lines stand here and a test holds them against it.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,6 +32,23 @@ def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
     return srgb_encode(np.clip(image_linear, 0.0, 1.0))
+
+
+def display_slope(
+    linear: Float[np.ndarray, "..."], space: Literal["srgb", "linear"] = "srgb"
+) -> Float[np.ndarray, "..."]:
+    """Derivative (float64) of the display value with respect to linear light: 0 where the display clips.
+
+    Args:
+        linear: any range.
+        space: "srgb": the display value is `image_srgb`; "linear": only the clip to [0, 1].
+    """
+    x = np.asarray(linear, np.float64)
+    if space == "srgb":
+        slope = np.where(x <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))
+    else:
+        slope = np.ones_like(x)
+    return np.where((x < 0) | (x > 1), 0.0, slope)
 
 
 def unpremultiply(

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from unirender.color import HdrCurve, image_srgb, luminance, srgb_decode, srgb_encode, unpremultiply
+from unirender.color import HdrCurve, display_slope, image_srgb, luminance, srgb_decode, srgb_encode, unpremultiply
 
 
 def test_srgb_agrees_with_colour_science() -> None:
@@ -46,6 +46,21 @@ def test_hdr_curve_ends_and_overflow() -> None:
 
 def test_image_srgb_clips_to_the_display() -> None:
     assert image_srgb(np.array([-1.0, 0.0, 1.0, 7.0])) == pytest.approx([0, 0, 1, 1])
+
+
+def test_display_slope_is_the_derivative_of_what_is_shown() -> None:
+    """Against central differences in float64; 0 where the display clips; twin: the slope of a plain gamma."""
+    x, h = np.array([-0.5, 0.001, 0.002, 0.01, 0.2, 0.7, 0.99, 1.5]), 1e-6
+
+    def shown(linear: np.ndarray) -> np.ndarray:
+        clipped = np.clip(linear, 0, 1)
+        return colour.cctf_encoding(clipped, function="sRGB")
+
+    differences = (shown(x + h) - shown(x - h)) / (2 * h)
+    np.testing.assert_allclose(display_slope(x), differences, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(display_slope(x, "linear"), [0, 1, 1, 1, 1, 1, 1, 0])
+    gamma = 1 / 2.2 * x[1:-1] ** (1 / 2.2 - 1)
+    assert np.abs(gamma / differences[1:-1] - 1).max() > 0.1
 
 
 def test_unpremultiply_undoes_coverage_and_leaves_the_background_black() -> None:

@@ -1,13 +1,9 @@
-"""Environment maps: closed forms, invariants and Monte Carlo for the light that a surface receives."""
-
-import tracemalloc
+"""Environment maps: their grid, orientation and energy."""
 
 import numpy as np
 import pytest
+from environments import random_directions, smooth_environment
 
-from unirender.camera import Camera
-from unirender.color import image_srgb
-from unirender.errors import UnirenderError
 from unirender.lighting import (
     environment_directions,
     mean_radiance,
@@ -17,28 +13,8 @@ from unirender.lighting import (
     sample_environment,
     texel_solid_angles,
 )
-from unirender.surface_light import diffuse_light, specular_light
 
 RNG = np.random.default_rng(3)
-
-
-def sphere_normals(size: int = 24) -> np.ndarray:
-    y, x = np.mgrid[:size, :size]
-    x, y = (x - size / 2 + 0.5) / (size * 0.46), -(y - size / 2 + 0.5) / (size * 0.46)
-    inside = x**2 + y**2 < 0.95
-    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
-    return np.where(inside[..., None], normal, 0).astype(np.float32)
-
-
-def smooth_environment(height: int = 32, width: int = 64) -> np.ndarray:
-    d = environment_directions(height, width)
-    lobes = [np.exp(4 * (d @ axis - 1)) for axis in np.eye(3, dtype=np.float32)]
-    return (0.2 + np.stack(lobes, axis=-1)).astype(np.float32)
-
-
-def random_directions(count: int) -> np.ndarray:
-    d = RNG.normal(size=(count, 3))
-    return (d / np.linalg.norm(d, axis=-1, keepdims=True)).astype(np.float32)
 
 
 def test_solid_angles_sum_to_the_sphere() -> None:
@@ -106,96 +82,3 @@ def test_mirror_flips_x() -> None:
     np.testing.assert_allclose(
         sample_environment(mirror_environment(environment), flipped), sample_environment(environment, d), atol=1e-4
     )
-
-
-def test_diffuse_light_of_a_constant_and_of_a_gradient() -> None:
-    normal = sphere_normals()
-    inside = normal.any(axis=-1)
-    d = diffuse_light(normal, np.full((16, 32, 3), 2.0, dtype=np.float32))
-    np.testing.assert_allclose(d[inside], 2.0, rtol=5e-3)
-    assert (d[~inside] == 0).all()
-    # radiance 1 + a.l gives irradiance / pi = 1 + 2/3 a.n (second Lambertian coefficient)
-    axis = np.array([0.3, 0.5, -0.2], dtype=np.float32)
-    environment = np.repeat((1 + environment_directions(64, 128) @ axis)[..., None], 3, axis=-1)
-    expected = 1 + 2 / 3 * (normal @ axis)
-    np.testing.assert_allclose(diffuse_light(normal, environment)[inside][:, 0], expected[inside], rtol=0, atol=0.01)
-
-
-def test_mirror_limit_reads_the_reflected_radiance() -> None:
-    normal, environment = sphere_normals(), smooth_environment()
-    inside = normal.any(axis=-1)
-    view = Camera().view_directions(*normal.shape[:2])
-    reflected = 2 * np.sum(normal * view, axis=-1, keepdims=True) * normal - view
-    s = specular_light(normal, 0.03, environment)
-    expected = sample_environment(environment, reflected)
-    central = inside & (np.sum(normal * view, axis=-1) > 0.5)
-    np.testing.assert_allclose(s[central], expected[central], rtol=0.03)
-
-
-@pytest.mark.parametrize("roughness", [0.2, 0.34, 0.4, 0.6, 1.0])
-def test_specular_light_against_monte_carlo(roughness: float) -> None:
-    """Uniform directions on the sphere, the GGX formula written out again."""
-    normal = np.zeros((2, 2, 3), dtype=np.float32)
-    normal[..., :] = np.array([0.5, 0.3, 0.812404])
-    normal[0, 1] = [0.0, 0.0, 1.0]
-    normal[1, 0] = [-0.6, 0.0, 0.8]
-    environment, view = smooth_environment(), Camera().view_directions(2, 2)
-    alpha = roughness**2
-    light = random_directions(500_000)
-    radiance = sample_environment(environment, light)
-    s = specular_light(normal, roughness, environment)
-    for i, j in np.ndindex(2, 2):
-        n, v = normal[i, j], view[i, j]
-        h = v + light
-        h /= np.linalg.norm(h, axis=-1, keepdims=True)
-        cos_l, cos_v = light @ n, v @ n
-        d = alpha**2 / (np.pi * ((h @ n) ** 2 * (alpha**2 - 1) + 1) ** 2)
-        g = [2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2)) for c in (np.maximum(cos_l, 1e-6), cos_v)]
-        f_cos = np.where(cos_l > 0, d * g[0] * g[1] / (4 * cos_v), 0)
-        samples = 4 * np.pi * f_cos[:, None] * radiance
-        error = samples.std(axis=0) / np.sqrt(len(light))
-        np.testing.assert_array_less(np.abs(s[i, j] - samples.mean(axis=0)), 0.015 * s[i, j] + 4 * error)
-
-
-def test_specular_light_twin_a_rougher_lobe_is_told_apart() -> None:
-    normal, environment = sphere_normals(), smooth_environment()
-    inside = normal.any(axis=-1)
-    a, b = (specular_light(normal, r, environment)[inside] for r in (0.5, 0.56))
-    assert np.median(np.abs(a - b) / a) > 0.015
-
-
-def test_sharp_and_wide_lobes_meet() -> None:
-    normal, environment = sphere_normals(48), smooth_environment()
-    inside = normal[..., 2] > 0.4
-    a, b = (image_srgb(0.5 * specular_light(normal, r, environment))[inside] for r in (0.3499, 0.3501))
-    assert -10 * np.log10(np.mean((a - b) ** 2)) > 35
-
-
-def test_a_large_map_costs_little_memory_and_gives_the_light_of_its_small_version() -> None:
-    """1024 x 2048 texels with a sun: dense resampling matrices alone would be 2 GB."""
-    normal, environment = sphere_normals(), smooth_environment(1024, 2048)
-    axis = np.array([0.48, 0.6, 0.64], dtype=np.float32)
-    environment += 5 * np.exp(300 * (environment_directions(1024, 2048) @ axis - 1))[..., None]
-
-    def lights(environment: np.ndarray) -> list[np.ndarray]:
-        rough = (specular_light(normal, r, environment) for r in (0.15, 0.3, 0.6))
-        return [image_srgb(0.5 * light) for light in (diffuse_light(normal, environment), *rough)]
-
-    tracemalloc.start()
-    large = lights(environment)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 400e6
-    small, twin = lights(resample_environment(environment, (256, 512))), lights(np.roll(environment, 100, axis=1))
-    for a, b, other in zip(large, small, twin, strict=True):
-        assert -10 * np.log10(np.mean((a - b) ** 2)) > 40
-        assert -10 * np.log10(np.mean((a - other) ** 2)) < 40
-
-
-def test_light_is_linear_and_needs_a_map() -> None:
-    normal = sphere_normals()
-    a, b = smooth_environment(), RNG.random((32, 64, 3), dtype=np.float32)
-    for f in (diffuse_light, lambda n, e: specular_light(n, 0.6, e), lambda n, e: specular_light(n, 0.1, e)):
-        np.testing.assert_allclose(f(normal, 2 * a + b), 2 * f(normal, a) + f(normal, b), rtol=1e-3, atol=1e-4)
-    with pytest.raises(UnirenderError, match="at least 2 x 2"):
-        diffuse_light(normal, np.ones((1, 8, 3), dtype=np.float32))
