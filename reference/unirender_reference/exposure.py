@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender import exposure as gauge
+from unirender.errors import UnirenderError
+from unirender_reference.faults import ObjectFault
 
 PASS_SPP = 16
 PASS_SEED = 0
@@ -31,9 +33,16 @@ def exposure_factor(diffuse: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray,
         seed: draws the target brightness.
 
     Raises:
-        UnirenderError: the mask is empty, or no light reaches the object.
+        ObjectFault: the object covers no pixel, or no light reaches it.
     """
-    return gauge.exposure_factor(diffuse, mask, gauge.draw_target(np.random.default_rng(seed)))
+    if not (mask > gauge.MASK_THRESHOLD).any():
+        raise ObjectFault(
+            "covers no pixel of the picture by half or more, expected an object in view; is it flat and seen edge-on?"
+        )
+    try:
+        return gauge.exposure_factor(diffuse, mask, gauge.draw_target(np.random.default_rng(seed)))
+    except UnirenderError as error:
+        raise ObjectFault(str(error)) from error
 
 
 def scene_exposure(renderer: _Renderer, environment: Float[np.ndarray, "h w 3"], seed: int) -> float:

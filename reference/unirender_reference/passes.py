@@ -1,14 +1,16 @@
 """Monte Carlo passes: seeds, batches, the repair of NaN pixels, means and their variance.
 
 A *pass* is one `mi.render` with its own seed. An estimate is the mean over its passes; the variance *of that mean*
-comes from the spread between passes (Mitsuba's `moment` integrator gives XYZ, not RGB).
+comes from the spread between passes (Mitsuba's `moment` integrator gives XYZ, not RGB). Many passes are kept as the
+means of equal groups, so that memory does not grow with the samples: a mean over groups is the mean over passes, and
+the spread between groups gives the same variance, with fewer degrees of freedom.
 """
 
 import hashlib
 import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +19,15 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
+from unirender_reference.faults import ObjectFault
+from unirender_reference.integrators import path_integrator
 
 TRUTH_BATCHES = 8
 SAMPLES_PER_PASS = 1 << 23  # wavefront size: memory grows with it
 NAN_ATTEMPTS = 8
+PIXELS_PER_BLOCK = 1 << 13
+MOST_KEPT = 32  # passes, or means of groups of them, in memory
+PIXELS_KEPT = 1 << 25  # in memory, of all of them: of pictures above 1024 x 1024 fewer than `MOST_KEPT` are kept
 MOST_SPLITS = 8  # passes to make of one that is no full grid: small passes are hardly stratified
 
 
@@ -51,25 +58,79 @@ class Counters:
 def render_passes(
     scene: Any, depth: int, spp: int, seed: int, batches: int, counters: Counters
 ) -> tuple[Float[np.ndarray, "n h w 4"], int]:
-    """Premultiplied RGBA passes of path tracing at `depth`, the environment hidden; at least `batches` of them.
+    """Premultiplied RGBA passes of path tracing at `depth`, the environment hidden; arguments as `integrator_passes`.
+
+    Depth 2 is one bounce, direct light; depth 4 is three bounces.
+    """
+    return integrator_passes(scene, path_integrator(depth), spp, seed, batches, counters)
+
+
+def integrator_passes(
+    scene: Any, integrator: Any, spp: int, seed: int, batches: int, counters: Counters
+) -> tuple[Float[np.ndarray, "n h w c"], int]:
+    """At least `batches` passes of any Mitsuba integrator, each an `mi.render` with its own seed.
+
+    Where there are more than `kept_passes` allows, what comes back are the means of groups of as many passes each.
 
     A pixel that comes out NaN or infinite is taken from a render with another seed; how many is the second result.
+
+    Args:
+        scene: a Mitsuba scene with one sensor.
+        integrator: what is rendered; c is 4 (RGBA) and one channel for each of its AOVs.
+        spp: samples per pixel of all passes together.
+        seed: equal seeds give equal passes.
+        batches: least number of passes.
+        counters: seconds, calls and repaired pixels are added here.
 
     Raises:
         UnirenderError: `spp` cannot be divided, or a pixel stays NaN.
     """
-    mi = mitsuba()
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
     width, height = scene.sensors()[0].film().crop_size()
-    count = pass_count(spp, batches, SAMPLES_PER_PASS // int(width * height))
-    before, passes = counters.nan_pixels, []
-    for index in range(count):
+    pixels = int(width * height)
+    count = pass_count(spp, batches, SAMPLES_PER_PASS // pixels)
+    before = counters.nan_pixels
 
-        def draw(attempt: int, index: int = index) -> Float[np.ndarray, "h w 4"]:
+    def drawn(index: int) -> Float[np.ndarray, "h w c"]:
+        def draw(attempt: int) -> Float[np.ndarray, "h w c"]:
             return _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
 
-        passes.append(finite_pass(draw, counters, "render"))
-    return np.stack(passes), counters.nan_pixels - before
+        return finite_pass(draw, counters, "render")
+
+    kept = group_means((drawn(index) for index in range(count)), count, kept_passes(count, batches, pixels))
+    return kept, counters.nan_pixels - before
+
+
+def group_means(
+    passes: Iterable[Float[np.ndarray, "h w c"]], count: int, groups: int
+) -> Float[np.ndarray, "groups h w c"]:
+    """The means of `groups` equal groups of `count` successive passes; the passes themselves where there is one each.
+
+    One pass and one float64 sum are in memory besides the result.
+    """
+    size, kept = count // groups, np.empty(0, np.float32)
+    total = np.empty(0)
+    for index, picture in enumerate(passes):
+        if index == 0:
+            kept = np.empty((groups, *picture.shape), np.float32)
+            total = np.zeros(picture.shape if size > 1 else 0)
+        if size == 1:
+            kept[index] = picture
+            continue
+        total += picture
+        if (index + 1) % size == 0:
+            kept[index // size] = total / size
+            total[:] = 0
+    return kept
+
+
+def kept_passes(count: int, batches: int, pixels: int) -> int:
+    """How many passes, or means of equal groups of passes, of a picture of `pixels` are kept of `count`.
+
+    All of them up to `MOST_KEPT` (and `PIXELS_KEPT` in all); else the most groups below that, but at least `batches`.
+    """
+    most = max(batches, min(MOST_KEPT, PIXELS_KEPT // pixels))
+    groups = [n for n in range(batches, count + 1) if count % n == 0]
+    return max((n for n in groups if n <= most), default=groups[0])
 
 
 def finite_pass(
@@ -83,9 +144,11 @@ def finite_pass(
         what: stands in the error message.
 
     Raises:
-        UnirenderError: a pixel is not finite in any of `NAN_ATTEMPTS` other draws.
+        ObjectFault: a pixel is not finite in any of `NAN_ATTEMPTS` other draws.
     """
     picture = draw(0)
+    if np.isfinite(picture).all():
+        return picture
     bad = ~np.isfinite(picture).all(axis=-1)
     counters.nan_pixels += int(bad.sum())
     for attempt in range(1, NAN_ATTEMPTS + 1):
@@ -94,7 +157,7 @@ def finite_pass(
         picture[bad] = draw(attempt)[bad]
         bad = ~np.isfinite(picture).all(axis=-1)
     if bad.any():
-        raise UnirenderError(
+        raise ObjectFault(
             f"{what}: {int(bad.sum())} pixels stay NaN after {NAN_ATTEMPTS} seeds, expected finite radiance; "
             "check the normals and the light"
         )
@@ -103,28 +166,60 @@ def finite_pass(
 
 def mean_estimate(passes: Float[np.ndarray, "n h w c"], nan_pixels: int, batches: int) -> Estimate:
     """Mean over passes and its variance (None for one batch)."""
-    variance = passes.var(axis=0, ddof=1, dtype=np.float64) / len(passes) if batches > 1 else None
-    return Estimate(_float32(passes.mean(axis=0, dtype=np.float64)), _float32(variance), nan_pixels)
+    mean = np.empty(passes.shape[1:], np.float32)
+    variance = np.empty_like(mean) if batches > 1 else None
+    for rows in _row_blocks(passes):
+        block = passes[:, rows].astype(np.float64)
+        average = block.mean(axis=0)
+        mean[rows] = average
+        if variance is not None:
+            block -= average
+            variance[rows] = np.einsum("nijc,nijc->ijc", block, block) / (len(block) - 1) / len(block)
+    return Estimate(mean, variance, nan_pixels)
 
 
 def ratio_estimate(passes: Float[np.ndarray, "n h w 4"], nan_pixels: int, batches: int) -> Estimate:
     """Sum of radiance over sum of coverage, 0 where nothing is covered; variance of the ratio by the delta method."""
-    radiance, coverage = passes[..., :3].astype(np.float64), passes[..., 3:].astype(np.float64)
-    total = coverage.mean(axis=0)
-    covered = total > 0
-    mean = np.divide(radiance.mean(axis=0), total, out=np.zeros(radiance.shape[1:]), where=covered)
-    if batches == 1:
-        return Estimate(_float32(mean), None, nan_pixels)
-    residual = radiance - mean * coverage
-    spread = np.square(residual).sum(axis=0) / (len(passes) - 1) / len(passes)
-    variance = np.divide(spread, np.square(total), out=np.zeros_like(spread), where=covered)
-    return Estimate(_float32(mean), _float32(variance), nan_pixels)
+    return weighted_estimate(passes[..., :3], passes[..., 3:], nan_pixels, batches)
+
+
+def weighted_estimate(
+    light: Float[np.ndarray, "n h w 3"], weight: Float[np.ndarray, "n h w k"], nan_pixels: int, batches: int
+) -> Estimate:
+    """Sum of weighted radiance over sum of weights (one a pixel, or one a channel), 0 where the weights are 0.
+
+    `light` has its weight in it. Variance of the ratio by the delta method; None for one batch.
+    """
+    mean = np.empty(light.shape[1:], np.float32)
+    variance = np.empty_like(mean) if batches > 1 else None
+    for rows in _row_blocks(light):
+        radiance, coverage = (
+            np.moveaxis(part[:, rows], -1, 0).astype(np.float64, order="C") for part in (light, weight)
+        )
+        total = coverage.mean(axis=1)
+        covered = np.broadcast_to(total > 0, (len(radiance), *total.shape[1:]))
+        average = np.divide(radiance.mean(axis=1), total, out=np.zeros(covered.shape), where=covered)
+        mean[rows] = np.moveaxis(average, 0, -1)
+        if variance is not None:
+            radiance -= average[:, None] * coverage
+            spread = np.einsum("cnij,cnij->cij", radiance, radiance) / (len(light) - 1) / len(light)
+            spread = np.divide(spread, np.square(total), out=np.zeros(covered.shape), where=covered)
+            variance[rows] = np.moveaxis(spread, 0, -1)
+    return Estimate(mean, variance, nan_pixels)
+
+
+def _row_blocks(passes: Float[np.ndarray, "n h w c"]) -> Iterator[slice]:
+    """Rows to average at a time: their float64 copies stay in the processor's cache."""
+    height, width = passes.shape[1:3]
+    step = max(1, PIXELS_PER_BLOCK // width)
+    return (slice(start, start + step) for start in range(0, height, step))
 
 
 def pass_count(spp: int, batches: int, most: int) -> int:
     """The fewest passes (at least `batches`) that divide `spp` into equal pass sizes, each a full multi-jittered grid.
 
-    Mitsuba's multi-jittered sampler rounds other sizes up, with a warning.
+    Mitsuba's multi-jittered sampler rounds other sizes up, with a warning. More than `MOST_KEPT` passes can be put into
+    equal groups, at least `batches` and at most `MOST_KEPT` (or `MOST_SPLITS` times `batches`) of them.
 
     Args:
         spp: samples per pixel in all.
@@ -140,12 +235,17 @@ def pass_count(spp: int, batches: int, most: int) -> int:
     if (count := _grid_passes(spp, batches, most)) is not None:
         return count
     below = next(n for n in range(spp - 1, 0, -1) if n < batches or _grid_passes(n, batches, most) is not None)
-    above = next(n for n in itertools.count(spp + 1) if _grid_passes(n, batches, most) is not None)
+    above = next_spp(spp, batches, most)
     advice = f"use {below} or {above}" if below >= batches else f"use {above}"
     raise UnirenderError(
         f"spp: got {spp} in {batches} batches, expected a number that divides into a few full multi-jittered grids "
         f"(4, 6, 9, 16, 64, ... samples a pass); {advice}"
     )
+
+
+def next_spp(spp: int, batches: int, most: int) -> int:
+    """The least number of samples per pixel >= `spp` that `pass_count` divides; `spp` itself where it can."""
+    return next(n for n in itertools.count(max(spp, batches)) if _grid_passes(n, batches, most) is not None)
 
 
 def _grid_passes(spp: int, batches: int, most: int) -> int | None:
@@ -154,9 +254,14 @@ def _grid_passes(spp: int, batches: int, most: int) -> int | None:
     needed = max(batches, -(-spp // most))
     for count in range(needed, min(spp, needed * MOST_SPLITS) + 1):
         size = spp // count
-        if spp % count == 0 and size % math.isqrt(size) == 0:
+        if spp % count == 0 and size % math.isqrt(size) == 0 and _groupable(count, batches):
             return count
     return None
+
+
+def _groupable(count: int, batches: int) -> bool:
+    most = max(MOST_KEPT, MOST_SPLITS * batches)
+    return count <= most or any(count % groups == 0 for groups in range(batches, most + 1))
 
 
 def derive_seed(*parts: int | str) -> int:
@@ -164,13 +269,9 @@ def derive_seed(*parts: int | str) -> int:
     return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:4], "little")
 
 
-def _render(scene: Any, integrator: Any, spp: int, seed: int, counters: Counters) -> Float[np.ndarray, "h w 4"]:
+def _render(scene: Any, integrator: Any, spp: int, seed: int, counters: Counters) -> Float[np.ndarray, "h w c"]:
     start = time.perf_counter()
     picture = np.array(mitsuba().render(scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
     counters.render_seconds += time.perf_counter() - start
     counters.renders += 1
     return picture
-
-
-def _float32(array: Any) -> Any:
-    return None if array is None else array.astype(np.float32)

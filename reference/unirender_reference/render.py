@@ -1,16 +1,14 @@
 """Mitsuba renders of one object with every buffer of the contract.
 
-Buffers other than the image are ratios: coverage-weighted sum over coverage, from the same samples. How passes make an
-estimate and its variance: `passes`.
+s and d are ratios: coverage-weighted sum over coverage, from the same samples. How passes make an estimate and its
+variance: `passes`. What belongs to the surface (base colour, normal, ...): `geometry`.
 
     image   path tracing at `depth` (4: three bounces), premultiplied RGBA, the environment hidden behind the object
     s, d    direct light only (depth 2) on the mirror-tinted and on the white Lambertian surface
 """
 
 import functools
-import hashlib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -20,47 +18,41 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
-from unirender_reference.lights import Light
+from unirender_reference.geometry import geometry_buffers
 from unirender_reference.passes import (
-    SAMPLES_PER_PASS,
     TRUTH_BATCHES,
     Counters,
     Estimate,
     derive_seed,
     mean_estimate,
-    pass_count,
     ratio_estimate,
     render_passes,
 )
 from unirender_reference.scene import EditableScene
+from unirender_reference.scene_spec import Sample, SceneSpec, object_hash, scene_hash, scene_hashes, shared_scene_hash
 from unirender_reference.shapes import MeshObject
+
+__all__ = [
+    "DIRECT_DEPTH",
+    "IMAGE_DEPTH",
+    "Renderer",
+    "Sample",
+    "SceneSpec",
+    "assemble_sample",
+    "geometry_spp",
+    "render_sample",
+    "renderer_of",
+    "renderer_provenance",
+    "scene_hash",
+    "scene_hashes",
+    "shared_scene_hash",
+]
 
 IMAGE_DEPTH = 4
 DIRECT_DEPTH = 2
 GEOMETRY_SPP = 256
-
-
-@dataclass(frozen=True)
-class SceneSpec:
-    """One sample to render. `exposure_seed` draws the gauge's target; roughness is perceptual."""
-
-    obj: MeshObject
-    light: Light
-    roughness: float
-    metallic: float
-    camera: Camera = field(default_factory=Camera)
-    resolution: int = 64
-    exposure_seed: int = 0
-
-
-@dataclass(frozen=True)
-class Sample:
-    """A rendered scene: `image_linear` premultiplied (h, w, 3), complete `intrinsics`, the variance of the means."""
-
-    image_linear: Float[np.ndarray, "h w 3"]
-    intrinsics: Intrinsics
-    variance: dict[str, Float[np.ndarray, "h w c"]]
-    provenance: dict[str, str]
+LARGE = 128  # pixels along a side; above, edges are a small part of the picture
+LARGE_GEOMETRY_SPP = 36  # in few passes as noisy at edges as the image's own alpha of 64 samples in 8
 
 
 class Renderer:
@@ -79,28 +71,19 @@ class Renderer:
         self.camera = camera or Camera()
         self.resolution = resolution
         self.counters = Counters()
-        self._scene = EditableScene(obj, self.camera, resolution)
+        self.scene = EditableScene(obj, self.camera, resolution)
 
-    def geometry(self, spp: int = GEOMETRY_SPP, seed: int = 0) -> Intrinsics:
-        """Albedo, normal (camera axes) and mask; roughness and metallic are the caller's.
+    def geometry(
+        self, spp: int = GEOMETRY_SPP, seed: int = 0, material: tuple[float | None, float | None] | None = None
+    ) -> Intrinsics:
+        """Albedo, normal (camera axes) and mask; with a `material` also roughness and metallic.
 
-        Base colour is read with `eval_attribute`: Mitsuba's albedo AOV is view-dependent on metals.
+        Args:
+            spp: least number of camera rays per pixel: the next that makes full multi-jittered grids is taken.
+            seed: of the rays' positions within the pixels.
+            material: (roughness, metallic) of the scene, each a value or None for the object's own map.
         """
-        sums = np.zeros((self.resolution, self.resolution, 7), np.float64)
-        budget = max(1, SAMPLES_PER_PASS // self.resolution**2)
-        count = pass_count(spp, 1, budget)
-        for index in range(count):
-            sums += self._trace_geometry(spp // count, derive_seed(seed, "geometry", index)) * (spp // count)
-        mask = sums[..., :1] / spp
-        maps = np.divide(sums[..., 1:], sums[..., :1], out=np.zeros_like(sums[..., 1:]), where=mask > 0)
-        length = np.linalg.norm(maps[..., 3:], axis=-1, keepdims=True)
-        normal = np.divide(maps[..., 3:], length, out=np.zeros_like(maps[..., 3:]), where=length > 0)
-        return Intrinsics(
-            albedo=np.clip(maps[..., :3], 0, 1).astype(np.float32),
-            normal=normal.astype(np.float32),
-            mask=np.clip(mask, 0, 1).astype(np.float32),
-            camera=self.camera,
-        )
+        return geometry_buffers(self.scene, self.camera, self.resolution, spp, seed, material)
 
     @functools.cached_property
     def _exposure_mask(self) -> Float[np.ndarray, "h w 1"]:
@@ -115,15 +98,15 @@ class Renderer:
     def image(
         self,
         environment: Float[np.ndarray, "h w 3"],
-        roughness: float,
-        metallic: float,
+        roughness: float | None,
+        metallic: float | None,
         spp: int,
         seed: int = 0,
         depth: int = IMAGE_DEPTH,
         batches: int = TRUTH_BATCHES,
     ) -> Estimate:
-        """The image: premultiplied linear RGBA."""
-        scene = self._scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
+        """The image: premultiplied linear RGBA. None: the object's own roughness or metallic map."""
+        scene = self.scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
         passes = render_passes(scene, depth, spp, derive_seed(seed, "image"), batches, self.counters)
         return mean_estimate(*passes, batches)
 
@@ -131,46 +114,22 @@ class Renderer:
         self, environment: Float[np.ndarray, "h w 3"], spp: int, seed: int = 0, batches: int = TRUTH_BATCHES
     ) -> Estimate:
         """d: the white Lambertian surface, direct light, divided by coverage."""
-        scene = self._scene.show("white", {}, environment)
+        scene = self.scene.show("white", {}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "diffuse"), batches, self.counters)
         return ratio_estimate(*passes, batches)
 
     def specular(
         self,
         environment: Float[np.ndarray, "h w 3"],
-        roughness: float,
+        roughness: float | None,
         spp: int,
         seed: int = 0,
         batches: int = TRUTH_BATCHES,
     ) -> Estimate:
-        """s: the mirror-tinted reflector of the same roughness, direct light, divided by coverage."""
-        scene = self._scene.show("mirror", {"roughness": roughness}, environment)
+        """s: the mirror-tinted reflector of the same roughness (None: map), direct light, divided by coverage."""
+        scene = self.scene.show("mirror", {"roughness": roughness}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "specular"), batches, self.counters)
         return ratio_estimate(*passes, batches)
-
-    def _trace_geometry(self, spp: int, seed: int) -> Float[np.ndarray, "h w 7"]:
-        """Mean over `spp` camera rays of (hit, base colour, shading normal), per pixel."""
-        mi = mitsuba()
-        import drjit as dr
-
-        scene = self._scene.show("principled")
-        size, sensor = self.resolution, scene.sensors()[0]
-        index = dr.arange(mi.UInt32, size * size * spp)
-        pixel = index // spp
-        sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-        sampler.set_samples_per_wavefront(spp)
-        sampler.seed(dr.opaque(mi.UInt32, seed), size * size * spp)  # a literal seed would recompile the kernel
-        corner = mi.Point2f(mi.Float(pixel % size), mi.Float(pixel // size))
-        position = (corner + sampler.next_2d()) / size
-        ray, _ = sensor.sample_ray_differential(0.0, 0.5, position, mi.Point2f(0.5))
-        hit = scene.ray_intersect(ray)
-        valid = hit.is_valid()
-        base = hit.bsdf(ray).eval_attribute_3("base_color", hit, valid)
-        normal = dr.select(dr.dot(hit.n, ray.d) > 0, -hit.sh_frame.n, hit.sh_frame.n)
-        channels = [dr.select(valid, mi.Float(channel), 0.0) for channel in (valid, *base, *normal)]
-        dr.eval(channels)  # one kernel; block_sum would trace again for every channel
-        means = [dr.block_sum(channel, spp) / spp for channel in channels]
-        return np.stack([np.array(mean).reshape(size, size) for mean in means], axis=-1)
 
 
 def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer | None = None) -> Sample:
@@ -182,49 +141,109 @@ def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer |
         seed: another seed gives an independent estimate of the same scene, under the same exposure.
         renderer: reuse this one (of the same object, camera and resolution) instead of loading the scene.
     """
-    renderer = renderer or Renderer(spec.obj, spec.camera, spec.resolution)
-    if (renderer.obj.name, renderer.camera, renderer.resolution) != (spec.obj.name, spec.camera, spec.resolution):
-        raise UnirenderError(
-            f"renderer: got one for {renderer.obj.name} at {renderer.resolution} px, expected {spec.obj.name} at "
-            f"{spec.resolution} px with the spec's camera; leave `renderer` out"
-        )
+    renderer = renderer_of(spec, renderer)
     factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed)
     environment = (spec.light.environment * factor).astype(np.float32)
-    geometry = renderer.geometry(max(GEOMETRY_SPP, spp), seed)
-    assert geometry.mask is not None
-    image = renderer.image(environment, spec.roughness, spec.metallic, spp, seed)
-    diffuse = renderer.diffuse(environment, spp, seed)
-    specular = renderer.specular(environment, spec.roughness, spp, seed)
-    covered = geometry.mask > 0
+    return assemble_sample(
+        spec,
+        renderer,
+        factor,
+        renderer.geometry(geometry_spp(spec.resolution, spp), seed, (spec.roughness, spec.metallic)),
+        image=renderer.image(environment, spec.roughness, spec.metallic, spp, seed),
+        diffuse=renderer.diffuse(environment, spp, seed),
+        specular=renderer.specular(environment, spec.roughness, spp, seed),
+        provenance={"spp": str(spp), "seed": str(seed), "batches": str(TRUTH_BATCHES)},
+    )
+
+
+def renderer_of(spec: SceneSpec, renderer: Renderer | None = None) -> Renderer:
+    """A renderer for the scene: the one given, or a new one.
+
+    Raises:
+        UnirenderError: the one given has another object (by its arrays, not by its name), camera or resolution.
+    """
+    if renderer is None:
+        return Renderer(spec.obj, spec.camera, spec.resolution)
+    same = renderer.obj is spec.obj or (
+        renderer.obj.name == spec.obj.name and object_hash(renderer.obj) == object_hash(spec.obj)
+    )
+    differs = [
+        name
+        for name, equal in (
+            ("object", same),
+            ("camera", renderer.camera == spec.camera),
+            ("resolution", renderer.resolution == spec.resolution),
+        )
+        if not equal
+    ]
+    if differs:
+        raise UnirenderError(
+            f"renderer: got one for {renderer.obj.name} at {renderer.resolution} px, expected {spec.obj.name} at "
+            f"{spec.resolution} px as the spec has it (another: {', '.join(differs)}); leave `renderer` out"
+        )
+    return renderer
+
+
+def geometry_spp(resolution: int, spp: int) -> int:
+    """Camera rays per pixel for the geometry of a sample whose image takes `spp`.
+
+    Up to `LARGE` pixels at least `GEOMETRY_SPP`; above, so many that they take about 3 % of the time of the renders.
+    """
+    if resolution <= LARGE:
+        return max(GEOMETRY_SPP, spp)
+    return GEOMETRY_SPP if spp >= 2 * GEOMETRY_SPP else LARGE_GEOMETRY_SPP
+
+
+def assemble_sample(
+    spec: SceneSpec,
+    renderer: Renderer,
+    factor: float,
+    geometry: Intrinsics,
+    *,
+    image: Estimate,
+    diffuse: Estimate,
+    specular: Estimate,
+    provenance: Mapping[str, str],
+) -> Sample:
+    """The sample that estimates of a scene make.
+
+    Args:
+        spec: the scene.
+        renderer: what rendered it.
+        factor: the exposure that was folded into the light.
+        geometry: albedo, normal, roughness, metallic and mask.
+        image: premultiplied linear RGBA under `spec.light.environment * factor`.
+        diffuse: d under the same light.
+        specular: s under the same light.
+        provenance: how the estimates were made (spp, seed, batches, ...); the scene's own entries are added.
+    """
+    covered = geometry.require("mask")["mask"] > 0
     intrinsics = geometry.replace(
-        roughness=np.where(covered, spec.roughness, 0).astype(np.float32),
-        metallic=np.where(covered, spec.metallic, 0).astype(np.float32),
         diffuse=np.where(covered, diffuse.mean, 0),
         specular=np.where(covered, specular.mean, 0),
-        environment=environment,
+        environment=(spec.light.environment * factor).astype(np.float32),
     )
-    variance = {
-        name: estimate.variance
-        for name, estimate in (("image", image), ("diffuse", diffuse), ("specular", specular))
-        if estimate.variance is not None
-    }
-    variance["image"] = variance["image"][..., :3]
-    nan_pixels = image.nan_pixels + diffuse.nan_pixels + specular.nan_pixels
-    provenance = {
+    estimates = {"image": image, "diffuse": diffuse, "specular": specular}
+    header = {
         **renderer_provenance(renderer),
-        "spp": str(spp),
-        "seed": str(seed),
-        "batches": str(TRUTH_BATCHES),
+        **provenance,
         "depth": str(IMAGE_DEPTH),
         "light": spec.light.name,
-        "roughness": f"{spec.roughness:g}",
-        "metallic": f"{spec.metallic:g}",
+        "roughness": _value(spec.roughness),
+        "metallic": _value(spec.metallic),
         "exposure_seed": str(spec.exposure_seed),
         "exposure_factor": repr(factor),
-        "nan_pixels": str(nan_pixels),
+        "nan_pixels": str(sum(estimate.nan_pixels for estimate in estimates.values())),
         "scene": scene_hash(spec),
     }
-    return Sample(image.mean[..., :3], intrinsics, variance, provenance)
+    variance = {
+        name: estimate.variance[..., :3] for name, estimate in estimates.items() if estimate.variance is not None
+    }
+    return Sample(image.mean[..., :3], intrinsics, variance, header)
+
+
+def _value(value: float | None) -> str:
+    return "map" if value is None else f"{value:g}"
 
 
 def renderer_provenance(renderer: Renderer) -> dict[str, str]:
@@ -237,27 +256,3 @@ def renderer_provenance(renderer: Renderer) -> dict[str, str]:
         "camera": renderer.camera.describe(),
         "resolution": str(renderer.resolution),
     }
-
-
-def scene_hash(spec: SceneSpec) -> str:
-    """sha256 over everything that defines a scene's radiance."""
-    return next(scene_hashes([spec]))
-
-
-def scene_hashes(specs: Iterable[SceneSpec]) -> Iterator[str]:
-    """`scene_hash` of each spec; the arrays of an object under a light are read once while they stay the same."""
-    shared, obj, light = hashlib.sha256(), None, None
-    for spec in specs:
-        if spec.obj is not obj or spec.light is not light:
-            shared, obj, light = hashlib.sha256(), spec.obj, spec.light
-            for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo, light.environment):
-                shared.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-        digest = shared.copy()
-        values = (spec.roughness, spec.metallic, spec.camera, spec.resolution, spec.exposure_seed)
-        digest.update(repr(values).encode())
-        yield digest.hexdigest()
-
-
-def shared_scene_hash(hashes: Iterable[str]) -> str:
-    """The scene hash of a member that belongs to several scenes: sha256 over theirs, in order."""
-    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()

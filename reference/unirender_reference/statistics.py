@@ -7,21 +7,21 @@
 follows Student's distribution (Welch's degrees of freedom: the variances come from a few batches). Two conditions have
 to hold, each against another kind of error:
 
-    min p  >= 1 - (1 - alpha)^(1/n)      one wrong pixel (Sidak's correction for n values)
-    share of p >= 0.05 at least 0.92     a small error everywhere (0.95 is expected; the rest allows for skewed noise)
+    min p  >= 1 - (1 - alpha)^(1/n)             one wrong pixel (Sidak's correction for n values)
+    share of p >= 0.05 at least share_bar(N)    a small error everywhere (0.95 is expected of N pixels)
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import stdtr
+from scipy.special import bdtrc, bdtrik, stdtr
 
 from unirender.errors import UnirenderError
 
 FAMILY_ALPHA = 0.01
 LEVEL = 0.05
-PASS_SHARE = 0.92
+PASS_SHARE = 0.92  # the share condition of large pictures
 ROUNDING = 1e-4  # relative difference that storage and summation order may cause
 
 
@@ -35,6 +35,7 @@ class ZTest:
         passed: both conditions hold.
         threshold: Sidak's bound on `min_p`.
         values: how many values were compared.
+        share_threshold: `share_bar`, the bound on `pass_share`.
     """
 
     min_p: float
@@ -42,11 +43,12 @@ class ZTest:
     passed: bool
     threshold: float
     values: int
+    share_threshold: float
 
     def __str__(self) -> str:
         return (
             f"z-test of {self.values} values {'passed' if self.passed else 'FAILED'}: min p {self.min_p:.3g} "
-            f"(threshold {self.threshold:.3g}), pass share {self.pass_share:.4f} (threshold {PASS_SHARE})"
+            f"(threshold {self.threshold:.3g}), pass share {self.pass_share:.4f} (threshold {self.share_threshold:.4g})"
         )
 
 
@@ -81,6 +83,21 @@ def p_values(
     return 2 * stdtr(freedom, -t)
 
 
+def share_bar(pixels: int, alpha: float) -> float:
+    """The least share of values with p >= `LEVEL` that equal pictures reach with probability 1 - `alpha`.
+
+    The number of independent values is that of the pixels: the channels of one share their samples and stray together
+    (correlation near 1), so three of them can fail at once. That many of N pixels fail is binomial with the rate
+    `LEVEL`; the bar is its quantile at `alpha`. Small pictures need it: of 150 equal pixels, 4 in 100 times fewer than
+    0.92 pass. In large ones the quantile approaches 0.95, but noise that is skewed takes the share below it in pictures
+    of any size; the bar therefore never exceeds `PASS_SHARE`.
+    """
+    most = max(int(np.ceil(bdtrik(1 - alpha, pixels, LEVEL))), 0)
+    if most > 0 and bdtrc(most - 1, pixels, LEVEL) <= alpha:  # the inverse was rounded up
+        most -= 1
+    return min(PASS_SHARE, (pixels - most) / pixels)
+
+
 def z_test(
     mean_a: Float[np.ndarray, "h w c"],
     var_a: Float[np.ndarray, "h w c"],
@@ -95,8 +112,8 @@ def z_test(
 ) -> ZTest:
     """Tests that two independent estimates have the same expectation in every pixel with mask > 0.5.
 
-    Arguments as `p_values`; a mask of None compares all pixels; `alpha` is the chance that equal pictures fail
-    the first condition (a test file with many comparisons takes a smaller one).
+    Arguments as `p_values`; a mask of None compares all pixels; `alpha` is the chance that equal pictures fail one
+    condition, and so at most 2 `alpha` that they fail (a test file with many comparisons takes a smaller one).
 
     Raises:
         UnirenderError: shapes differ or the mask is empty.
@@ -107,5 +124,6 @@ def z_test(
     if p.size == 0:
         raise UnirenderError("z-test: got an empty mask, expected at least one pixel")
     threshold = -np.expm1(np.log1p(-alpha) / p.size)
+    bar = share_bar(p.size // mean_a.shape[-1], alpha)
     min_p, share = float(p.min()), float((p >= LEVEL).mean())
-    return ZTest(min_p, share, bool(min_p >= threshold and share >= PASS_SHARE), float(threshold), int(p.size))
+    return ZTest(min_p, share, bool(min_p >= threshold and share >= bar), float(threshold), int(p.size), bar)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,17 +12,20 @@ from scipy.stats import chi2
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference import backend, materials, passes, scene
+from unirender_reference.adaptive import render_sample_to_floor
 from unirender_reference.render import (
     DIRECT_DEPTH,
     IMAGE_DEPTH,
     Renderer,
+    Sample,
     SceneSpec,
     render_sample,
     renderer_provenance,
     scene_hash,
     scene_hashes,
 )
-from unirender_reference.scene import envmap_data
+from unirender_reference.scene import MOST_RADIANCE, envmap_data
+from unirender_reference.shapes import make_object
 
 SIZE = 32
 
@@ -345,6 +349,59 @@ def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(rend
     assert {"mitsuba", "variant", "spp", "seed", "camera", "nan_pixels"} <= set(sample.provenance)
 
 
-def test_a_renderer_of_another_scene_is_refused(renderer: Renderer) -> None:
-    with pytest.raises(UnirenderError, match="leave `renderer` out"):
-        render_sample(SceneSpec(renderer.obj, scenes.light(1), 0.3, 0.6, resolution=SIZE + 1), 16, 0, renderer)
+@pytest.mark.parametrize("other", ["maps", "camera", "resolution"])
+@pytest.mark.parametrize("to_floor", [False, True], ids=["spp", "floor"])
+def test_a_renderer_of_another_scene_is_refused(other: str, to_floor: bool) -> None:
+    """An object with maps has the name of the one without, and is another object."""
+    obj, light = make_object(1, "train"), scenes.light(1)
+    renderer = Renderer(obj, resolution=8)
+    spec = SceneSpec(obj, light, 0.3, 0.6, resolution=8)
+    changes: dict[str, dict[str, Any]] = {
+        "maps": {"obj": make_object(1, "train", maps=True)},
+        "camera": {"camera": Camera(20.0)},
+        "resolution": {"resolution": 9},
+    }
+    wrong = dataclasses.replace(spec, **changes[other])
+    assert wrong.obj.name == obj.name
+    assert scene_hash(wrong) != scene_hash(spec)
+
+    def render(spec: SceneSpec) -> Sample:
+        return render_sample_to_floor(spec, 20, 0, renderer) if to_floor else render_sample(spec, 16, 0, renderer)
+
+    with pytest.raises(
+        UnirenderError, match=f"another: {'object' if other == 'maps' else other}.*leave `renderer` out"
+    ):
+        render(wrong)
+    copied = dataclasses.replace(spec, obj=dataclasses.replace(obj, vertices=obj.vertices.copy()))
+    assert render(copied).provenance["scene"] == scene_hash(spec)
+
+
+def test_the_hash_does_not_depend_on_the_type_of_a_number() -> None:
+    plain = SceneSpec(scenes.sphere(), scenes.light(1), 1.0, 0.5, Camera(40.0, (0.5, 1.0)), 64, 3)
+    camera = Camera(40, (np.float64(0.5), 1))
+    typed = SceneSpec(plain.obj, plain.light, 1, np.float64(0.5), camera, 64, 3)
+    assert scene_hash(typed) == scene_hash(plain)
+    assert scene_hash(dataclasses.replace(typed, roughness=0)) != scene_hash(plain)
+
+
+@pytest.mark.parametrize("spp", [67, 704])
+def test_geometry_takes_the_next_full_grid(renderer: Renderer, spp: int) -> None:
+    """Any number of samples that an image takes: 704 in 8 batches are 11 passes of 64, but no full grid in one."""
+    taken = passes.next_spp(spp, 1, passes.SAMPLES_PER_PASS // SIZE**2)
+    assert spp < taken < 1.1 * spp
+    for name, picture in renderer.geometry(spp, 1).require("mask", "normal", "albedo").items():
+        np.testing.assert_array_equal(picture, renderer.geometry(taken, 1).require(name)[name])
+
+
+def test_a_sample_takes_any_samples_that_its_image_takes() -> None:
+    spec = SceneSpec(scenes.sphere(), scenes.light(1), 0.3, 0.6, resolution=8)
+    assert render_sample(spec, 704).provenance["spp"] == "704"
+
+
+def test_the_brightest_light_has_a_finite_variance(renderer: Renderer) -> None:
+    light = np.full((4, 8, 3), MOST_RADIANCE, np.float32)
+    variance = renderer.image(light, 0.2, 1.0, 64).variance
+    assert variance is not None
+    assert np.isfinite(variance).all()
+    with pytest.raises(UnirenderError, match="at most 1e"):
+        renderer.image(light * np.float32(1.01), 0.2, 1.0, 64)

@@ -7,6 +7,7 @@ from unirender.errors import UnirenderError
 from unirender_reference.shapes import HELD_OUT_FAMILIES, TRAIN_FAMILIES, MeshObject, Split, make_object, unit_sphere
 from unirender_reference.shapes.generator import FAMILIES, draw_family
 from unirender_reference.shapes.implicit import mesh_field
+from unirender_reference.shapes.material_maps import ROUGHEST, SMOOTHEST, normal_from_height, random_material
 from unirender_reference.shapes.mesh_object import signed_volume
 from unirender_reference.shapes.parametric import rounded_box_part
 from unirender_reference.shapes.surface import Part, corner_normals, grid_part
@@ -180,3 +181,81 @@ def test_broken_objects_are_refused(change, message):
 def test_negative_seeds_are_refused():
     with pytest.raises(UnirenderError, match="expected seed >= 0"):
         make_object(-1, "train")
+
+
+def test_maps_leave_shape_and_base_colour_alone():
+    """Textured or made of several parts, an object keeps its vertices; a plain one gets texture coordinates."""
+    kinds = set()
+    for seed in range(8):
+        bare, obj = make_object(seed, "train"), make_object(seed, "train", maps=True)
+        np.testing.assert_array_equal(obj.albedo, bare.albedo)
+        assert (obj.name, len(obj.faces)) == (bare.name, len(bare.faces))
+        np.testing.assert_array_equal(obj.vertices[obj.faces], bare.vertices[bare.faces])
+        np.testing.assert_array_equal(obj.normals[obj.faces], bare.normals[bare.faces])
+        if bare.uv is not None:
+            np.testing.assert_array_equal(obj.uv, bare.uv)
+        assert bare.roughness is None
+        assert bare.metallic is None
+        assert bare.normal_map is None
+        kinds |= set(obj.provenance["materials"].split("+"))
+    assert len(kinds) >= 4
+
+
+def test_maps_repeat_and_are_those_of_real_materials():
+    """Metallic mostly 0 or 1, roughness between polished and matte, normals that lean but do not fold over."""
+    steep, two_level = [], []
+    for seed in range(8):
+        obj, again = make_object(seed, "test", maps=True), make_object(seed, "test", maps=True)
+        for name in ("roughness", "metallic", "normal_map"):
+            np.testing.assert_array_equal(getattr(obj, name), getattr(again, name))
+        assert obj.roughness is not None
+        assert obj.metallic is not None
+        assert obj.normal_map is not None
+        assert obj.roughness.shape == obj.metallic.shape == obj.normal_map.shape[:2]
+        assert obj.roughness.min() >= SMOOTHEST
+        assert obj.roughness.max() <= ROUGHEST
+        assert obj.normal_map[..., 2].min() > 0.75
+        steep.append(obj.normal_map[..., 2].min() < 0.98)
+        two_level.append(((obj.metallic < 0.02) | (obj.metallic > 0.98)).mean())
+    assert any(steep)
+    assert np.mean(two_level) > 0.8
+    other, split = make_object(1, "test", maps=True).roughness, make_object(1, "train", maps=True).roughness
+    assert other is not None
+    assert split is not None
+    assert other.shape != split.shape or not np.array_equal(other, split)
+
+
+def test_normal_from_height_is_the_slope_in_tangent_space():
+    """A tilted, stretched and sheared plane with a ramp on it: the closed form; a wrong sign must fail."""
+    u, v = np.meshgrid(np.linspace(0, 1, 20), np.linspace(0, 1, 24))
+    along_u, along_v = np.array([2.0, 0, 0]), np.array([0.5, 0, -1.5])  # v runs towards -z and is sheared
+    positions = (u[..., None] * along_u + v[..., None] * along_v).astype(np.float32)
+    slope = np.array([0.3, 0, -0.2])  # height = slope . position; tangent x = +x, and y = +z (against v)
+    expected = np.array([-0.3, 0.2, 1]) / np.linalg.norm([0.3, 0.2, 1])
+    normal = normal_from_height(positions @ slope.astype(np.float32), positions)
+    np.testing.assert_allclose(normal, np.broadcast_to(expected, normal.shape), atol=1e-4)
+    assert np.abs(normal - expected * [1, -1, 1]).min(axis=(0, 1)).max() > 0.3
+    np.testing.assert_array_equal(normal_from_height(positions[..., 0], 0 * positions)[..., 2], 1)  # a pole
+
+
+@pytest.mark.parametrize(
+    ("positions", "message"),
+    [
+        (
+            np.random.default_rng(0).random((1, 5, 3)).astype(np.float32),
+            r"got \(1, 5\) texels, expected at least \(2, 2\)",
+        ),
+        (np.full((4, 4, 3), 0.5, np.float32), r"all points are \[0.5, 0.5, 0.5\], expected a surface"),
+    ],
+)
+def test_maps_of_no_surface_are_refused(positions: np.ndarray, message: str):
+    with pytest.raises(UnirenderError, match=message):
+        random_material(np.random.default_rng(0)).bake(positions)
+
+
+def test_an_object_without_its_maps_is_the_same_shape():
+    obj = make_object(1, "train", maps=True)
+    bare = obj.without_maps()
+    assert (bare.roughness, bare.metallic, bare.normal_map) == (None, None, None)
+    for name in ("vertices", "faces", "normals", "uv", "albedo"):
+        assert getattr(bare, name) is getattr(obj, name)

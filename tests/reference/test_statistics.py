@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from unirender.errors import UnirenderError
-from unirender_reference.statistics import p_values, z_test
+from unirender_reference.statistics import LEVEL, PASS_SHARE, p_values, share_bar, z_test
 
 SHAPE = (64, 64, 3)
 
@@ -47,6 +48,39 @@ def test_small_error_everywhere_fails() -> None:
     assert not result.passed
     assert result.min_p > result.threshold
     assert result.pass_share < 0.92
+
+
+@pytest.mark.parametrize("alpha", [0.01, 5e-4])
+@pytest.mark.parametrize("pixels", [1, 20, 150, 250])
+def test_share_bar_is_the_binomial_quantile(pixels: int, alpha: float) -> None:
+    """That more pixels fail than the bar allows has at most the chance alpha; of one fewer it has not."""
+    most = round((1 - share_bar(pixels, alpha)) * pixels)
+    assert binom.sf(most, pixels, LEVEL) <= alpha < binom.sf(most - 1, pixels, LEVEL)
+
+
+def test_share_bar_of_a_large_picture_leaves_room_for_skewed_noise() -> None:
+    assert share_bar(20_000, 0.01) == PASS_SHARE
+    assert share_bar(150, 0.01) < PASS_SHARE
+
+
+def test_small_equal_pictures_with_equal_channels_rarely_fail() -> None:
+    """Of 600 pairs of equal grey pictures of 150 pixels; with the bar of large pictures many would fail."""
+    shares, passed = [], []
+    for seed in range(600):
+        (a, var_a), (b, var_b) = (estimate(np.ones((1, 150, 1)), 0.1, 2 * seed + i, 16) for i in (0, 1))
+        grey = (np.repeat(array, 3, axis=-1) for array in (a, var_a, b, var_b))
+        result = z_test(*grey, batches_a=16, batches_b=16, alpha=5e-4)
+        shares.append(result.pass_share)
+        passed.append(result.passed)
+    assert passed.count(False) <= 3  # 0.6 are expected at most
+    assert sum(share < PASS_SHARE for share in shares) > 10
+
+
+def test_message_names_the_bar_in_use() -> None:
+    arguments = estimate(np.ones((10, 15, 1)), 0.1, 1), estimate(np.ones((10, 15, 1)), 0.1, 2)
+    result = z_test(*arguments[0], *arguments[1])
+    assert result.share_threshold == share_bar(150, 0.01)
+    assert f"(threshold {result.share_threshold:.4g})" in str(result)
 
 
 def test_identical_pictures_pass_and_the_mask_restricts() -> None:

@@ -2,7 +2,8 @@
 
 Every draw comes from `numpy.random.default_rng([SPLIT[split], seed])`, so the two splits share no random stream.
 The train split never draws a held-out family; in the test split even seeds are held-out families, odd seeds are train
-families. Meshes repeat from machine to machine up to floating-point rounding.
+families. Material maps have a stream of their own, `[SPLIT[split], seed, MAPS]`. Meshes repeat from machine to machine
+up to floating-point rounding.
 """
 
 from collections.abc import Callable
@@ -14,13 +15,15 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender_reference.shapes import implicit, parametric
+from unirender_reference.shapes.material_maps import Maps, SolidMaterial, random_material
 from unirender_reference.shapes.mesh_object import MeshObject, unit_sphere
-from unirender_reference.shapes.surface import Part, corner_normals, pack_textures, split_corners
+from unirender_reference.shapes.surface import Frame, Part, corner_normals, pack_textures, split_corners
 from unirender_reference.textures import random_color, random_texture
 
 Split = Literal["train", "test"]
 SPLIT = {"train": 0x7421, "test": 0x7E57}
 TEXTURED = 0.62
+MAPS = 0x3A95
 
 ASSEMBLED = ("rounded_box", "cylinder", "capsule", "superquadric", "turned")
 
@@ -80,12 +83,14 @@ def draw_family(seed: int, split: Split) -> tuple[str, np.random.Generator]:
     return str(rng.choice(names, p=weights / weights.sum())), rng
 
 
-def make_object(seed: int, split: Split) -> MeshObject:
+def make_object(seed: int, split: Split, maps: bool = False) -> MeshObject:
     """Makes procedural object number `seed` of a split.
 
     Args:
         seed: 0 or more; every seed is another object.
         split: "train" or "test".
+        maps: give it roughness, metallic and normal maps, drawn from a random stream of their own: shape and base
+            colour are those of the object without maps.
 
     Returns:
         An object named like "train-000123".
@@ -97,11 +102,22 @@ def make_object(seed: int, split: Split) -> MeshObject:
     made = FAMILIES[family](rng)
     parts = made if isinstance(made, list) else [deform(rng, made) if rng.random() < 0.3 else made]
     textured = bool(rng.random() < TEXTURED)
-    return _finish(rng, f"{split}-{seed:06d}", family, parts, textured)
+    materials = []
+    if maps:
+        own = np.random.default_rng([SPLIT[split], seed, MAPS])
+        materials = [random_material(own) for _ in parts]
+    return _finish(rng, f"{split}-{seed:06d}", family, parts, textured, materials)
 
 
-def _finish(rng: np.random.Generator, name: str, family: str, parts: list[Part], textured: bool) -> MeshObject:
-    """Colours the parts, joins and turns them, and gives them normals."""
+def _finish(
+    rng: np.random.Generator,
+    name: str,
+    family: str,
+    parts: list[Part],
+    textured: bool,
+    materials: list[SolidMaterial],
+) -> MeshObject:
+    """Colours the parts, joins and turns them, and gives them normals; `materials` is empty or has one a part."""
     normals = [corner_normals(part.vertices, part.faces, part.crease_deg) for part in parts]
     pattern, albedo, uvs = "constant", random_color(rng), None
     if textured or len(parts) > 1:
@@ -109,6 +125,10 @@ def _finish(rng: np.random.Generator, name: str, family: str, parts: list[Part],
         albedo, frames = pack_textures(textures)
         uvs = [frame.place(part.corner_uv) for frame, part in zip(frames, parts, strict=True)]
         pattern = "+".join(kinds)
+    maps = [material.bake(part.position_map) for material, part in zip(materials, parts, strict=False)]
+    packed, frames = pack_maps(maps)
+    if maps:
+        uvs = [frame.place(part.corner_uv) for frame, part in zip(frames, parts, strict=True)]
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     vertices, faces, shading, uv = split_corners(
         unit_sphere(np.concatenate([part.vertices for part in parts])),
@@ -118,6 +138,9 @@ def _finish(rng: np.random.Generator, name: str, family: str, parts: list[Part],
     )
     turn = implicit.random_rotation(rng)
     shading = shading @ turn.T
+    provenance = {"source": "procedural", "family": family, "parts": str(len(parts)), "texture": pattern}
+    if maps:
+        provenance["materials"] = "+".join(material.kind for material in materials)
     return MeshObject(
         name=name,
         family=family,
@@ -126,8 +149,19 @@ def _finish(rng: np.random.Generator, name: str, family: str, parts: list[Part],
         normals=(shading / np.linalg.norm(shading, axis=1, keepdims=True)).astype(np.float32),
         uv=uv,
         albedo=albedo.astype(np.float32),
-        provenance={"source": "procedural", "family": family, "parts": str(len(parts)), "texture": pattern},
+        **packed,
+        provenance=provenance,
     )
+
+
+def pack_maps(maps: list[Maps]) -> tuple[dict[str, np.ndarray], list[Frame]]:
+    """The maps of all parts side by side, as fields of `MeshObject`, and where each part's lie."""
+    if not maps:
+        return {}, []
+    roughness, frames = pack_textures([part.roughness[..., None] for part in maps])
+    metallic, _ = pack_textures([part.metallic[..., None] for part in maps])
+    normal_map, _ = pack_textures([part.normal_map for part in maps])
+    return {"roughness": roughness[..., 0], "metallic": metallic[..., 0], "normal_map": normal_map}, frames
 
 
 def _part_texture(rng: np.random.Generator, part: Part, textured: bool) -> tuple[str, Float[np.ndarray, "h w 3"]]:

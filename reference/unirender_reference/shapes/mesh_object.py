@@ -5,6 +5,7 @@ first row*, texel (i, j) has its centre at ((j + 0.5) / w, (i + 0.5) / h). (This
 glTF stores it like this too, OBJ upside down.) All textures of an object share its `uv`; their sizes may differ.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -31,7 +32,8 @@ class MeshObject:
         roughness: (h, w) float32, perceptual, [0, 1]; None: the object has no roughness of its own, scenes give it.
         metallic: (h, w) float32, [0, 1]; None as for roughness.
         normal_map: (h, w, 3) float32 unit vectors in tangent space, or None: x along +u, y against +v (up in the
-            picture, as glTF and OpenGL have it), z along the shading normal.
+            picture, as glTF and OpenGL have it), z along the shading normal. The renderer sees to charts that lie
+            mirrored on the surface (u x v pointing outwards): loaders leave their texels as they are.
         provenance: how the object was made, as text.
     """
 
@@ -98,6 +100,10 @@ class MeshObject:
                 f"{self.name}: {label} must be finite float32 {size} with uv, got {texture.dtype} {texture.shape}, "
                 f"uv {'absent' if self.uv is None else 'present'}"
             )
+
+    def without_maps(self) -> "MeshObject":
+        """The object without roughness, metallic and normal maps; base colour and texture coordinates stay."""
+        return dataclasses.replace(self, roughness=None, metallic=None, normal_map=None)
 
     @property
     def signed_volume(self) -> float:

@@ -244,7 +244,7 @@ class Frame:
         return uv * self.scale + self.offset
 
 
-def pack_textures(textures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[Float[np.ndarray, "h w 3"], list[Frame]]:
+def pack_textures(textures: Sequence[Float[np.ndarray, "_ _ c"]]) -> tuple[Float[np.ndarray, "h w c"], list[Frame]]:
     """Puts textures side by side, repeating the last row below the lower ones."""
     height = max(len(texture) for texture in textures)
     width = sum(texture.shape[1] for texture in textures)

@@ -1,0 +1,91 @@
+"""What one sample is: the scene it is rendered of, the maps and estimates that come out, and the scene's hash."""
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender_reference.lights import Light
+from unirender_reference.shapes import MeshObject
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """One sample to render. `exposure_seed` draws the gauge's target.
+
+    Roughness (perceptual) and metallic are one value for the object, or None for its own map.
+    """
+
+    obj: MeshObject
+    light: Light
+    roughness: float | None
+    metallic: float | None
+    camera: Camera = field(default_factory=Camera)
+    resolution: int = 64
+    exposure_seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A rendered scene: `image_linear` premultiplied (h, w, 3), complete `intrinsics`, the variance of the means."""
+
+    image_linear: Float[np.ndarray, "h w 3"]
+    intrinsics: Intrinsics
+    variance: dict[str, Float[np.ndarray, "h w c"]]
+    provenance: dict[str, str]
+
+
+def scene_hash(spec: SceneSpec) -> str:
+    """sha256 over everything that defines a scene's radiance; 1, 1.0 and numpy's 1.0 are one value."""
+    return next(scene_hashes([spec]))
+
+
+def scene_hashes(specs: Iterable[SceneSpec]) -> Iterator[str]:
+    """`scene_hash` of each spec; the arrays of an object under a light are read once while they stay the same."""
+    shared, obj, light = hashlib.sha256(), None, None
+    for spec in specs:
+        if spec.obj is not obj or spec.light is not light:
+            shared, obj, light = hashlib.sha256(), spec.obj, spec.light
+            for part in (*_mesh(obj), np.ascontiguousarray(light.environment).tobytes(), *_maps(obj)):
+                shared.update(part)
+        digest = shared.copy()
+        digest.update(repr(_plain(spec)).encode())
+        yield digest.hexdigest()
+
+
+def object_hash(obj: MeshObject) -> str:
+    """sha256 over the arrays of an object."""
+    digest = hashlib.sha256()
+    for part in (*_mesh(obj), *_maps(obj)):
+        digest.update(part)
+    return digest.hexdigest()
+
+
+def shared_scene_hash(hashes: Iterable[str]) -> str:
+    """The scene hash of a member that belongs to several scenes: sha256 over theirs, in order."""
+    return hashlib.sha256(" ".join(hashes).encode()).hexdigest()
+
+
+def _mesh(obj: MeshObject) -> Iterator[bytes]:
+    for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo):
+        yield b"none" if array is None else np.ascontiguousarray(array).tobytes()
+
+
+def _maps(obj: MeshObject) -> Iterator[bytes]:
+    """Nothing for an object without maps: its hash is over its mesh and base colour alone."""
+    for name in ("roughness", "metallic", "normal_map"):
+        texture = getattr(obj, name)
+        if texture is not None:
+            yield f"{name} {texture.shape}".encode() + np.ascontiguousarray(texture).tobytes()
+
+
+def _plain(spec: SceneSpec) -> tuple[float | None, float | None, Camera, int, int]:
+    """What a spec holds besides arrays, as Python's own numbers: the text of others depends on their type."""
+    roughness, metallic = (None if value is None else float(value) for value in (spec.roughness, spec.metallic))
+    x, y = spec.camera.principal
+    camera = Camera(float(spec.camera.fov_deg), (float(x), float(y)))
+    return roughness, metallic, camera, int(spec.resolution), int(spec.exposure_seed)
