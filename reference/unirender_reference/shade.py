@@ -1,26 +1,48 @@
-"""Mitsuba shades an `Intrinsics`: one surface point per pixel, from its normal and material, under an environment.
+"""Mitsuba shades an `Intrinsics` under an environment, and differentiates what it shaded: numpy in, numpy out.
 
-The radiance that leaves pixel x towards the viewer along v is, with the principled BSDF f of the pixel,
+The equation, and what differentiation holds fixed, stand in `shader`. Without geometry nothing is hidden; with the
+object that the picture shows, light that it blocks is left out. Either way there is one bounce, and one normal and
+material per pixel where a render averages many. `shade` of the true maps is therefore a row of its own in the tables,
+and the ceiling of every closed loop.
 
-    L(x) = integral of f(l, v) E(l) max(n . l, 0) dl
+An optimiser alternates two calls, with a seed of its own for each:
 
-estimated with one light sample and one BSDF sample per sample, combined by the balance heuristic. There is no geometry:
-no shadows, no interreflection, and one normal per pixel where a render averages many. `shade` of the true maps is
-therefore a row of its own in the tables, and the ceiling of every closed loop.
+    image = shade(maps, light, spp, seed=2 * step)
+    gradients = shade_gradients(maps, light, loss_gradient(image), spp, seed=2 * step + 1)
+
+The gradient of a loss that is not linear in the image is biased if both use the same samples: image noise and gradient
+noise are then correlated.
 """
 
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_reference.backend import mitsuba
-from unirender_reference.passes import SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
+from unirender_reference.passes import NAN_ATTEMPTS, SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
 from unirender_reference.scene import envmap_data
+from unirender_reference.shader import PARAMETERS, Parameter, Shader, gradient, tensors
+from unirender_reference.shapes import MeshObject
 
-LEAST_FACING = 0.01  # cosine to which normals that face away from the viewer are bent
+GRADIENT_SAMPLES_PER_PASS = SAMPLES_PER_PASS // 4
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Derivatives of a loss, each of the shape of its map; 0 outside the mask; None where it was not asked for.
+
+    `normal` is the derivative with respect to the three numbers of a normal, of any length: it is perpendicular to the
+    normal, since length does not count. A material that is one number per object has the sum of its map as derivative.
+    """
+
+    albedo: Float[np.ndarray, "h w 3"] | None = None
+    normal: Float[np.ndarray, "h w 3"] | None = None
+    roughness: Float[np.ndarray, "h w 1"] | None = None
+    metallic: Float[np.ndarray, "h w 1"] | None = None
+    environment: Float[np.ndarray, "eh ew 3"] | None = None
 
 
 def shade(
@@ -29,6 +51,7 @@ def shade(
     spp: int = 256,
     seed: int = 0,
     counters: Counters | None = None,
+    geometry: MeshObject | None = None,
 ) -> Float[np.ndarray, "h w 3"]:
     """The image of given maps under a light: linear, premultiplied by the mask (all ones where the mask is None).
 
@@ -39,121 +62,112 @@ def shade(
         seed: equal seeds give equal images.
         counters: if given, its `nan_pixels` grows by the points that came out NaN or infinite in some pass and were
             shaded again with another seed.
+        geometry: the object in the picture: light that it blocks is left out. None: nothing is hidden.
 
     Raises:
         UnirenderError: a map is missing, the environment is not usable, or a point stays NaN.
     """
+    maps, light, mask = _arguments(intrinsics, environment)
+    image = np.zeros((*mask.shape[:2], 3), np.float64)
+    if not mask.any() or not light.any():
+        return image.astype(np.float32)
+    shader = Shader(mask, intrinsics.camera, geometry)
+    made = tensors({**maps, "environment": light})
+    passes = pass_count(spp, 1, max(1, SAMPLES_PER_PASS // shader.points))
+    for index in range(passes):
+
+        def draw(attempt: int, index: int = index) -> Float[np.ndarray, "h w 3"]:
+            return np.array(shader.image(made, made["environment"], spp // passes, _pass_seed(seed, index, attempt)))
+
+        image += finite_pass(draw, counters or Counters(), "shade")
+    return (image / passes).astype(np.float32)
+
+
+def shade_gradients(
+    intrinsics: Intrinsics,
+    image_gradient: Float[np.ndarray, "h w 3"],
+    environment: Float[np.ndarray, "eh ew 3"] | None = None,
+    spp: int = 64,
+    seed: int = 0,
+    counters: Counters | None = None,
+    geometry: MeshObject | None = None,
+    wrt: Sequence[Parameter] = PARAMETERS,
+) -> Gradients:
+    """Derivatives of a loss with respect to maps and light, from its derivative with respect to the image.
+
+    Unbiased, by reverse differentiation of `shade`, some samples at a time: memory does not grow with `spp`.
+
+    Args:
+        intrinsics, environment, geometry: as in `shade`.
+        image_gradient: derivative of the loss with respect to the image that `shade` returns (linear, premultiplied).
+        spp: samples per pixel.
+        seed: `shade` with the same seed and samples draws the same directions.
+        counters: its `nan_pixels` grows by the pixels and texels whose derivative came out NaN or infinite in some
+            pass; that pass was made again with another seed.
+        wrt: what to differentiate with respect to. Under a black light the maps' derivatives are 0.
+
+    Raises:
+        UnirenderError: as in `shade`; the image gradient has another size or is not finite; `wrt` names no parameter.
+    """
+    if not wrt or not set(wrt) <= set(PARAMETERS):
+        raise UnirenderError(f"shade_gradients: got wrt={tuple(wrt)}, expected some of {', '.join(PARAMETERS)}")
+    maps, light, mask = _arguments(intrinsics, environment)
+    if image_gradient.shape != (*mask.shape[:2], 3) or not np.isfinite(image_gradient).all():
+        raise UnirenderError(
+            f"shade_gradients: got an image gradient of shape {image_gradient.shape}, expected finite "
+            f"{(*mask.shape[:2], 3)}"
+        )
+    given = {**maps, "environment": light}
+    totals = {name: np.zeros(given[name].shape, np.float64) for name in wrt}
+    wanted = tuple(totals)
+    if not light.any():  # the image is linear in the light: any light has the same derivative with respect to it
+        given["environment"] = np.ones_like(light)
+        wanted = tuple(name for name in wanted if name == "environment")
+    if mask.any() and wanted:
+        shader = Shader(mask, intrinsics.camera, geometry)
+        weights = tensors({"image": image_gradient})["image"]
+        passes = pass_count(spp, 1, max(1, GRADIENT_SAMPLES_PER_PASS // shader.points))
+        for index in range(passes):
+
+            def draw(attempt: int, index: int = index) -> dict[str, np.ndarray]:
+                made = tensors(given, wanted)
+                shader.backward(made, made["environment"], weights, spp // passes, _pass_seed(seed, index, attempt))
+                return {name: gradient(made[name]) for name in wanted}
+
+            for name, values in _finite(draw, counters or Counters()).items():
+                totals[name] += values / passes
+    return Gradients(**{name: total.astype(np.float32) for name, total in totals.items()})
+
+
+def _arguments(
+    intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"] | None
+) -> tuple[dict[str, Float[np.ndarray, "h w c"]], Float[np.ndarray, "eh ew 3"], Float[np.ndarray, "h w 1"]]:
+    """Maps, light (checked; it may be black), and the mask: 0 where there is no normal."""
     maps = intrinsics.require("albedo", "normal", "roughness", "metallic")
     if environment is None:
         environment = intrinsics.require("environment")["environment"]
-    height, width = intrinsics.height, intrinsics.width
     if maps["normal"].ndim != 3:
         raise UnirenderError(f"shade: got maps of shape {maps['normal'].shape}, expected one picture (h, w, c)")
-    image = np.zeros((height, width, 3), np.float32)
-    inside = np.any(maps["normal"] != 0, axis=-1)
-    if inside.any() and np.max(environment) > 0:
-        view = intrinsics.camera.view_directions(height, width)[inside]
-        normal = facing_normals(maps["normal"][inside], view)
-        material = {name: maps[name][inside] for name in ("albedo", "roughness", "metallic")}
-        image[inside] = _radiance(normal, view, material, environment, spp, seed, counters or Counters())
-    return image if intrinsics.mask is None else (image * intrinsics.mask).astype(np.float32)
+    light = np.asarray(environment, np.float32)
+    envmap_data(light if light.any() else np.ones_like(light))  # checks
+    inside = np.any(maps["normal"] != 0, axis=-1, keepdims=True)
+    return maps, light, np.where(inside, 1 if intrinsics.mask is None else intrinsics.mask, 0).astype(np.float32)
 
 
-def facing_normals(normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Unit normals; those that face away from the viewer (averaged or predicted ones may) are bent until they don't."""
-    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-    cosine = (normal * view).sum(axis=-1, keepdims=True)
-    normal = normal + view * np.maximum(LEAST_FACING - cosine, 0)
-    return (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+def _pass_seed(seed: int, index: int, attempt: int) -> int:
+    return derive_seed(seed, *(("shade", index, attempt) if attempt else ("shade", index)))
 
 
-def _radiance(
-    normal: Float[np.ndarray, "n 3"],
-    view: Float[np.ndarray, "n 3"],
-    material: dict[str, Float[np.ndarray, "n c"]],
-    environment: Float[np.ndarray, "eh ew 3"],
-    spp: int,
-    seed: int,
-    counters: Counters,
-) -> Float[np.ndarray, "n 3"]:
-    """Outgoing radiance of n points with the given normals and materials, per-point mean over `spp` samples."""
-    mi = mitsuba()
-    envmap_data(environment)  # checks
-    count = len(normal)
-    light = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(environment, np.float32))}
-    scene = mi.load_dict({"type": "scene", "light": light})
-    bsdf = mi.load_dict(_material_rows(material))
-    passes = pass_count(spp, 1, max(1, SAMPLES_PER_PASS // count))
-    total = np.zeros((count, 3), np.float64)
-    for index in range(passes):
-
-        def draw(attempt: int, index: int = index) -> Float[np.ndarray, "n 3"]:
-            parts = ("shade", index, attempt) if attempt else ("shade", index)
-            return _pass(scene, bsdf, normal, view, spp // passes, derive_seed(seed, *parts))
-
-        total += finite_pass(draw, counters, "shade")
-    return (total / passes).astype(np.float32)
-
-
-def _material_rows(material: dict[str, Float[np.ndarray, "n c"]]) -> dict[str, Any]:
-    """A principled BSDF whose parameters are pictures one pixel high: point i reads column i."""
-    mi = mitsuba()
-
-    def row(values: Float[np.ndarray, "n c"]) -> dict[str, Any]:
-        bitmap = mi.Bitmap(np.ascontiguousarray(np.clip(values, 0, 1)[None], np.float32))
-        return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest", "wrap_mode": "clamp"}
-
-    return {
-        "type": "principled",
-        "base_color": row(material["albedo"]),
-        "roughness": row(material["roughness"]),
-        "metallic": row(material["metallic"]),
-    }
-
-
-def _pass(
-    scene: Any, bsdf: Any, normal: Float[np.ndarray, "n 3"], view: Float[np.ndarray, "n 3"], spp: int, seed: int
-) -> Float[np.ndarray, "n 3"]:
-    import drjit as dr
-
-    mi = mitsuba()
-    count = len(normal)
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, count * spp)
-    index = dr.arange(mi.UInt32, count * spp) // spp
-    to_points = {name: mi.Vector3f(np.ascontiguousarray(array.T)) for name, array in (("n", normal), ("v", view))}
-    n, v = (dr.gather(mi.Vector3f, to_points[name], index) for name in ("n", "v"))
-
-    hit = dr.zeros(mi.SurfaceInteraction3f, count * spp)
-    hit.t = mi.Float(1.0)
-    hit.n, hit.sh_frame, hit.uv = mi.Normal3f(n), mi.Frame3f(n), mi.Point2f((mi.Float(index) + 0.5) / count, 0.5)
-    hit.wi = hit.to_local(v)
-    context = mi.BSDFContext()
-
-    towards, weight = scene.sample_emitter_direction(hit, sampler.next_2d(), False)
-    local = hit.to_local(towards.d)
-    value, pdf = bsdf.eval_pdf(context, hit, local)
-    lit = value * weight * _balance(towards.pdf, pdf)
-
-    drawn, throughput = bsdf.sample(context, hit, sampler.next_1d(), sampler.next_2d())
-    ray = hit.spawn_ray(hit.to_world(drawn.wo))
-    sky = scene.ray_intersect(ray)
-    emitter = sky.emitter(scene)
-    direction = mi.DirectionSample3f(scene, sky, hit)
-    pdf_light = scene.pdf_emitter_direction(hit, direction)
-    delta = mi.has_flag(drawn.sampled_type, mi.BSDFFlags.Delta)
-    share = dr.select(delta, 1.0, _balance(drawn.pdf, pdf_light))
-    reflected = throughput * emitter.eval(sky) * share
-
-    radiance = dr.select(towards.pdf > 0, lit, 0) + dr.select(drawn.pdf > 0, reflected, 0)
-    means = [dr.block_sum(channel, spp) / spp for channel in (radiance.x, radiance.y, radiance.z)]
-    return np.stack([np.array(mean) for mean in means], axis=-1)
-
-
-def _balance(pdf: Any, other: Any) -> Any:
-    """Weight of a strategy in the balance heuristic; 0 where neither can draw the direction."""
-    import drjit as dr
-
-    total = pdf + other
-    return dr.select(total > 0, pdf / dr.maximum(total, 1e-20), 0)
+def _finite(draw: Callable[[int], Mapping[str, np.ndarray]], counters: Counters) -> Mapping[str, np.ndarray]:
+    """The derivatives of a pass, made again with other seeds until all are finite."""
+    bad = 0
+    for attempt in range(NAN_ATTEMPTS + 1):
+        found = draw(attempt)
+        bad = sum(int((~np.isfinite(values)).any(axis=-1).sum()) for values in found.values())
+        if not bad:
+            return found
+        counters.nan_pixels += bad
+    raise UnirenderError(
+        f"shade_gradients: {bad} derivatives stay NaN after {NAN_ATTEMPTS} seeds, expected finite values; check the "
+        "normals and the light"
+    )
