@@ -16,9 +16,10 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender.surface_light import diffuse_light, specular_light
 from unirender_reference.dataset import render_group
+from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.lights import load_light
 from unirender_reference.lights.light import area_resampled
-from unirender_reference.plan import DatasetConfig, plan_groups
+from unirender_reference.plan import plan_groups
 
 Environment = Float[np.ndarray, "h w 3"]
 

@@ -6,8 +6,8 @@ reads `SOURCE/pmndrs/*.exr` (npm `@pmndrs/assets` 1.7.0) and `SOURCE/blender/*.e
 the resized maps and `lights.toml` (with the sha256 of every source file) into `data/lights`. Source files that differ
 from the sha256 in the present catalogue are refused.
 
-Split: maps whose name occurs in both packages may show the same place and stay on one side. (Measured: `sunrise` is the
-same capture, correlation 0.99 of the local log radiance at the best yaw; all other pairs stay below 0.33.)
+Split: maps whose name occurs in both packages may show the same place and stay on one side. (By content, see `twins`:
+`sunrise` is the same capture.)
 """
 
 import argparse

@@ -63,12 +63,6 @@ def mean_luminance(environment: Float[np.ndarray, "h w 3"], name: str = "light")
     return mean
 
 
-def turned(environment: Float[np.ndarray, "h w 3"], rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
-    """A random yaw by whole columns and a random mirroring: both exact, so that nothing blurs."""
-    environment = np.roll(environment, int(rng.integers(environment.shape[1])), axis=1)
-    return environment[:, ::-1].copy() if rng.random() < 0.5 else environment
-
-
 def area_resampled(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -> Float[np.ndarray, "h2 w2 3"]:
     """A lat-long picture (pixels are areas: rows end at the poles) on the grid of `Light`, energy kept.
 

@@ -4,9 +4,10 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.lighting import environment_directions, resample_environment, rotate_environment
+from unirender.lighting import environment_directions, resample_environment
 from unirender_reference.backend import mitsuba
-from unirender_reference.lights.light import SHAPE, Light, normalized, turned
+from unirender_reference.lights.light import SHAPE, Light, normalized
+from unirender_reference.lights.placement import random_turn
 
 FINE = (128, 256)  # synthetic maps are drawn at this size and averaged down
 
@@ -26,14 +27,6 @@ def random_tint(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
         return rng.uniform(0.05, 1, 3) ** 1.5 + 0.02
     warmth = rng.normal(0, 0.45)
     return np.exp(np.array([warmth * 0.6, 0.0, -warmth * 0.9]) + rng.normal(0, 0.05, 3))
-
-
-def random_tilt(environment: Float[np.ndarray, "h w 3"], rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
-    """The light turned by up to 20 degrees about a random horizontal axis."""
-    angle, azimuth = np.radians(rng.uniform(-20, 20)), rng.uniform(0, 2 * np.pi)
-    x, z = np.cos(azimuth), np.sin(azimuth)
-    cross = np.array([[0, -z, 0], [z, 0, -x], [0, x, 0]])
-    return rotate_environment(environment, np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
 def _direction(rng: np.random.Generator, low: float = -1.0) -> Float[np.ndarray, "3"]:
@@ -122,7 +115,8 @@ def light_sunsky(seed: int | np.random.Generator) -> Light:
     upper = (sky * (np.cos(theta) * np.sin(theta) * (theta < np.pi / 2))[:, None, None]).sum((0, 1))
     irradiance = upper * (np.pi / (FINE[0] - 1)) * (2 * np.pi / FINE[1])
     sky[theta >= np.pi / 2] = ground * irradiance / np.pi
-    environment = normalized(turned(resample_environment(sky.astype(np.float32), SHAPE), rng))
+    turn = random_turn(rng, SHAPE[1])
+    environment = normalized(turn.apply(resample_environment(sky.astype(np.float32), SHAPE)))
     provenance = {
         "source": "mitsuba sunsky",
         "seed": _label(seed),
@@ -130,6 +124,7 @@ def light_sunsky(seed: int | np.random.Generator) -> Light:
         "turbidity": f"{turbidity:.3f}",
         "sun_aperture_deg": f"{aperture:.2f}",
         "sun_scale": f"{sun_scale:.3f}",
+        **turn.provenance(),
     }
     return Light(f"sunsky-{_label(seed)}", environment, provenance)
 

@@ -1,0 +1,76 @@
+"""The contact sheet: what its tiles show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unirender.color import image_srgb
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference.measure.contact_sheet import CHECK_CONTRAST, COLUMNS, Sheet, buffer_tiles
+from unirender_reference.render import Sample, render_sample
+
+
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return render_sample(next(iter(Sheet(Path("unused.png"), objects=1, resolution=24).specs())), spp=8)
+
+
+def test_tiles_show_the_buffers(sample: Sample) -> None:
+    tiles: dict[str, np.ndarray] = dict(zip(COLUMNS, buffer_tiles(sample, 0.8), strict=True))
+    maps = sample.intrinsics.maps
+    inside, outside = maps["mask"][..., 0] == 1, maps["mask"][..., 0] == 0
+    assert inside.any()
+    assert outside.any()
+    for column, value in (
+        ("image", image_srgb(sample.image_linear)),
+        ("albedo", image_srgb(maps["albedo"])),
+        ("normal", maps["normal"] / 2 + 0.5),
+        ("roughness", np.full((24, 24, 3), 0.1)),
+        ("metallic", np.ones((24, 24, 3))),
+        ("specular s", image_srgb(maps["specular"])),
+        ("diffuse d", image_srgb(maps["diffuse"])),
+        ("mask", np.ones((24, 24, 3))),
+    ):
+        tile = tiles[column]
+        assert tile.shape == (24, 24, 3)
+        np.testing.assert_allclose(tile[inside], value[inside], rtol=0, atol=1e-3, err_msg=column)
+        if column == "mask":
+            assert (tile[outside] == 0).all()
+        else:  # the page, or checks about it
+            assert np.abs(tile[outside] - 0.8).max() <= CHECK_CONTRAST / 2 + 1e-3
+    assert tiles["environment"].shape == (12, 24, 3)
+
+
+def test_an_edge_is_composited_in_linear_light(sample: Sample) -> None:
+    """Half covered by black over display grey 0.8: as dark as half its light, not 0.4."""
+    maps, half = sample.intrinsics, np.full((24, 24, 1), 0.5, np.float32)
+    edge = Sample(np.zeros((24, 24, 3), np.float32), maps.replace(mask=half), {}, {})
+    shown = buffer_tiles(edge, 0.8)[0]
+    np.testing.assert_allclose(shown, 0.5855, rtol=0, atol=1e-3)
+
+
+def test_rows_have_values_or_maps_in_turn() -> None:
+    specs = list(Sheet(Path("unused.png"), objects=4).specs())
+    assert [spec.roughness is None for spec in specs] == [False, True, False, True]
+    assert [spec.metallic is None for spec in specs] == [False, True, False, True]
+    assert len({spec.light.name for spec in specs}) == 4
+
+
+@pytest.mark.slow
+def test_a_sheet_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert Sheet(tmp_path / "sheet.png", objects=2, resolution=24, spp=8, background="dark").run() == 0
+    assert "2 objects x 9 buffers" in capsys.readouterr().out
+    page = np.asarray(Image.open(tmp_path / "sheet.png"))
+    assert page.shape[0] > 2 * 24
+    assert page.shape[1] > len(COLUMNS) * 24
+    assert (page[-1] == 28).all()  # 0.11 of 255
+
+
+def test_a_wrong_command_line(tmp_path: Path) -> None:
+    for command in (Sheet(tmp_path / "a.png", objects=0), Sheet(tmp_path / "a.png", spp=12), Sheet(tmp_path, seed=-1)):
+        with pytest.raises(UsageError, match="expected"):
+            command.run()
+    with pytest.raises(UnirenderError, match="no such folder"):
+        Sheet(tmp_path / "absent" / "a.png").run()
