@@ -1,0 +1,137 @@
+"""Pictures of a model: refused by their header when too large, reduced in linear light while they are decoded."""
+
+import io
+import re
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+
+from unirender.errors import UnirenderError
+from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
+
+# No format whose reader starts another program (EPS) or draws (WMF, SVG).
+FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
+_LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
+STRIP = 500_000  # stored pixels made float at a time
+Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
+
+
+class ImageBudget:
+    """Opens the images of one model and counts their pixels."""
+
+    def __init__(self) -> None:
+        self._pixels = 0
+
+    def open(self, data: bytes, name: str) -> Image.Image:
+        """An image whose header has been read and whose pixels have not.
+
+        Raises:
+            UnirenderError: no image in a format we read, or one of too many pixels, alone or with the others.
+        """
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is lower
+            try:
+                image = Image.open(io.BytesIO(data), formats=FORMATS)
+            except Image.DecompressionBombError as error:  # its message holds the number of pixels
+                count = float((re.findall(r"\d+", str(error)) or ["inf"])[0])
+                raise UnirenderError(f"texture {name}: {count / 1e6:,.0f} megapixels, {_LIMIT}") from error
+            except UnidentifiedImageError as error:
+                raise UnirenderError(
+                    f"texture {name}: no image that can be read, expected one of {', '.join(FORMATS)}; export it as PNG"
+                ) from error
+            except Exception as error:  # Pillow's readers raise whatever a broken header makes them raise
+                raise UnirenderError(
+                    f"texture {name}: no image that can be read ({error}); export it as PNG"
+                ) from error
+        pixels = image.width * image.height
+        self._pixels += pixels
+        if pixels > MAX_IMAGE_PIXELS:
+            raise UnirenderError(f"texture {name}: {pixels / 1e6:,.0f} megapixels, {_LIMIT}")
+        if max(image.size) > MAX_IMAGE_SIDE:
+            raise UnirenderError(
+                f"texture {name}: {image.width:,} x {image.height:,} pixels, expected sides of at most "
+                f"{MAX_IMAGE_SIDE:,}; reduce it"
+            )
+        if self._pixels > MAX_MODEL_PIXELS:
+            raise UnirenderError(
+                f"texture {name}: brings the textures to {self._pixels / 1e6:.0f} megapixels, expected at most "
+                f"{MAX_MODEL_PIXELS / 1e6:.0f}; reduce them"
+            )
+        return image
+
+
+def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode) -> Float[np.ndarray, "i j k"]:
+    """Decodes an image and reduces what it means (light, vectors, roughness) to at most `side` on a side.
+
+    The means are taken after `curve`, strip by strip: whatever the image's size, the float texels under way stay few.
+
+    Args:
+        image: from `ImageBudget.open`.
+        name: for messages.
+        side: pixels.
+        mode: Pillow's mode: "RGB" or "RGBA".
+        curve: stored values in [0, 1] -> linear ones, each channel by itself.
+
+    Raises:
+        UnirenderError: the image is cut off or damaged.
+    """
+    try:
+        image.load()
+        if image.mode.startswith("I;16"):
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        image = image if image.mode == mode else image.convert(mode)
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow's readers raise whatever a damaged file makes them raise
+        raise UnirenderError(f"texture {name}: damaged ({error}); export it again") from error
+    levels = np.repeat(np.arange(256, dtype=np.float32)[:, None] / 255, len(image.getbands()), axis=1)
+    table = np.ascontiguousarray(curve(levels[None])[0], np.float32)  # (256, c)
+    scale = min(1.0, side / max(image.size))
+    width, height = (max(1, round(n * scale)) for n in image.size)
+    texels = np.empty((height, width, table.shape[1]), np.float32)
+    strip = max(1, STRIP * height // (image.width * image.height))  # rows of the result at a time
+    for top in range(0, height, strip):
+        stop = min(top + strip, height)
+        low, high = top * image.height / height, stop * image.height / height
+        first, last = int(low), min(int(np.ceil(high)), image.height)
+        stored = np.asarray(image.crop((0, first, image.width, last)))
+        linear = np.stack([table[:, k][stored[..., k]] for k in range(table.shape[1])], axis=-1)
+        texels[top:stop] = area_means(area_means(linear, width, 1), stop - top, 0, low - first, high - first)
+    return texels
+
+
+def area_means(
+    texels: Float[np.ndarray, "h w c"], count: int, axis: int, low: float = 0.0, high: float | None = None
+) -> Float[np.ndarray, "i j c"]:
+    """Means over `count` equal parts of one axis, from `low` to `high` in texels (the whole axis)."""
+    length = texels.shape[axis]
+    high = float(length) if high is None else high
+    if count == length == high - low:
+        return texels
+    edges = np.linspace(low, high, count + 1)
+    whole = np.minimum(edges.astype(np.int64), length - 1)
+    share = (edges - whole).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+    sums = np.cumsum(texels, axis=axis, dtype=np.float64)  # up to and with each texel
+    own = texels.take(whole, axis)
+    parts = np.diff(sums.take(whole, axis) - own * (1 - share), axis=axis)
+    return (parts * (count / (high - low))).astype(np.float32)
+
+
+def resized(texels: Float[np.ndarray, "h w c"], height: int, width: int) -> Float[np.ndarray, "{height} {width} c"]:
+    """Area means over a grid that is not finer."""
+    return area_means(area_means(texels, width, 1), height, 0)
+
+
+def linear(stored: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """The curve of data that are stored as they are: roughness, metallic, vectors."""
+    return stored
+
+
+def nearest(texels: Float[np.ndarray, "h w c"], height: int, width: int) -> Float[np.ndarray, "{height} {width} c"]:
+    """The nearest texels of a grid that is not coarser."""
+    rows = np.arange(height) * texels.shape[0] // height
+    columns = np.arange(width) * texels.shape[1] // width
+    return texels[rows][:, columns]

@@ -1,0 +1,149 @@
+"""Users' meshes: GLB, glTF, OBJ, PLY, STL, OFF to a `MeshObject`, or one sentence why not.
+
+The scene is flattened and its materials are packed into one atlas. `docs/meshes.md` says what is read from each
+format, in which colour space, what is ignored, and every reason for a refusal.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender_reference.meshes.atlas import build_atlas
+from unirender_reference.meshes.doubles import without_doubles
+from unirender_reference.meshes.find import SUFFIXES
+from unirender_reference.meshes.folder import ModelFolder
+from unirender_reference.meshes.gltf_scene import read_gltf
+from unirender_reference.meshes.limits import check_geometry
+from unirender_reference.meshes.normals import piece_normals
+from unirender_reference.meshes.obj import read_obj
+from unirender_reference.meshes.surface import Material, Model, Piece
+from unirender_reference.meshes.tiles import Patch
+from unirender_reference.meshes.trimesh_files import read_through_trimesh
+from unirender_reference.shapes import MeshObject, unit_sphere
+from unirender_reference.shapes.surface import split_corners
+
+READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+
+
+def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
+    """Loads a mesh, moved and scaled into the unit sphere; its own normals are kept where it has them.
+
+    Args:
+        path: a GLB, glTF, OBJ, PLY, STL or OFF file; +y is up and +z faces the camera, as in glTF.
+        root: a folder of models that may share textures: what the file names is read from there and from the file's
+            own folder, and from nowhere else. None: from its own folder alone.
+
+    Returns:
+        The object. glTF objects always have roughness and metallic of their own, OBJ objects where their MTL has the
+        PBR keywords. `provenance["ignored"]` lists what the file has and the contract has not.
+
+    Raises:
+        UnirenderError: one sentence with the reason: a missing, damaged or dangerous file (see `limits`), no faces,
+            broken coordinates, a missing texture.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UnirenderError(f"mesh {path}: no such file; expected one of {', '.join(SUFFIXES)}")
+    if path.suffix.lower() not in SUFFIXES:
+        raise UnirenderError(f"mesh {path}: got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
+    if path.stat().st_size == 0:
+        raise UnirenderError(f"mesh {path}: is empty; copy it again")
+    try:
+        model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
+        return _assembled(path, model)
+    except UnirenderError as error:
+        raise UnirenderError(f"mesh {path}: {error}") from error
+    except MemoryError as error:
+        raise UnirenderError(f"mesh {path}: needs more memory than there is; reduce the model") from error
+    except Exception as error:  # parsers raise whatever a broken file makes them raise
+        reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise UnirenderError(
+            f"mesh {path}: cannot be read as {path.suffix.lower()} ({reason}); export it again"
+        ) from error
+
+
+@dataclass(frozen=True)
+class _Group:
+    """The pieces of one material that have the same attributes."""
+
+    material: Material
+    pieces: list[Piece]
+
+    def patch(self) -> Patch:
+        sets = self.pieces[0].uv
+        colored = any(piece.colors is not None for piece in self.pieces)
+        colors = [np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in self.pieces]
+        return Patch(
+            points=np.concatenate([piece.vertices[piece.faces] for piece in self.pieces]),
+            uv={i: np.concatenate([piece.uv[i] for piece in self.pieces]) for i in sets},
+            colors=np.concatenate(colors) if colored else None,
+            material=self.material,
+        )
+
+
+def _grouped(pieces: list[Piece]) -> list[_Group]:
+    groups: dict[tuple[int, frozenset[int]], _Group] = {}
+    for piece in pieces:
+        key = id(piece.material), frozenset(piece.uv)
+        groups.setdefault(key, _Group(piece.material, [])).pieces.append(piece)
+    return list(groups.values())
+
+
+def _assembled(path: Path, model: Model) -> MeshObject:
+    if not any(len(piece.faces) for piece in model.pieces):
+        raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")
+    single, doubles = without_doubles([piece for piece in model.pieces if len(piece.faces)])
+    groups = _grouped(single)
+    pieces = [piece for group in groups for piece in group.pieces]
+    patches = [group.patch() for group in groups]
+    points = np.concatenate([patch.points for patch in patches])
+    check_geometry(points, max(piece.step for piece in pieces))
+    atlas = build_atlas(patches)
+    arrays = {id(piece.vertices): piece.vertices for piece in pieces}  # an OBJ's pieces share one
+    starts = dict(zip(arrays, np.cumsum([0, *map(len, arrays.values())]), strict=False))
+    vertices, faces, normals, uv = split_corners(
+        unit_sphere(
+            np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces]),
+            np.concatenate(list(arrays.values())),
+        ),
+        np.concatenate([piece.faces + starts[id(piece.vertices)] for piece in pieces]),
+        np.concatenate([piece_normals(piece) for piece in pieces]),
+        atlas.uv,
+    )
+    maps = atlas.maps
+    if "roughness" in maps and uv is None:
+        uv = np.zeros((len(vertices), 2), np.float32)
+    albedo = np.clip(maps["albedo"], 0, 1)
+    return MeshObject(
+        name=path.stem.replace(".", "-"),
+        family="mesh",
+        vertices=vertices,
+        faces=faces,
+        normals=normals,
+        uv=uv,
+        albedo=albedo[0, 0] if albedo.shape[:2] == (1, 1) else albedo,
+        roughness=_scalar_map(maps.get("roughness")),
+        metallic=_scalar_map(maps.get("metallic")),
+        normal_map=maps["normal"] if "normal" in maps and uv is not None else None,
+        provenance={
+            "source": "file",
+            "file": path.name,
+            "meshes": str(len(pieces)),
+            "double_faces": str(doubles),
+            "textures": str(atlas.tiles),
+            "textures_averaged": str(atlas.averaged),
+            "textures_baked": str(atlas.baked),
+            "ignored": ", ".join(sorted(model.ignored)),
+        },
+    )
+
+
+def _scalar_map(texels: Float[np.ndarray, "h w 1"] | None) -> Float[np.ndarray, "i j"] | None:
+    """A map in [0, 1]; a constant takes 2 x 2 texels."""
+    if texels is None:
+        return None
+    plane = np.clip(texels[..., 0], 0, 1)
+    return np.full((2, 2), plane[0, 0], np.float32) if plane.shape == (1, 1) else np.ascontiguousarray(plane)

@@ -1,0 +1,155 @@
+"""Wavefront MTL: colours and textures of the classic format and of its PBR extension (Pr, Pm, map_Pr, map_Pm, norm).
+
+Kd counts only without a map_Kd, as Blender reads it; both are sRGB. Of a map's options `-clamp`, `-o` and `-s` are
+read (`-bm` of `norm`, too); bump maps (`map_Bump`) are heights and are ignored.
+"""
+
+import io
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender_reference.meshes.folder import ModelFolder
+from unirender_reference.meshes.images import Decode, ImageBudget, linear, texels_of
+from unirender_reference.meshes.limits import check_materials, texture_side
+from unirender_reference.meshes.surface import Channel, Material, Texture, unit_vectors
+
+DEFAULT_ALBEDO = 0.5
+DEFAULT_ROUGHNESS, DEFAULT_METALLIC = 0.5, 0.0  # beside materials that have them
+OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-type": 1, "-bm": 1}
+OPTIONS |= {"-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
+MAPS = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
+IGNORED = {"map_d": "alpha", "map_bump": "bump", "bump": "bump", "map_ke": "emission", "disp": "displacement"}
+
+
+@dataclass
+class MtlEntry:
+    """One `newmtl`: numbers by lower-case keyword, maps as (file, options)."""
+
+    numbers: dict[str, list[float]] = field(default_factory=dict)
+    maps: dict[str, tuple[str, dict[str, list[str]]]] = field(default_factory=dict)
+    ignored: set[str] = field(default_factory=set)
+
+
+def parse_mtl(text: str) -> dict[str, MtlEntry]:
+    """The materials of a file by name; lines that are not understood are left out.
+
+    Raises:
+        UnirenderError: there are too many materials.
+    """
+    entries: dict[str, MtlEntry] = {}
+    entry = MtlEntry()
+    for line in io.StringIO(text):
+        keyword, _, rest = line.strip().partition(" ")
+        keyword, rest = keyword.lower(), rest.strip()
+        if keyword == "newmtl":
+            entry = entries.setdefault(rest, MtlEntry())
+            check_materials(len(entries))
+        elif keyword in MAPS:
+            entry.maps[MAPS[keyword]] = _map(rest)
+        elif keyword in IGNORED:
+            entry.ignored.add(IGNORED[keyword])
+        elif keyword in ("kd", "pr", "pm", "d", "ke"):
+            try:
+                entry.numbers[keyword] = [float(value) for value in rest.split()]
+            except ValueError:  # "Kd spectral file.rfl" and the like
+                entry.ignored.add(f"{keyword} {rest[:20]}")
+    return entries
+
+
+def _map(rest: str) -> tuple[str, dict[str, list[str]]]:
+    """A file name, which may hold spaces, behind options of known length (`-o`, `-s`, `-t` take one to three)."""
+    words, options = rest.split(" "), {}
+    while words and words[0].lower() in OPTIONS:
+        name = words.pop(0).lower()
+        values: list[str] = []
+        while words and len(values) < OPTIONS[name] and (_is_number(words[0]) or OPTIONS[name] == 1 or not words[0]):
+            value = words.pop(0)
+            values += [value] if value else []
+        options[name] = values
+    return " ".join(words).strip(), options
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+class MtlMaterials:
+    """The materials that a model uses, made when first asked for.
+
+    Args:
+        folder: where textures lie.
+        entries: the parsed library.
+        used: names of the materials that have faces.
+    """
+
+    def __init__(self, folder: ModelFolder, entries: dict[str, MtlEntry], used: list[str | None]) -> None:
+        self._folder, self._images = folder, ImageBudget()
+        self._entries = entries
+        self._texels: dict[tuple[str, Decode], Float[np.ndarray, "h w c"]] = {}  # materials share pictures
+        here = [entries[name] for name in used if name in entries]
+        self._pbr = any(
+            {"pr", "pm"} & set(entry.numbers) or {"roughness", "metallic"} & set(entry.maps) for entry in here
+        )
+        self._side = texture_side(sum(bool(entry.maps) for entry in here))
+        self.ignored = {what for entry in here for what in entry.ignored}
+        if any(entry.numbers.get("d", [1.0])[:1] < [1.0] for entry in here):
+            self.ignored.add("alpha")
+        if any(max(entry.numbers.get("ke", [0.0]), default=0.0) > 0 for entry in here):
+            self.ignored.add("emission")
+
+    def make(self, name: str | None, textured: bool, colored: bool) -> Material:
+        """A material on faces that have texture coordinates or not, and colours of their own or not.
+
+        A texture on faces without coordinates counts as its mean.
+        """
+        entry = self._entries.get(name or "", MtlEntry())
+        color = entry.numbers.get("kd", [])
+        plain = np.full(3, DEFAULT_ALBEDO if not colored else 1.0, np.float32)
+        if len(color) in (1, 3) and not colored:
+            plain = srgb_decode(np.clip(np.nan_to_num(np.resize(color, 3)), 0, 1))
+        channels: dict[str, Channel] = {"albedo": plain}
+        if self._pbr:
+            for channel, key, default in (("roughness", "pr", DEFAULT_ROUGHNESS), ("metallic", "pm", DEFAULT_METALLIC)):
+                value = (entry.numbers.get(key) or [default])[0]
+                channels[channel] = np.clip(np.nan_to_num(np.array([value], np.float32)), 0, 1)
+        for channel, (file, options) in entry.maps.items():
+            texture = self._texture(channel, file, options)
+            channels[channel] = texture if textured else texture.texels.mean((0, 1))
+        if not textured:
+            channels.pop("normal", None)
+        return Material(channels)
+
+    def _texture(self, channel: str, file: str, options: dict[str, list[str]]) -> Texture:
+        if not file:
+            raise UnirenderError(f"its MTL has a map without a file name for {channel}; write the name")
+        curve = srgb_decode if channel == "albedo" else linear
+        if (file, curve) not in self._texels:
+            image = self._images.open(self._folder.read(file, "texture"), repr(file))
+            self._texels[file, curve] = texels_of(image, repr(file), self._side, "RGB", curve)
+        texels = self._texels[file, curve]
+        if channel == "normal":
+            texels = unit_vectors(2 * texels - 1, _number(options.get("-bm"), 1.0))
+        elif channel != "albedo":
+            texels = texels[..., :1]
+        # OBJ counts v from below: v_down = 1 - (s v_up + o), in terms of the 1 - v_up that the reader stores
+        (su, sv), (ou, ov) = _pair(options.get("-s"), 1.0), _pair(options.get("-o"), 0.0)
+        transform = np.array([[su, 0, ou], [0, sv, 1 - sv - ov]])
+        wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
+        return Texture(texels, 0, transform, (wrap, wrap))
+
+
+def _number(words: list[str] | None, default: float) -> float:
+    return float(words[0]) if words and _is_number(words[0]) else default
+
+
+def _pair(words: list[str] | None, default: float) -> tuple[float, float]:
+    values = [float(word) for word in words or [] if _is_number(word)]
+    return (values + [default] * 2)[0], (values + [default] * 2)[1]

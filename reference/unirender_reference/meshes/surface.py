@@ -1,0 +1,85 @@
+"""What a reader hands on: pieces of mesh with a material, before anything is put into one atlas.
+
+Channels, the same for every format: `albedo` (3, linear), `roughness` (1, perceptual), `metallic` (1), `normal` (3,
+unit tangent-space vectors with y up in the picture). A channel is one value or a texture.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Wrap = Literal["repeat", "mirror", "clamp"]
+IDENTITY = np.eye(2, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture and how texture coordinates find it.
+
+    Attributes:
+        texels: (h, w, c) float32, decoded: linear colour, roughness, unit vectors.
+        texcoord: which set of coordinates of the piece.
+        transform: affine, coordinates of the set -> coordinates of the picture (v from its first row).
+        wrap: outside [0, 1], along u and along v.
+    """
+
+    texels: Float[np.ndarray, "h w c"]
+    texcoord: int = 0
+    transform: Float[np.ndarray, "2 3"] = field(default_factory=lambda: IDENTITY)
+    wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+
+    def scaled(self, factor: Float[np.ndarray, " c"]) -> "Texture":
+        """The same picture times a colour."""
+        return replace(self, texels=self.texels * factor)
+
+
+Channel = Texture | Float[np.ndarray, " c"]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """The channels of a surface; `albedo` always, `roughness` and `metallic` both or neither, `normal` or not."""
+
+    channels: Mapping[str, Channel]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Triangles of one material in world space.
+
+    Attributes:
+        vertices: (n, 3).
+        faces: (m, 3), counter-clockwise seen from outside.
+        normals: (m, 3, 3) of each corner, of any length; None where the file has none.
+        uv: (m, 3, 2) of each corner, by set; v from the first row.
+        colors: (m, 3, 3) linear colours of each corner that multiply the albedo, or None.
+        material: shared by the pieces that have the same one.
+        step: distance between neighbouring coordinates that the file can tell apart, in world units; 0 for text.
+    """
+
+    vertices: Float[np.ndarray, "n 3"]
+    faces: Int[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "m 3 3"] | None
+    uv: Mapping[int, Float[np.ndarray, "m 3 2"]]
+    colors: Float[np.ndarray, "m 3 3"] | None
+    material: Material
+    step: float = 0.0
+
+
+@dataclass(frozen=True)
+class Model:
+    """A whole file: its pieces and what of it is not part of our contract ("alpha", "emission", ...)."""
+
+    pieces: list[Piece]
+    ignored: frozenset[str]
+
+
+def unit_vectors(vectors: Float[np.ndarray, "h w 3"], scale: float) -> Float[np.ndarray, "h w 3"]:
+    """Tangent-space vectors with x and y scaled, normalised; (0, 0, 1) where there is none."""
+    scaled = vectors * np.array([scale, scale, 1], np.float32)
+    length = np.linalg.norm(scaled, axis=-1, keepdims=True)
+    flat = np.array([0, 0, 1], np.float32)
+    return np.where(length > 1e-6, scaled / np.maximum(length, 1e-6), flat).astype(np.float32)

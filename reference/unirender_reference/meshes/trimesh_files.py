@@ -1,0 +1,134 @@
+"""PLY, STL and OFF through trimesh: geometry, vertex and face colours (sRGB-coded), one texture of a PLY.
+
+trimesh trusts the counts of a header, so those are held against the size of the file first.
+"""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender_reference.meshes.folder import FolderResolver, ModelFolder
+from unirender_reference.meshes.images import ImageBudget, texels_of
+from unirender_reference.meshes.limits import (
+    MAX_FACES,
+    MAX_TEXTURE,
+    MAX_VERTICES,
+    check_bytes,
+    check_faces,
+    float32_step,
+)
+from unirender_reference.meshes.mtl import DEFAULT_ALBEDO
+from unirender_reference.meshes.surface import Channel, Material, Model, Piece, Texture
+
+PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)\s*$", re.MULTILINE)
+DOUBLE = re.compile(rb"^format ascii|^property (double|float64) x", re.MULTILINE)
+TEXTURE_COMMENT = re.compile(rb"^comment\s+TextureFile\s+(.+?)\s*$", re.MULTILINE)
+
+
+def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
+    """Reads a PLY, STL or OFF file.
+
+    Args:
+        path: the file.
+        folder: where the texture of a PLY may lie.
+
+    Raises:
+        UnirenderError: the file claims more than it holds, or a limit is exceeded; also whatever trimesh raises.
+    """
+    length = path.stat().st_size
+    check_bytes(length, "the file")
+    with path.open("rb") as file:
+        head = file.read(65536)
+    _check_claims(path.suffix.lower(), head, length)
+    resolver = FolderResolver(folder)
+    scene = trimesh.load_scene(path, process=False, resolver=resolver)
+    if resolver.error:
+        raise resolver.error
+    texture = _texture(folder, head)
+    pieces = []
+    for mesh in scene.geometry.values():
+        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+            check_faces(len(mesh.faces))
+            if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+                raise UnirenderError(f"its faces index outside the {len(mesh.vertices):,} vertices; export it again")
+            step = 0.0 if DOUBLE.search(head) or path.suffix.lower() == ".off" else float32_step(mesh.vertices)
+            pieces.append(_piece(mesh, texture, step))
+    return Model(pieces, frozenset())
+
+
+def _check_claims(suffix: str, head: bytes, length: int) -> None:
+    """Counts in a header that the file cannot hold; an element takes a byte at least."""
+    claims: dict[str, int] = {}
+    if suffix == ".ply" and head[:3] == b"ply":
+        if b"end_header" not in head:
+            raise UnirenderError(f"truncated: its header does not end within {len(head):,} bytes; export it again")
+        claims = {name.decode(): int(count) for name, count in PLY_ELEMENT.findall(head.partition(b"end_header")[0])}
+    elif suffix == ".off" and head[:3].upper() == b"OFF":
+        numbers = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", head[3:]))[:2]
+        claims = dict(zip(("vertex", "face"), map(int, numbers), strict=False))
+    elif suffix == ".stl" and not re.search(b"facet|endsolid", head[:1024]):
+        count = int.from_bytes(head[80:84], "little")
+        if len(head) < 84 or length < 84 + 50 * count:
+            raise UnirenderError(
+                f"truncated: claims {count:,} triangles in {length:,} bytes, expected {84 + 50 * count:,}"
+            )
+    for name, count in claims.items():
+        limit = MAX_FACES if name == "face" else MAX_VERTICES
+        if count > limit:
+            raise UnirenderError(f"claims {count:,} of element {name}, expected at most {limit:,}")
+        if count > length:
+            raise UnirenderError(f"truncated: claims {count:,} of element {name} in {length:,} bytes")
+
+
+def _texture(folder: ModelFolder, head: bytes) -> Texture | None:
+    """The picture that a PLY header names, as MeshLab writes it."""
+    found = TEXTURE_COMMENT.search(head.partition(b"end_header")[0])
+    if found is None:
+        return None
+    name = found[1].decode("utf-8", "surrogateescape")
+    image = ImageBudget().open(folder.read(name, "texture"), repr(name))
+    return Texture(texels_of(image, repr(name), MAX_TEXTURE, "RGB", srgb_decode))
+
+
+def _piece(mesh: trimesh.Trimesh, texture: Texture | None, step: float) -> Piece:
+    visual: Any = mesh.visual
+    faces = np.asarray(mesh.faces, np.int64)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    stored = mesh._cache["vertex_normals"]  # the file's, or None; the property would compute them
+    uv = np.asarray(getattr(visual, "uv", None), np.float64)  # of any shape
+    textured = texture is not None and uv.shape == (len(vertices), 2) and bool(np.isfinite(uv).all())
+    colors = None if textured else _colors(mesh, faces)
+    albedo: Channel = np.full(3, 1.0 if colors is not None else DEFAULT_ALBEDO, np.float32)
+    material = getattr(visual, "material", None)
+    if textured:
+        assert texture is not None
+        albedo = texture
+    elif colors is None and isinstance(material, SimpleMaterial | PBRMaterial) and texture is not None:
+        albedo = texture.texels.mean((0, 1))
+    return Piece(
+        vertices=vertices,
+        faces=faces,
+        normals=None if stored is None else np.asarray(stored, np.float64)[faces],
+        uv={0: (uv * [1, -1] + [0, 1])[faces]} if textured else {},  # trimesh: v from below
+        colors=colors,
+        material=Material({"albedo": albedo}),
+        step=step,
+    )
+
+
+def _colors(mesh: trimesh.Trimesh, faces: np.ndarray) -> Float[np.ndarray, "m 3 3"] | None:
+    """Linear colours of the corners, from the vertices or the faces."""
+    visual: Any = mesh.visual
+    if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
+        return srgb_decode(np.asarray(visual.vertex_colors, np.float32)[:, :3] / 255)[faces].astype(np.float64)
+    if getattr(visual, "kind", None) == "face":
+        linear = srgb_decode(np.asarray(visual.face_colors, np.float32)[:, :3] / 255)
+        return np.repeat(linear[:, None], 3, axis=1).astype(np.float64)
+    return None

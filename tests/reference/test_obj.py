@@ -1,0 +1,139 @@
+"""OBJ and MTL files: polygons, indices, options of maps, the PBR keywords."""
+
+import numpy as np
+import pytest
+import trimesh
+from gltf_files import bilinear, png, quad_uv, random_pixels
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import SimpleMaterial
+
+from unirender.color import srgb_decode
+from unirender_reference.meshes import load_mesh
+from unirender_reference.meshes.mtl import parse_mtl
+from unirender_reference.shapes import MeshObject
+
+QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+POINTS = np.random.default_rng(0).uniform(-0.95, 0.95, (40, 2))
+
+
+def write(tmp_path, material: str, faces: str = "f 1/1 2/2 3/3 4/4", head: str = QUAD):
+    (tmp_path / "quad.obj").write_text(f"mtllib my materials.mtl\n{head}usemtl red paint\n{faces}\n")
+    (tmp_path / "my materials.mtl").write_text(f"newmtl red paint\n{material}\n")
+    return load_mesh(tmp_path / "quad.obj")
+
+
+def shown(obj: MeshObject, texels: np.ndarray | None) -> np.ndarray:
+    """A map at the points, through the uv of the quad's corners (it is affine over a quad)."""
+    assert obj.uv is not None
+    assert texels is not None
+    design = np.column_stack([obj.vertices[:, :2] * np.sqrt(2), np.ones(len(obj.vertices))])
+    affine = np.linalg.lstsq(design, obj.uv.astype(float), rcond=None)[0]
+    uv = np.column_stack([POINTS, np.ones(len(POINTS))]) @ affine
+    return bilinear(texels if texels.ndim == 3 else texels[..., None], uv)
+
+
+def test_no_pbr_keywords_no_maps(tmp_path):
+    obj = write(tmp_path, "Kd 0.5 0.5 0.5\nNs 100\nKs 1 1 1")
+    assert obj.roughness is None
+    assert obj.metallic is None
+    assert obj.uv is None
+
+
+def test_pbr_keywords(tmp_path):
+    pictures = {name: random_pixels(i, 8, 8) for i, name in enumerate(("color", "rough", "metal", "bumps"))}
+    pictures["bumps"][..., 2] = 255
+    for name, pixels in pictures.items():
+        (tmp_path / f"{name} map.png").write_bytes(png(pixels))
+    lines = "map_Kd color map.png\nPr 0.9\nmap_Pr rough map.png\nmap_Pm metal map.png\nnorm -bm 0.5 bumps map.png"
+    obj = write(tmp_path, lines)
+    uv = quad_uv(POINTS)
+    assert shown(obj, obj.albedo) == pytest.approx(bilinear(srgb_decode(pictures["color"] / 255), uv), abs=2e-5)
+    assert shown(obj, obj.roughness) == pytest.approx(bilinear(pictures["rough"][..., :1] / 255, uv), abs=2e-5)
+    assert shown(obj, obj.metallic) == pytest.approx(bilinear(pictures["metal"][..., :1] / 255, uv), abs=2e-5)
+    assert obj.normal_map is not None
+    tilt = (pictures["bumps"] / 255 * 2 - 1) * [0.5, 0.5, 1]
+    tilt /= np.linalg.norm(tilt, axis=-1, keepdims=True)
+    assert obj.normal_map[1:-1, 1:-1] == pytest.approx(tilt, abs=1e-5)
+
+
+def test_pbr_values_and_their_defaults(tmp_path):
+    obj = write(tmp_path, "Kd 1 1 1\nPr 0.25")
+    assert obj.roughness == pytest.approx(np.full((2, 2), 0.25))
+    assert obj.metallic == pytest.approx(np.zeros((2, 2)))
+
+
+def test_map_options(tmp_path):
+    pixels = random_pixels(5, 4, 4)
+    (tmp_path / "a.png").write_bytes(png(pixels))
+    obj = write(tmp_path, "map_Kd -clamp on -s 2 0.5 1 -o 0.25 -0.1 a.png")
+    u, v_up = quad_uv(POINTS)[:, 0] * 2 + 0.25, (1 - quad_uv(POINTS)[:, 1]) * 0.5 - 0.1
+    expected = bilinear(srgb_decode(pixels / 255), np.column_stack([u, 1 - v_up]), ("clamp", "clamp"))
+    assert shown(obj, obj.albedo) == pytest.approx(expected, abs=2e-5)
+
+
+def test_parse_mtl_reads_names_and_options():
+    entries = parse_mtl("newmtl a b\nmap_Kd -o 1 -s 2 2 my wood 2.png\nKd 0.1 0.2 0.3\nmap_bump x.png\nKd spectral x\n")
+    assert entries["a b"].maps["albedo"] == ("my wood 2.png", {"-o": ["1"], "-s": ["2", "2"]})
+    assert entries["a b"].numbers["kd"] == [0.1, 0.2, 0.3]
+    assert entries["a b"].ignored == {"bump", "kd spectral x"}
+
+
+def test_polygons_relative_indices_and_continued_lines(tmp_path):
+    """A pentagon, a triangle by negative indices in the middle of the file, a line that goes on."""
+    pentagon = "v 0 0 0\nv 2 0 0\nv 3 1 0\nv 1 2 0\nv -1 1 0\nf 1 2 3 \\\n 4 5\n"
+    (tmp_path / "a.obj").write_text(pentagon + "v 0 0 1\nv 1 0 1\nv 0 1 1\nf -3 -2 -1\nv 9 9 9\n")
+    obj = load_mesh(tmp_path / "a.obj")
+    assert len(obj.faces) == 4
+    a, b, c = np.moveaxis(obj.vertices[obj.faces].astype(float), 1, 0)
+    area = np.cross(b - a, c - a)[:, 2] / 2
+    assert area[:3].sum() / area[3] == pytest.approx(5 / 0.5, rel=1e-5)  # pentagon by the shoelace formula: 5
+    assert area.min() > 0
+
+
+def test_vertex_colors_of_an_obj_are_srgb(tmp_path):
+    (tmp_path / "a.obj").write_text(
+        "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nv 0 0 1 0.5 0.5 0.5\nf 1 2 3\nf 1 2 4\n"
+    )
+    obj = load_mesh(tmp_path / "a.obj")
+    assert obj.uv is not None
+    h, w, _ = obj.albedo.shape
+    texel = obj.albedo[(obj.uv[:, 1] * h).astype(int), (obj.uv[:, 0] * w).astype(int)]
+    grey = obj.vertices[:, 2] > obj.vertices[:, 2].max() - 1e-3
+    assert texel[grey] == pytest.approx(np.full((grey.sum(), 3), 0.214), abs=1e-3)
+    assert texel[~grey] == pytest.approx(np.tile([1, 0, 0], ((~grey).sum(), 1)), abs=1e-6)
+
+
+def test_two_materials_share_an_atlas(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd a.png\nnewmtl b\nKd 1 1 0\n")
+    text = QUAD + "v 4 0 0\nmtllib m.mtl\nusemtl a\nf 1/1 2/2 3/3 4/4\nusemtl b\nf 2 5 3\n"
+    (tmp_path / "a.obj").write_text(text)
+    obj = load_mesh(tmp_path / "a.obj")
+    assert obj.uv is not None
+    h, w, _ = obj.albedo.shape
+    tip = obj.vertices[:, 0].argmax()
+    assert obj.albedo[int(obj.uv[tip, 1] * h), int(obj.uv[tip, 0] * w)] == pytest.approx([1, 1, 0])
+
+
+def test_same_geometry_as_trimesh(tmp_path):
+    """Another implementation: areas, volume and colours of a sphere with a picture."""
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    uv = np.random.default_rng(2).random((len(ball.vertices), 2))
+    picture = Image.fromarray(random_pixels(3, 8, 8))
+    ball.visual = TextureVisuals(uv=uv, material=SimpleMaterial(image=picture))
+    ball.export(tmp_path / "ball.obj")
+    obj = load_mesh(tmp_path / "ball.obj")
+    assert len(obj.faces) == len(ball.faces)
+    assert obj.signed_volume == pytest.approx(ball.volume, rel=0.02)
+    assert obj.albedo[1:-1, 1:-1] == pytest.approx(srgb_decode(np.asarray(picture) / 255), abs=1e-5)
+
+
+def test_faces_on_each_other_are_one(tmp_path):
+    """A sheet that is written for both sides, the second time with broken normals; its edge neighbour stays."""
+    normals = "vn 0 0 1\nvn 0 1 0\n"
+    faces = "f 1//1 2//1 3//1\nf 3//2 2//2 1//2\nf 1//1 3//1 4//1"
+    obj = write(tmp_path, "Kd 1 1 1", faces, QUAD + normals)
+    assert len(obj.faces) == 2
+    assert obj.provenance["double_faces"] == "1"
+    assert obj.normals == pytest.approx(np.tile([0, 0, 1], (len(obj.normals), 1)))
