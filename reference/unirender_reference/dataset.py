@@ -2,52 +2,50 @@
 
 Mitsuba scales badly over threads at 64 pixels (a wavefront lasts tens of milliseconds), so every worker is one process
 with one thread that renders whole groups and encodes its EXR files; the parent only writes tars, in the order of the
-plan.
+plan. It never loads a mesh or Mitsuba itself, and knows at most `AHEAD` groups per worker at a time, however many there
+are. A mesh file that cannot be loaded or rendered is listed, and its groups are left out.
 """
 
-import json
-import multiprocessing
+import contextlib
+import dataclasses
+import itertools
 import os
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.exr import exr_bytes, image_channels, intrinsics_channels
-from unirender_reference import backend, exposure
-from unirender_reference.lights import make_light
-from unirender_reference.passes import derive_seed
-from unirender_reference.plan import SHARD_GROUPS, DatasetConfig, GroupPlan, plan_groups
+from unirender_reference import backend
+from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.faults import FileFailure, FileNotSeen
+from unirender_reference.folder_lock import locked, made_folder
+from unirender_reference.journal import Journal
+from unirender_reference.plan import SHARD_GROUPS, GroupPlan, Plan, plan_groups
 from unirender_reference.processes import exit_with_parent
-from unirender_reference.render import Renderer, SceneSpec, renderer_provenance, scene_hashes, shared_scene_hash
-from unirender_reference.shapes import make_object
-from unirender_reference.shards import ShardRecord, finished_shards, shard_name, write_manifest, write_shard
+from unirender_reference.resume import check_sources, finished_shards, sources_hash
+from unirender_reference.shards import (
+    Failure,
+    FloorCount,
+    RenderedGroup,
+    ShardRecord,
+    all_failures,
+    shard_name,
+    total_floor,
+    write_shard,
+)
+from unirender_reference.versions import versions
+from unirender_reference.workers import LocalWorkers, WorkerDied
 
 AHEAD = 3  # groups under way per worker
-GEOMETRY_SPP = 64  # multi-jittered: coverage to about 1/64
+
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class RenderedGroup:
-    """A group ready to be stored: its key, its members by name, what it cost."""
-
-    key: str
-    members: dict[str, bytes]
-    samples: int
-    nan_pixels: int
-    render_seconds: float
-    seconds: float
-
-
-@dataclass(frozen=True)
 class GenerateReport:
-    """What a call of `generate` did (shards of earlier calls are not counted).
+    """What a call of `generate` did (shards of earlier calls are counted where it says so).
 
     Attributes:
         groups, samples: rendered and stored now.
@@ -57,6 +55,11 @@ class GenerateReport:
         workers: processes that rendered.
         overhead: `seconds * workers / render_seconds`: 1 is a generator that does nothing but render.
         manifest_sha256: of the manifest written.
+        failures: mesh files, and folders, that the whole data set lacks, those of earlier calls included.
+        floor: what was reached of the noise floor asked for, in the whole data set; None without one.
+        negative_pixels: of interpolated pictures, with a channel below 0, in the whole data set.
+        unreadable_lights: files of the user's that are no lights and were passed over, a line each, in the whole data
+            set.
     """
 
     groups: int
@@ -68,163 +71,213 @@ class GenerateReport:
     overhead: float
     nan_pixels: int
     manifest_sha256: str
+    failures: tuple[Failure, ...] = ()
+    floor: FloorCount | None = None
+    negative_pixels: int = 0
+    unreadable_lights: tuple[str, ...] = ()
 
 
-def generate(config: DatasetConfig, progress: Progress | None = None) -> GenerateReport:
+def generate(
+    config: DatasetConfig, progress: Progress | None = None, executor: Any = None, verify: bool = False
+) -> GenerateReport:
     """Writes the data set, or what is missing of it.
 
     Args:
         config: what to generate.
         progress: called with (groups done, groups in all) whenever a group is finished.
+        executor: renders instead of `config.workers` processes of this machine or `config.cluster`: anything with the
+            `submit` of `concurrent.futures` and a number of `workers`.
+        verify: read every byte of the shards that are there; else of the last few, and of the others the size.
 
     Raises:
-        UnirenderError: the folder is unusable or holds another data set, or a render failed.
+        UnirenderError: the folder is unusable, in use, or holds another data set; there are no meshes; or a render
+            failed and no file is to blame. A folder that this call made is gone again if nothing got into it.
     """
     start = time.perf_counter()
-    if config.out.exists() and not config.out.is_dir():
-        raise UnirenderError(f"{config.out}: is a file, expected a folder to write shards to; choose another --out")
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnirenderError(f"{config.out}: cannot be made ({error.strerror}); choose another --out") from error
-    backend.find_llvm()  # a clear error here rather than in a worker
-    groups = plan_groups(config)
+    _prepare(config)
+    plan = plan_groups(config)
     content = {**config.content(), "shard_groups": SHARD_GROUPS}
-    chunks = [groups[i : i + SHARD_GROUPS] for i in range(0, len(groups), SHARD_GROUPS)]
-    shards = {shard_name(i): plans for i, plans in enumerate(chunks)}
-    done = finished_shards(config.out, content, {name: len(plans) for name, plans in shards.items()})
-    todo = {name: plans for name, plans in shards.items() if name not in done}
-    skipped, count = len(done), len(groups) - sum(len(plans) for plans in todo.values())
-    workers = min(config.workers or os.cpu_count() or 1, max(1, sum(len(plans) for plans in todo.values())))
-    samples = nan_pixels = rendered = 0
-    render_seconds = 0.0
+    config = dataclasses.replace(config, lights_digest=content["lights"])
+    with made_folder(config.out), locked(config.out):
+        return _generate(config, plan, content, progress, executor, start, verify)
+
+
+def _generate(
+    config: DatasetConfig,
+    plan: Plan,
+    content: dict[str, Any],
+    progress: Progress | None,
+    executor: Any,
+    start: float,
+    verify: bool,
+) -> GenerateReport:
+    shards = {shard_name(i // SHARD_GROUPS): range(i, i + SHARD_GROUPS) for i in range(0, len(plan), SHARD_GROUPS)}
+    shards = {name: part[: len(plan) - part.start] for name, part in shards.items()}
+    header: dict[str, Any] = {"config": content, "versions": versions(config.denoise)}
+    if unreadable := _unreadable_folders(plan):
+        header["unreadable"] = [{"file": failure.file, "reason": failure.reason} for failure in unreadable]
+    sizes = {name: len(part) for name, part in shards.items()}
+    done, stale = finished_shards(config.out, header, sizes, verify=verify)
+    for name, record in done.items():
+        check_sources(config, record, [plan[i] for i in shards[name]])
+    todo = {name: part for name, part in shards.items() if name not in done}
+    found, count = len(done), sum(len(shards[name]) for name in done)
+    workers, render_seconds = 0, 0.0
     if progress:
-        progress(count, len(groups))
-    results = _render_groups(config, [plan for plans in todo.values() for plan in plans], workers)
-    for name, plans in todo.items():
-        finished: list[RenderedGroup] = []
-        for group in (next(results) for _ in plans):
-            finished.append(group)
-            count += 1
-            if progress:
-                progress(count, len(groups))
-        sha256 = write_shard(config.out / name, ((group.key, group.members) for group in finished))
-        done[name] = ShardRecord(
-            name=name,
-            sha256=sha256,
-            bytes=(config.out / name).stat().st_size,
-            groups=len(finished),
-            samples=sum(group.samples for group in finished),
-            nan_pixels=sum(group.nan_pixels for group in finished),
-        )
-        write_manifest(config.out, content, done.values(), complete=False)
-        rendered += len(finished)
-        samples += done[name].samples
-        nan_pixels += done[name].nan_pixels
-        render_seconds += sum(group.render_seconds for group in finished)
-    manifest_sha256 = write_manifest(config.out, content, done.values(), complete=True)
+        progress(count, len(plan))
+
+    def arriving(part: range) -> Iterator[RenderedGroup | Failure]:
+        nonlocal count
+        try:
+            for outcome in itertools.islice(results, len(part)):
+                count += 1
+                if progress:
+                    progress(count, len(plan))
+                yield outcome
+        except OSError as error:  # of a worker's; the shard that it comes to is not to blame
+            raise UnirenderError(f"dataset: a render failed ({error}); run the same command again") from error
+
+    with contextlib.ExitStack() as stack:
+        if todo:
+            executor = executor or stack.enter_context(_executor(config, len(plan) - count))
+            workers = executor.workers
+        results = _results(config, (plan[i] for part in todo.values() for i in part), executor)
+        stack.callback(results.close)
+        journal = stack.enter_context(Journal(config.out, header, done, stale))
+        for name, part in todo.items():
+            done[name], spent = _write_shard(config, name, arriving(part), [plan[i] for i in part])
+            journal.add(done[name])
+            render_seconds += spent
+        manifest_sha256 = journal.complete()
     seconds = time.perf_counter() - start
-    overhead = seconds * workers / render_seconds if render_seconds else float("nan")
+    new = list(done.values())[found:]
     return GenerateReport(
-        rendered, samples, skipped, seconds, render_seconds, workers, overhead, nan_pixels, manifest_sha256
+        groups=sum(record.groups for record in new),
+        samples=sum(record.samples for record in new),
+        skipped_shards=found,
+        seconds=seconds,
+        render_seconds=render_seconds,
+        workers=workers,
+        overhead=seconds * workers / render_seconds if render_seconds else float("nan"),
+        nan_pixels=sum(record.nan_pixels for record in new),
+        manifest_sha256=manifest_sha256,
+        failures=(*unreadable, *all_failures(done.values())),
+        floor=total_floor(record.floor for record in done.values()),
+        negative_pixels=sum(record.negative_pixels for record in done.values()),
+        unreadable_lights=tuple(sorted({line for record in done.values() for line in record.unreadable_lights})),
     )
 
 
 def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
-    """Renders and encodes one group; a pure function of its arguments."""
-    start = time.perf_counter()
-    obj = make_object(plan.object_seed, config.split)
-    renderer = Renderer(obj, resolution=config.resolution)
-    geometry = renderer.geometry(GEOMETRY_SPP, derive_seed(plan.render_seed, "shared"))
-    assert geometry.mask is not None
-    covered = geometry.mask > 0
-    header = {**renderer_provenance(renderer), "spp": str(config.spp), "seed": str(plan.render_seed)}
-    drawn = [make_light(light_plan.seed, config.split) for light_plan in plan.lights]
-    specs = {
-        (i, r, m): SceneSpec(obj, light, r / 100, m / 100, renderer.camera, config.resolution, light_plan.exposure_seed)
-        for i, (light, light_plan) in enumerate(zip(drawn, plan.lights, strict=True))
-        for r, m in light_plan.pairs
-    }
-    scenes = dict(zip(specs, scene_hashes(specs.values()), strict=True))
-    shared = {**header, "spp": str(GEOMETRY_SPP), "scene": shared_scene_hash(scenes.values())}
-    members = {"shared.exr": exr_bytes(intrinsics_channels(geometry), attributes=shared)}
-    lights = []
-    for i, (light, light_plan) in enumerate(zip(drawn, plan.lights, strict=True)):
-        own = {pair: scenes[i, *pair] for pair in light_plan.pairs}
-        factor = exposure.scene_exposure(renderer, light.environment, light_plan.exposure_seed)
-        environment = (light.environment * np.float32(factor)).astype(np.float32)
-        attributes = {**header, "light": light.name, "exposure_factor": repr(factor)}
-        lit = {**attributes, "scene": shared_scene_hash(own.values())}
-        members[f"l{i}.environment.exr"] = exr_bytes(image_channels(environment), half=False, attributes=lit)
-        seed = derive_seed(plan.render_seed, "light", i)
-        diffuse = np.where(covered, renderer.diffuse(environment, config.spp, seed, batches=1).mean, 0)
-        members[f"l{i}.diffuse.exr"] = _buffer("diffuse", diffuse, lit)
-        for r in dict.fromkeys(pair[0] for pair in light_plan.pairs):
-            s_seed = derive_seed(seed, r)
-            specular = renderer.specular(environment, r / 100, config.spp, s_seed, batches=1).mean
-            rough = {**attributes, "scene": shared_scene_hash(own[pair] for pair in own if pair[0] == r)}
-            members[f"l{i}.r{r:03d}.specular.exr"] = _buffer("specular", np.where(covered, specular, 0), rough)
-        for r, m in light_plan.pairs:
-            image = renderer.image(environment, r / 100, m / 100, config.spp, derive_seed(seed, r, m), batches=1)
-            scene = {**attributes, "scene": own[r, m]}
-            members[f"l{i}.m{m:03d}_r{r:03d}.exr"] = exr_bytes(image_channels(image.mean), attributes=scene)
-        lights.append(
-            {
-                "name": light.name,
-                "seed": light_plan.seed,
-                "exposure_factor": factor,
-                "exposure_seed": light_plan.exposure_seed,
-                "pairs": light_plan.pairs,
-                "provenance": dict(light.provenance),
-            }
-        )
-    key = f"{obj.name}_g{plan.number}"
-    record = {
-        **header,
-        "family": obj.family,
-        "vary": config.vary,
-        "shares": plan.shares,
-        "camera": {"fov_deg": renderer.camera.fov_deg, "principal": list(renderer.camera.principal)},
-        "coverage": round(float(geometry.mask.mean()), 6),
-        "lights": lights,
-        "nan_pixels": renderer.counters.nan_pixels,
-        "object_provenance": dict(obj.provenance),
-    }
-    members["json"] = json.dumps(record, sort_keys=True).encode()
-    counters = renderer.counters
-    seconds = time.perf_counter() - start
-    return RenderedGroup(key, members, plan.samples, counters.nan_pixels, counters.render_seconds, seconds)
+    """`group.render`, which is imported where it runs: the parent needs neither shapes nor Mitsuba."""
+    from unirender_reference import group
+
+    return group.render(config, plan)
 
 
-def _buffer(name: str, value: np.ndarray, attributes: dict[str, str]) -> bytes:
-    channels = {f"{name}.{component}": value[..., i] for i, component in enumerate("RGB")}
-    return exr_bytes(channels, attributes=attributes)
-
-
-def _render_groups(config: DatasetConfig, plans: list[GroupPlan], workers: int) -> Iterator[RenderedGroup]:
-    """Renders groups in `workers` processes; yields them in order, a bounded number ahead."""
-    if not plans:
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
-        under_way: deque[Future[RenderedGroup]] = deque()
-        try:
-            for plan in plans:
-                under_way.append(pool.submit(render_group, config, plan))
-                if len(under_way) >= workers * AHEAD:
-                    yield under_way.popleft().result()
-            while under_way:
-                yield under_way.popleft().result()
-        except BrokenProcessPool as error:
-            raise UnirenderError(
-                "dataset: a worker process died (out of memory?); complete shards are kept, run the same command again"
-            ) from error
-        finally:
-            for future in under_way:
-                future.cancel()
-
-
-def _start_worker() -> None:
-    """One thread per worker; a worker ends with its parent, even if that is killed."""
+def start_worker() -> None:
+    """One thread per worker and everything imported; a worker ends with its parent, even if that is killed."""
     exit_with_parent()
     backend.set_threads(1)
+    from unirender_reference import group  # noqa: F401 - warms up
+
+
+def _prepare(config: DatasetConfig) -> None:
+    """Finds out early what would stop every worker."""
+    if config.out.exists() and not config.out.is_dir():
+        raise UnirenderError(f"{config.out}: is a file, expected a folder to write shards to; choose another --out")
+    if config.cluster is None:
+        backend.find_llvm()
+    if config.denoise:
+        from unirender_reference import denoise
+
+        denoise.version()
+
+
+def _executor(config: DatasetConfig, groups: int) -> contextlib.AbstractContextManager[Any]:
+    """What renders when the caller brings nothing: a cluster, or at most `groups` processes of this machine."""
+    if config.cluster is not None:
+        from unirender_reference import cluster
+
+        return cluster.connect(config.cluster, denoise=config.denoise)
+    return LocalWorkers(min(config.workers or os.cpu_count() or 1, groups), start_worker)
+
+
+def _results(
+    config: DatasetConfig, plans: Iterator[GroupPlan], executor: Any
+) -> Generator[RenderedGroup | Failure, None, None]:
+    """Renders groups and yields them in order; a bounded number is under way."""
+    under_way: deque[tuple[GroupPlan, Any]] = deque()
+    try:
+        for plan in plans:
+            under_way.append((plan, executor.submit(render_group, config, plan)))
+            if len(under_way) >= AHEAD * max(executor.workers, 1):
+                yield _outcome(*under_way.popleft())
+        while under_way:
+            yield _outcome(*under_way.popleft())
+    finally:
+        for _, future in under_way:
+            future.cancel()
+
+
+def _outcome(plan: GroupPlan, future: Any) -> RenderedGroup | Failure:
+    """The group, or why its file has none.
+
+    Raises:
+        UnirenderError: the group failed, and no file is to blame.
+    """
+    try:
+        return future.result()
+    except (FileFailure, WorkerDied) as error:
+        if plan.mesh is not None:
+            return Failure(plan.mesh.name, str(error), machine=isinstance(error, WorkerDied) or error.machine)
+        raise UnirenderError(f"dataset: {error}; complete shards are kept, run the same command again") from error
+    except FileNotSeen as error:
+        assert plan.mesh is not None
+        if os.path.isfile(plan.mesh.path):
+            raise UnirenderError(
+                f"{error}; the command sees it: --meshes has to be at the same path on every machine"
+            ) from error
+        if os.path.lexists(plan.mesh.path):
+            return Failure(plan.mesh.name, "is no regular file, or a link to nowhere")
+        raise UnirenderError(
+            f"{error}; it is gone since the command began: put it back and run the same command again"
+        ) from error
+
+
+def _write_shard(
+    config: DatasetConfig, name: str, outcomes: Iterator[RenderedGroup | Failure], plans: list[GroupPlan]
+) -> tuple[ShardRecord, float]:
+    """Stores the groups as they come (without any, an empty tar); the record, and the seconds of renders."""
+    groups: list[RenderedGroup] = []
+    failures: Counter[Failure] = Counter()
+
+    def stored() -> Iterator[tuple[str, dict[str, bytes]]]:
+        for outcome in outcomes:
+            if isinstance(outcome, Failure):
+                failures[outcome] += 1
+            else:
+                groups.append(dataclasses.replace(outcome, members={}))
+                yield outcome.key, outcome.members
+
+    sha256 = write_shard(config.out / name, stored())
+    record = ShardRecord(
+        name=name,
+        sha256=sha256,
+        bytes=(config.out / name).stat().st_size,
+        groups=len(groups),
+        samples=sum(group.samples for group in groups),
+        nan_pixels=sum(group.nan_pixels for group in groups),
+        sources=sources_hash(plans),
+        failures=tuple(dataclasses.replace(failure, groups=number) for failure, number in failures.items()),
+        floor=total_floor(group.floor for group in groups),
+        negative_pixels=sum(group.negative_pixels for group in groups),
+        unreadable_lights=tuple(sorted({line for group in groups for line in group.unreadable_lights})),
+    )
+    return record, sum(group.render_seconds for group in groups)
+
+
+def _unreadable_folders(plan: Plan) -> list[Failure]:
+    """Folders of meshes that cannot be listed: nobody knows what is missing from the data set."""
+    folders = [] if plan.meshes is None else plan.meshes.unreadable
+    return [Failure(f"{name}/", f"folder cannot be listed ({reason})", groups=0) for name, reason in folders]

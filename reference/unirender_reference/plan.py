@@ -6,106 +6,62 @@ Roughness and metallic are whole percents, since they stand in member names.
 | vary | groups of an object |
 |---|---|
 | basis | L lights x R roughness values x metallic {0, 50, 100}; every mixture of lights and metallic follows exactly |
-| independent | every pair has its own light and material |
+| independent | every pair has its own light and material; with `materials="maps"` its own light |
 | one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's) |
 | paper | 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
+| sweep | the same 121 pairs under one light |
+
+Every object has equally many groups, so the plan is indexed, not stored: its size does not grow with the data set.
 """
 
-import dataclasses
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import overload
 
 import numpy as np
 
-from unirender.errors import UnirenderError
-from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, pass_count
+from unirender_reference.dataset_config import (
+    DEFAULT_OBJECTS,
+    GRID,
+    MAX_LIGHTS,
+    METALLIC_NODES,
+    PERCENTS,
+    DatasetConfig,
+    basis_shape,
+)
+from unirender_reference.mesh_folder import MeshFile, MeshFolder, mesh_folder
+from unirender_reference.passes import derive_seed
 
-Vary = Literal["basis", "independent", "one-at-a-time", "paper"]
-MAX_LIGHTS = 8
-METALLIC_NODES = (0, 50, 100)
-PERCENTS = 101  # 0 .. 100
-GRID = tuple(range(0, PERCENTS, 10))
 OBJECT_BLOCK = 8  # objects that share a light and a material in "one-at-a-time"
 SHARD_GROUPS = 16
 
-
-@dataclass(frozen=True)
-class DatasetConfig:
-    """A data set to generate.
-
-    Attributes:
-        objects: number of objects.
-        pairs: pictures per object.
-        resolution: height and width in pixels.
-        vary: what the pictures of an object differ in.
-        out: folder of the shards.
-        seed: another seed gives other objects, lights and materials.
-        split: "train" or "test": disjoint objects and lights.
-        spp: samples per pixel of every picture, s and d (batches are not kept: training data has no variance).
-        workers: processes; 0 means one for each CPU core.
-    """
-
-    objects: int
-    pairs: int
-    resolution: int
-    vary: Vary
-    out: Path
-    seed: int = 0
-    split: Literal["train", "test"] = "train"
-    spp: int = 64
-    workers: int = 0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "out", Path(self.out))
-        for name in ("objects", "pairs", "resolution", "spp"):
-            if getattr(self, name) < 1:
-                raise UnirenderError(f"dataset {name}: got {getattr(self, name)}, expected at least 1")
-        for name in ("seed", "workers"):
-            if getattr(self, name) < 0:
-                raise UnirenderError(f"dataset {name}: got {getattr(self, name)}, expected 0 or more")
-        pass_count(self.spp, 1, SAMPLES_PER_PASS // self.resolution**2)
-        if self.vary not in ("basis", "independent", "one-at-a-time", "paper"):
-            raise UnirenderError(
-                f"dataset vary: got {self.vary!r}, expected basis, independent, one-at-a-time or paper"
-            )
-        if self.vary == "basis":
-            basis_shape(self.pairs)
-        if self.vary == "paper" and self.pairs != len(GRID) ** 2:
-            raise UnirenderError(f"dataset pairs: got {self.pairs}, expected {len(GRID) ** 2} with --vary paper")
-        if self.vary == "independent" and self.pairs > PERCENTS**2:
-            raise UnirenderError(
-                f"dataset pairs: got {self.pairs}, expected at most {PERCENTS**2} materials of whole percents with "
-                "--vary independent"
-            )
-        if self.vary == "one-at-a-time" and not 3 <= self.pairs <= 3 * PERCENTS**2:
-            raise UnirenderError(
-                f"dataset pairs: got {self.pairs}, expected at least 3 and at most {3 * PERCENTS**2} with "
-                "--vary one-at-a-time"
-            )
-
-    def content(self) -> dict[str, object]:
-        """The part that decides the bytes of a group, JSON-serialisable; `objects` may grow later."""
-        values = dataclasses.asdict(self)
-        return {name: value for name, value in values.items() if name not in ("out", "workers", "objects")}
+Materials = tuple[tuple[int, int], ...]  # distinct (roughness, metallic) in percent
+Lights = list["LightPlan"]
 
 
 @dataclass(frozen=True)
 class LightPlan:
-    """A light of a group and its pictures, distinct (roughness, metallic) in percent: they name the members."""
+    """A light of a group and its pictures, which the materials name. None: one picture, of the object's maps."""
 
     seed: int
     exposure_seed: int
-    pairs: tuple[tuple[int, int], ...]
+    pairs: Materials
 
     def __post_init__(self) -> None:
         assert len(set(self.pairs)) == len(self.pairs), f"pairs of a light occur twice: {self.pairs}"
 
+    @property
+    def pictures(self) -> int:
+        return len(self.pairs) or 1
+
 
 @dataclass(frozen=True)
 class GroupPlan:
-    """One group: which object, which lights, how the group relates to others (`shares`)."""
+    """One group: which object, which lights, how the group relates to others (`shares`).
+
+    `mesh` is the object's file; None: the procedural object number `object_seed`.
+    """
 
     index: int
     object_seed: int
@@ -113,56 +69,80 @@ class GroupPlan:
     shares: str
     lights: tuple[LightPlan, ...]
     render_seed: int
+    mesh: MeshFile | None = None
 
     @property
     def samples(self) -> int:
-        return sum(len(light.pairs) for light in self.lights)
+        return sum(light.pictures for light in self.lights)
 
 
-def basis_shape(pairs: int) -> tuple[int, int]:
-    """(lights, roughness values) with lights * roughness values * 3 = pairs, lights >= roughness, nearly square.
+class Plan(Sequence[GroupPlan]):
+    """All groups in the order in which they are stored, each made when it is asked for.
+
+    Attributes:
+        objects: how many objects there are.
+        per_object: groups of each.
+    """
+
+    def __init__(self, config: DatasetConfig, meshes: MeshFolder | None) -> None:
+        self.config = config
+        self.meshes = meshes
+        self.objects = (config.objects or DEFAULT_OBJECTS) if meshes is None else len(meshes)
+        self.per_object = sum(1 for _ in _object_groups(config, 0))
+
+    def __len__(self) -> int:
+        return self.objects * self.per_object
+
+    @overload
+    def __getitem__(self, index: int) -> GroupPlan: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[GroupPlan]: ...
+    def __getitem__(self, index: int | slice) -> GroupPlan | list[GroupPlan]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        number_of_object, number = divmod(range(len(self))[index], self.per_object)
+        return self._object(number_of_object)[number]
+
+    @functools.lru_cache(maxsize=4)  # noqa: B019 - a plan lives as long as the run that follows it
+    def _object(self, index: int) -> list[GroupPlan]:
+        config = self.config
+        return [
+            GroupPlan(
+                index=index * self.per_object + number,
+                object_seed=config.seed * 1_000_000 + index,
+                number=number,
+                shares=shares,
+                lights=tuple(lights),
+                render_seed=derive_seed(config.seed, "render", index, number),
+                mesh=None if self.meshes is None else self.meshes[index],
+            )
+            for number, (shares, lights) in enumerate(_object_groups(config, index))
+        ]
+
+
+def plan_groups(config: DatasetConfig) -> Plan:
+    """The plan of a data set; with meshes their folder is listed, and nothing in it is opened.
 
     Raises:
-        UnirenderError: `pairs` has no such form with at most `MAX_LIGHTS` lights.
+        UnirenderError: there are no such meshes.
     """
-    product = pairs // len(METALLIC_NODES)
-    shapes = [
-        (lights, product // lights)
-        for lights in range(1, MAX_LIGHTS + 1)
-        if pairs % len(METALLIC_NODES) == 0 and product and product % lights == 0 and lights >= product // lights
-    ]
-    if not shapes:
-        raise UnirenderError(
-            f"dataset pairs: got {pairs} with --vary basis, expected 3 x lights x roughness values with at most "
-            f"{MAX_LIGHTS} lights and no more roughness values than lights: 3, 6, 12, 18, 27, 36, 48, 75, 108, ..."
-        )
-    return min(shapes, key=lambda shape: shape[0] - shape[1])
+    if config.meshes is None:
+        return Plan(config, None)
+    return Plan(config, mesh_folder(config.meshes, config.split, config.holdout, config.objects))
 
 
-def plan_groups(config: DatasetConfig) -> list[GroupPlan]:
-    """All groups in the order in which they are stored."""
-    groups: list[GroupPlan] = []
-    for index in range(config.objects):
-        for number, (shares, lights) in enumerate(_object_groups(config, index)):
-            groups.append(
-                GroupPlan(
-                    index=len(groups),
-                    object_seed=config.seed * 1_000_000 + index,
-                    number=number,
-                    shares=shares,
-                    lights=tuple(lights),
-                    render_seed=derive_seed(config.seed, "render", index, number),
-                )
-            )
-    return groups
-
-
-def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, list[LightPlan]]]:
+def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lights]]:
     rng = np.random.default_rng(derive_seed(config.seed, "plan", config.split, config.vary, index))
-    if config.vary == "basis":
-        lights, levels = basis_shape(config.pairs)
+    if config.materials == "maps":
+        lights = [_light(rng, ()) for _ in range(config.pairs)]
+        for start in range(0, len(lights), MAX_LIGHTS):
+            yield "object material", lights[start : start + MAX_LIGHTS]
+    elif config.vary == "basis":
+        count, levels = basis_shape(config.pairs)
         materials = tuple((r, m) for r in _stratified(rng, levels) for m in METALLIC_NODES)
-        yield "object", [_light(rng, materials) for _ in range(lights)]
+        yield "object", [_light(rng, materials) for _ in range(count)]
+    elif config.vary == "sweep":
+        yield "object light", [_light(rng, tuple((r, m) for m in GRID for r in GRID))]
     elif config.vary == "independent":
         for pairs in _chunks(_materials(rng, config.pairs), MAX_LIGHTS):
             yield "object", [_light(rng, (pair,)) for pair in pairs]
@@ -182,7 +162,7 @@ def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, lis
             yield "light material", [_light(block, (pair,)) for pair in pairs]
 
 
-def _light(rng: np.random.Generator, pairs: tuple[tuple[int, int], ...]) -> LightPlan:
+def _light(rng: np.random.Generator, pairs: Materials) -> LightPlan:
     return LightPlan(int(rng.integers(1 << 31)), int(rng.integers(1 << 31)), pairs)
 
 

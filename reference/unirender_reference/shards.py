@@ -1,8 +1,9 @@
 """WebDataset tar shards whose bytes depend on their content only, and the manifest that lists them.
 
-A shard is written under a temporary name, fsynced and renamed: a file called `*.tar` is complete. The manifest is
-replaced after every shard, so that a reader can start early; it holds no times and no machine, and is equal for equal
-runs however often they were interrupted.
+A shard is written under a temporary name, fsynced and renamed: a file called `*.tar` is complete. The manifest holds no
+times and no machine, and is equal for equal runs however often they were interrupted (`journal` says when it is
+written). A shard of mesh files lists those that failed, and a hash of the names and sizes of all whose turn it was;
+`failures.jsonl` repeats the failures of all shards.
 """
 
 import hashlib
@@ -11,6 +12,7 @@ import json
 import os
 import tarfile
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,12 +21,64 @@ from typing import Any
 from unirender.errors import UnirenderError
 
 MANIFEST = "manifest.json"
+FAILURES = "failures.jsonl"
+JOURNAL = "shards.jsonl"
 FORMAT = 1
+OPTIONAL = ("sources", "failures", "floor", "negative_pixels", "unreadable_lights")
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A mesh file without some or all of its groups.
+
+    Attributes:
+        file: its path below the folder of meshes.
+        reason: why.
+        groups: how many.
+        machine: the file is not to blame (a dead worker, a time limit): the next run tries its shard again.
+    """
+
+    file: str
+    reason: str
+    groups: int = 1
+    machine: bool = False
+
+    def entry(self) -> dict[str, Any]:
+        """The failure as JSON."""
+        return {name: value for name, value in asdict(self).items() if name != "machine" or value}
+
+
+@dataclass(frozen=True)
+class FloorCount:
+    """How many buffers were sampled up to a noise floor, how many reached it, and the lowest that was reached (dB)."""
+
+    buffers: int
+    reached: int
+    minimum_db: float
+
+
+@dataclass(frozen=True)
+class RenderedGroup:
+    """A group ready to be stored: its key, its members by name, what it cost."""
+
+    key: str
+    members: dict[str, bytes]
+    samples: int
+    nan_pixels: int
+    render_seconds: float
+    seconds: float
+    floor: FloorCount | None = None
+    negative_pixels: int = 0
+    unreadable_lights: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class ShardRecord:
-    """A finished shard as the manifest lists it."""
+    """A finished shard as the manifest lists it; what it has nothing of (`OPTIONAL`) is left out there.
+
+    `negative_pixels` counts pixels of interpolated pictures with a channel below 0, `unreadable_lights` has a line for
+    each of the user's light files that draws of this shard passed over: its path below their folder, and why.
+    """
 
     name: str
     sha256: str
@@ -32,6 +86,49 @@ class ShardRecord:
     groups: int
     samples: int
     nan_pixels: int
+    sources: str = ""
+    failures: tuple[Failure, ...] = ()
+    floor: FloorCount | None = None
+    negative_pixels: int = 0
+    unreadable_lights: tuple[str, ...] = ()
+
+    @property
+    def planned(self) -> int:
+        """Groups whose turn it was."""
+        return self.groups + sum(failure.groups for failure in self.failures)
+
+    def entry(self) -> dict[str, Any]:
+        """The record as JSON."""
+        values = {**asdict(self), "failures": [failure.entry() for failure in self.failures]}
+        return {name: value for name, value in values.items() if value or name not in OPTIONAL}
+
+    @property
+    def is_final(self) -> bool:
+        """Whether trying again would change nothing."""
+        return not any(failure.machine for failure in self.failures)
+
+
+def parse_record(entry: Mapping[str, Any]) -> ShardRecord:
+    """The inverse of `ShardRecord.entry`."""
+    later: dict[str, Any] = {
+        "failures": tuple(Failure(**failure) for failure in entry.get("failures", ())),
+        "unreadable_lights": tuple(entry.get("unreadable_lights", ())),
+    }
+    if "floor" in entry:
+        later["floor"] = FloorCount(**entry["floor"])
+    return ShardRecord(**{**entry, **later})
+
+
+def total_floor(counts: Iterable[FloorCount | None]) -> FloorCount | None:
+    """The counts of several groups or shards together; None where there are none."""
+    known = [count for count in counts if count is not None]
+    if not known:
+        return None
+    return FloorCount(
+        sum(count.buffers for count in known),
+        sum(count.reached for count in known),
+        min(count.minimum_db for count in known),
+    )
 
 
 def shard_name(index: int) -> str:
@@ -79,70 +176,62 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def write_manifest(folder: Path, config: Mapping[str, Any], shards: Iterable[ShardRecord], *, complete: bool) -> str:
-    """Replaces the manifest; returns its sha256."""
+def write_manifest(folder: Path, header: Mapping[str, Any], shards: Iterable[ShardRecord], *, complete: bool) -> str:
+    """Replaces the manifest, and the list of failures; returns the manifest's sha256.
+
+    Args:
+        folder: of the data set.
+        header: `config` (what decides the bytes), `versions` (with what they are made), and `unreadable` folders of
+            meshes, if any (`file`, `reason`).
+        shards: those that are finished.
+        complete: whether they are all there will be.
+    """
     records = sorted(shards, key=lambda record: record.name)
     content = {
         "format": FORMAT,
         "complete": complete,
-        "config": dict(config),
+        **header,
         "groups": sum(record.groups for record in records),
         "samples": sum(record.samples for record in records),
         "nan_pixels": sum(record.nan_pixels for record in records),
-        "shards": [asdict(record) for record in records],
+        "shards": [record.entry() for record in records],
     }
     data = (json.dumps(content, indent=1, sort_keys=True) + "\n").encode()
-    temporary = folder / f".{MANIFEST}.{os.getpid()}.part"
-    with temporary.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, folder / MANIFEST)
-    _sync_folder(folder)
+    _replace(folder / MANIFEST, data)
+    failures = [failure.entry() for failure in all_failures(records)]
+    for failure in failures:
+        del failure["groups"]
+    failures = [*header.get("unreadable", ()), *failures]
+    if failures:
+        _replace(folder / FAILURES, "".join(json.dumps(failure) + "\n" for failure in failures).encode())
+    else:
+        (folder / FAILURES).unlink(missing_ok=True)
     return hashlib.sha256(data).hexdigest()
 
 
-def finished_shards(folder: Path, config: Mapping[str, Any], sizes: Mapping[str, int]) -> dict[str, ShardRecord]:
-    """The shards of an earlier run of the same configuration that are listed and whole; stale temporary files vanish.
+def all_failures(records: Iterable[ShardRecord]) -> list[Failure]:
+    """The failures of all shards in the order of the files, each reason of a file once."""
+    found: Counter[tuple[str, str, bool]] = Counter()
+    for record in sorted(records, key=lambda record: record.name):
+        for failure in record.failures:
+            found[failure.file, failure.reason, failure.machine] += failure.groups
+    return [Failure(file, reason, groups, machine) for (file, reason, machine), groups in found.items()]
 
-    Args:
-        folder: of the data set.
-        config: what decides the bytes.
-        sizes: how many groups each shard has to have. A data set can grow: its last, shorter shard is made again.
 
-    Raises:
-        UnirenderError: the folder holds another data set.
-    """
-    for stale in folder.glob(".*.part"):
-        stale.unlink(missing_ok=True)
-    path = folder / MANIFEST
-    if not path.exists():
-        if any(folder.glob("*.tar")) and not (folder / shard_name(0)).exists():
-            raise UnirenderError(f"{folder}: has .tar files of something else, expected an empty folder; use another")
-        return {}
+def _replace(path: Path, data: bytes) -> None:
+    temporary = path.parent / f".{path.name}.{os.getpid()}.part"
     try:
-        content = json.loads(path.read_text())
-        records = [ShardRecord(**record) for record in content["shards"]]
-        found = content["config"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise UnirenderError(f"{path}: not a manifest of unirender ({error}); choose another --out") from error
-    wanted = json.loads(json.dumps(dict(config)))
-    if found != wanted:
-        differs = ", ".join(sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key)))
-        raise UnirenderError(f"{folder}: holds a data set with other {differs}; choose another --out or delete it")
-    surplus = sorted(record.name for record in records if record.groups > sizes.get(record.name, 0))
-    if surplus:
+        with temporary.open("wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+        _sync_folder(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
         raise UnirenderError(
-            f"{folder}: already holds more objects ({surplus[0]}), expected at most as many as asked for; "
-            "raise --objects or choose another --out"
-        )
-    return {
-        record.name: record
-        for record in records
-        if record.groups == sizes[record.name]
-        and (folder / record.name).is_file()
-        and file_sha256(folder / record.name) == record.sha256
-    }
+            f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
+        ) from error
 
 
 def _sync_folder(folder: Path) -> None:

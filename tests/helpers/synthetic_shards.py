@@ -47,6 +47,26 @@ def group_members(
     return members
 
 
+def maps_members(size: int, lights: int, seed: int) -> dict[str, bytes]:
+    """Members of a group whose roughness and metallic are the object's own maps: a picture for each light."""
+    rng = np.random.default_rng(seed)
+    shape = sphere(size, rng)
+    albedo, normal, mask = shape.require("albedo", "normal", "mask").values()
+    ramp = np.linspace(0.1, 0.9, size, dtype=np.float32)
+    roughness, metallic = (np.broadcast_to(v, (size, size))[..., None] * mask for v in (ramp, ramp[::-1, None]))
+    shared = shape.replace(roughness=roughness, metallic=metallic)
+    members = {"shared.exr": exr_bytes(intrinsics_channels(shared)), "json": b'{"vary": "independent"}'}
+    for light in range(lights):
+        environment = rng.uniform(0, 2, (8, 16, 3)).astype(np.float32)
+        diffuse, specular = diffuse_light(normal, environment), specular_light(normal, 0.5, environment)
+        members[f"l{light}.environment.exr"] = exr_bytes(image_channels(environment), half=False)
+        members[f"l{light}.diffuse.exr"] = exr_bytes(intrinsics_channels(Intrinsics(diffuse=diffuse)))
+        members[f"l{light}.maps.specular.exr"] = exr_bytes(intrinsics_channels(Intrinsics(specular=specular)))
+        image = composite(albedo, metallic, diffuse, specular) * mask
+        members[f"l{light}.maps.exr"] = exr_bytes(image_channels(np.concatenate([image, mask], axis=-1)))
+    return members
+
+
 def write_shard(path: Path, groups: dict[str, dict[str, bytes]]) -> None:
     with tarfile.open(path, "w") as tar:
         for key, members in groups.items():

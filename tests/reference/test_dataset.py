@@ -19,9 +19,10 @@ from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr_bytes
 from unirender_reference.dataset import generate
+from unirender_reference.dataset_config import GRID, DatasetConfig, basis_shape
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
-from unirender_reference.plan import GRID, DatasetConfig, LightPlan, basis_shape, plan_groups
+from unirender_reference.plan import LightPlan, plan_groups
 from unirender_reference.render import SceneSpec, scene_hash
 from unirender_reference.shapes import make_object
 from unirender_reference.shards import shard_name, write_shard
@@ -54,7 +55,9 @@ def test_basis_refuses_other_numbers_of_pairs(pairs: int) -> None:
         basis_shape(pairs)
 
 
-@pytest.mark.parametrize(("vary", "pairs"), [("basis", 27), ("independent", 20), ("one-at-a-time", 20), ("paper", 121)])
+@pytest.mark.parametrize(
+    ("vary", "pairs"), [("basis", 27), ("independent", 20), ("one-at-a-time", 20), ("paper", 121), ("sweep", 121)]
+)
 def test_plan_has_the_pairs_asked_for(vary: str, pairs: int, tmp_path: Path) -> None:
     groups = plan_groups(config(tmp_path, 3, pairs, vary))
     counts = Counter(group.object_seed for group in groups)
@@ -66,8 +69,9 @@ def test_plan_has_the_pairs_asked_for(vary: str, pairs: int, tmp_path: Path) -> 
             assert 1 <= len(group.lights) <= 8
             assert all(len(set(light.pairs)) == len(light.pairs) for light in group.lights)
     assert [group.index for group in groups] == list(range(len(groups)))
-    assert groups == plan_groups(config(tmp_path, 3, pairs, vary))
-    assert groups[: len(plan_groups(config(tmp_path, 2, pairs, vary)))] == plan_groups(config(tmp_path, 2, pairs, vary))
+    assert groups[:] == plan_groups(config(tmp_path, 3, pairs, vary))[:]
+    fewer = plan_groups(config(tmp_path, 2, pairs, vary))[:]
+    assert groups[: len(fewer)] == fewer
 
 
 def test_roughness_values_of_a_group_are_distinct(tmp_path: Path) -> None:
@@ -173,10 +177,16 @@ def test_every_sample_is_read_back_through_webdataset(whole: Path) -> None:
             assert float(attributes["exposure_factor"]) == light["exposure_factor"]
             assert channels_rgb(environment).shape[-1] == 3
             assert channels_rgb(read_exr_bytes(sample[f"l{index}.diffuse.exr"])[0], "diffuse").max() > 0
-            for roughness, metallic in light["pairs"]:
-                specular = read_exr_bytes(sample[f"l{index}.r{roughness:03d}.specular.exr"])[0]
-                image = read_exr_bytes(sample[f"l{index}.m{metallic:03d}_r{roughness:03d}.exr"])[0]
+            for pair in light["pairs"]:
+                r, m = round(100 * pair["roughness"]), round(100 * pair["metallic"])
+                assert pair["member"] == f"l{index}.m{m:03d}_r{r:03d}.exr"
+                assert pair["specular"] == f"l{index}.r{r:03d}.specular.exr"
+                specular, about_specular = read_exr_bytes(sample[pair["specular"]])
+                image, about_image = read_exr_bytes(sample[pair["member"]])
                 assert set(image) == set("RGBA")
+                assert (float(about_image["roughness"]), float(about_image["metallic"])) == (r / 100, m / 100)
+                assert float(about_specular["roughness"]) == r / 100
+                assert "metallic" not in about_specular
                 assert np.isfinite(channels_rgb(specular, "specular")).all()
                 pictures += 1
     assert pictures == manifest["samples"] == 12

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from synthetic_shards import group_members, write_dataset, write_shard
+from synthetic_shards import group_members, maps_members, write_dataset, write_shard
 from webdataset.compat import WebDataset
 
 from unirender.composite import composite_image
@@ -157,7 +157,7 @@ def test_metallic_of_a_mixture_needs_its_own_nodes(dataset: GroupDataset) -> Non
     assert np.abs(right - wrong).max() > 5 * 6e-3
 
 
-@pytest.mark.parametrize("vary", ["independent", "one-at-a-time", "paper"])
+@pytest.mark.parametrize("vary", ["independent", "one-at-a-time", "paper", "sweep"])
 def test_other_groups_are_flattened_to_pairs(tmp_path: Path, vary: str) -> None:
     folder = write_dataset(tmp_path, vary=vary, shards=1, lights=2, roughness=(40, 70), metallic=(0, 30))
     dataset = GroupDataset(folder)
@@ -172,6 +172,58 @@ def test_no_augmentation_gives_stored_pictures(tmp_path: Path) -> None:
     stored = {dataset.stored(g, pair)[0].tobytes() for g in range(len(dataset.keys)) for pair in dataset.pairs(g)}
     batch = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
     assert {image.permute(1, 2, 0).contiguous().numpy().tobytes() for image in batch["image"]} == stored
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> GroupDataset:
+    folder = tmp_path_factory.mktemp("maps")
+    write_shard(folder / "shard-000000.tar", {f"a{i}_g0": maps_members(16, 3, i) for i in range(2)})
+    return GroupDataset(folder)
+
+
+def test_a_group_with_maps_of_its_own_has_a_picture_for_each_light(mapped: GroupDataset) -> None:
+    assert len(mapped) == mapped.num_pairs == 2 * 3
+    for pair in mapped.pairs(0):
+        assert pair.roughness is None
+        assert pair.metallic is None
+        image, intrinsics = mapped.stored(0, pair)
+        np.testing.assert_allclose(image, composite_image(intrinsics), atol=4e-3)  # half precision
+        roughness, metallic, mask = intrinsics.require("roughness", "metallic", "mask").values()
+        assert np.ptp(roughness[mask > 0]) > 0.5
+        assert np.ptp(metallic[mask > 0]) > 0.5
+        assert not roughness[mask == 0].any()
+
+
+def test_augmentations_carry_the_maps_along(mapped: GroupDataset) -> None:
+    """Composites again, which a map left behind by a turn or a mirror would break."""
+    wrong = 0.0
+    for index in range(24):
+        maps = mapped.sample(index, 3, DEFAULT_AUGMENTATION)
+        for metallic in (maps["metallic"], maps["metallic"][:, ::-1]):
+            dielectric = (1 - metallic) * (maps["albedo"] * maps["diffuse"] + 0.04 * maps["specular"])
+            expected = (dielectric + metallic * maps["albedo"] * maps["specular"]) * maps["mask"]
+            if metallic is maps["metallic"]:
+                np.testing.assert_allclose(maps["image"], expected, atol=6e-3)
+            else:
+                wrong = max(wrong, float(np.abs(maps["image"] - expected).max()))
+    assert wrong > 5 * 6e-3
+    batch = next(iterate_batches(mapped, 6, seed=0, workers=0))
+    assert tuple(batch) == BATCH_MAPS
+    assert batch["roughness"].shape == (6, 1, 16, 16)
+
+
+def test_a_shard_whose_meshes_all_failed_is_left_out(folder: Path, tmp_path: Path) -> None:
+    grown = shutil.copytree(folder, tmp_path / "grown")
+    write_shard(grown / "shard-000007.tar", {})
+    manifest = json.loads((grown / "manifest.json").read_text())
+    manifest["shards"].append({"name": "shard-000007.tar", "sha256": "0", "groups": 0})
+    (grown / "manifest.json").write_text(json.dumps(manifest))
+    assert [path.name for path in list_shards(grown)] == [path.name for path in list_shards(folder)]
+    for path in list_shards(folder):
+        (grown / path.name).unlink()
+    (grown / "manifest.json").write_text(json.dumps({"shards": manifest["shards"][-1:]}))
+    with pytest.raises(UnirenderError, match="only shards without groups"):
+        GroupDataset(grown)
 
 
 def test_a_growing_folder(folder: Path, dataset: GroupDataset, tmp_path: Path) -> None:
@@ -226,6 +278,7 @@ def _broken(tmp_path: Path, change) -> Path:
         (lambda m: m.pop("l0.m050_r040.exr"), "full basis grid"),
         (lambda m: m.update({"l0.m050_r040.exr": b"no exr"}), "not a readable OpenEXR"),
         (lambda m: m.update({"l0.mystery.exr": b""}), "unknown member"),
+        (lambda m: m.update({"l0.maps.exr": m["l0.m050_r040.exr"]}), "is missing"),
     ],
 )
 def test_broken_groups_are_refused(tmp_path: Path, change, message: str) -> None:

@@ -34,7 +34,7 @@ from unirender.training.augment import (
     mix_lights,
     permute_channels,
 )
-from unirender.training.groups import Group, Pair, Shard, list_shards, open_packed
+from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed
 from unirender.training.presets import Augmentation
 
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
@@ -129,7 +129,7 @@ class GroupDataset:
     def stored(self, group: int, pair: Pair) -> tuple[Float[np.ndarray, "h w 3"], Intrinsics]:
         """A stored pair as it is: premultiplied linear image and intrinsics (environment at the model's size)."""
         shard, entry = self._groups[group]
-        maps = _constant_maps(_shared_maps(shard, entry), pair.metallic, pair.roughness)
+        maps = _with_material(_shared_maps(shard, entry), pair.metallic, pair.roughness)
         rows = {"image": pair.image, "specular": pair.specular, "diffuse": pair.diffuse}
         maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
         return from_maps(maps | {"environment": _trailing(shard.environment[pair.light, 0])})
@@ -163,7 +163,7 @@ class GroupDataset:
             rows = {"image": [pair.image], "specular": [pair.specular], "diffuse": [pair.diffuse]}
             environment = shard.environment[pair.light, drawn.turns][None]
         maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
-        maps = mix_lights(_constant_maps(maps, metallic, roughness), drawn.weights)
+        maps = mix_lights(_with_material(maps, metallic, roughness), drawn.weights)
         maps = quarter_turn(maps, drawn.turns)
         maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)  # stored under each quarter turn
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
@@ -246,7 +246,7 @@ def _basis(group: Group) -> _Basis:
         UnirenderError: the grid is not complete.
     """
     lights = sorted({pair.light for pair in group.pairs})
-    roughness = sorted({pair.roughness for pair in group.pairs})
+    roughness = sorted({pair.roughness for pair in group.pairs if pair.roughness is not None})
     by_node = {(pair.light, pair.roughness, pair.metallic): pair for pair in group.pairs}
     try:
         grid = [[[by_node[light, r, m] for m in METALLIC_NODES] for r in roughness] for light in lights]
@@ -271,10 +271,16 @@ def _trailing(stored: Float16[np.ndarray, "*l c h w"] | Float[np.ndarray, "*l c 
 
 def _shared_maps(shard: Shard, group: Group) -> Maps:
     shared = _trailing(shard.shared[group.shared])
-    return {"albedo": shared[..., :3], "normal": shared[..., 3:6], "mask": shared[..., 6:]}
+    maps = {"albedo": shared[..., :3], "normal": shared[..., 3:6], "mask": shared[..., 6:7]}
+    if shared.shape[-1] > SCALAR_CHANNELS:
+        maps |= {"roughness": shared[..., 7:8], "metallic": shared[..., 8:9]}
+    return maps
 
 
-def _constant_maps(maps: Maps, metallic: float, roughness: float) -> Maps:
+def _with_material(maps: Maps, metallic: float | None, roughness: float | None) -> Maps:
+    """The maps with a material that is one value over the object; None: it is in the maps already."""
+    if metallic is None or roughness is None:
+        return maps
     inside = (maps["mask"] > 0).astype(np.float32)
     return maps | {"metallic": inside * np.float32(metallic), "roughness": inside * np.float32(roughness)}
 

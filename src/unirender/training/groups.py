@@ -2,17 +2,20 @@
 
 A shard is a tar whose samples are *groups*: an object under a few lights with its materials. Members of group KEY:
 `KEY.shared.exr` (albedo, normal, mask), `KEY.l0.environment.exr`, `KEY.l0.diffuse.exr`, `KEY.l0.r030.specular.exr`,
-`KEY.l0.m050_r030.exr` (the image; metallic and roughness in percent) and `KEY.json` (with `vary`).
+`KEY.l0.m050_r030.exr` (the image; metallic and roughness in percent) and `KEY.json` (with `vary`). Where roughness and
+metallic are the object's own maps, `KEY.shared.exr` holds them too, and a light has `KEY.l0.maps.specular.exr` and
+`KEY.l0.maps.exr`.
 
 Decoding the fifty EXRs of a group takes longer than a training step, so `open_packed` decodes a shard once into three
 memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
 
     pixels.npy       float16 [n, 3, h, w]          images, s and d
-    shared.npy       float16 [groups, 7, h, w]     albedo, normal, mask
+    shared.npy       float16 [groups, 7, h, w]     albedo, normal, mask; 9 with roughness and metallic maps
     environment.npy  float32 [lights, 4, 3, 16, 32]  the light at the model's size under 0 to 3 quarter turns
     index.json       which row is what
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -23,6 +26,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float16
@@ -35,16 +39,24 @@ from unirender.training.environments import turned_environments
 PACK_VERSION = 1  # part of the cache's path: raise it when the packed layout changes
 ENVIRONMENT_SIZE = (16, 32)  # the environment that the model predicts
 
-_LIGHT = re.compile(r"l(\d+)\.(?:(environment)|(diffuse)|r(\d+)\.(specular)|m(\d+)_r(\d+))\.exr")
+SCALAR_CHANNELS = 7  # of `Shard.shared` without maps of roughness and metallic
+
+_LIGHT = re.compile(
+    r"l(?P<light>\d+)\.(?:(?P<environment>environment)|(?P<diffuse>diffuse)|(?:r(?P<level>\d+)|maps)\.(?P<specular>specular)"
+    r"|m(?P<metallic>\d+)_r(?P<roughness>\d+)|maps)\.exr"
+)
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One picture of a group and the rows of its buffers in `Shard.pixels` (`light`: row of `Shard.environment`)."""
+    """One picture of a group and the rows of its buffers in `Shard.pixels` (`light`: row of `Shard.environment`).
+
+    Metallic and roughness are both None where they are the group's maps.
+    """
 
     light: int
-    metallic: float
-    roughness: float
+    metallic: float | None
+    roughness: float | None
     image: int
     specular: int
     diffuse: int
@@ -67,7 +79,7 @@ class Shard:
     name: str
     sha256: str
     pixels: Float16[np.ndarray, "n 3 h w"]
-    shared: Float16[np.ndarray, "g 7 h w"]
+    shared: Float16[np.ndarray, "g c h w"]
     environment: Float[np.ndarray, "l 4 3 16 32"]
     groups: tuple[Group, ...]
 
@@ -75,27 +87,42 @@ class Shard:
 def list_shards(folder: str | Path) -> dict[Path, str | None]:
     """The complete shards of a data folder in order of name, each with the sha256 the manifest gives, if it lists it.
 
-    Works while shards are still being written: a shard gets its `.tar` name when it is complete.
+    Works while shards are still being written: a shard gets its `.tar` name when it is complete. A shard in which every
+    mesh file failed, so that the manifest gives it no groups, is left out.
 
     Raises:
         UnirenderError: there is none, or one that the manifest lists is missing.
     """
     folder = Path(folder)
     listed: dict[str, str] = {}
+    empty: set[str] = set()
     manifest = folder / "manifest.json"
     if manifest.exists():
         try:
-            entries = json.loads(manifest.read_text())["shards"]
+            journal = _journal_entries(folder / "shards.jsonl")  # first: the manifest takes its lines over
+            entries = journal + json.loads(manifest.read_text())["shards"]
             listed = {entry["name"]: entry["sha256"] for entry in entries}
+            empty = {entry["name"] for entry in entries if entry.get("groups") == 0}
         except (ValueError, KeyError, TypeError) as error:
             raise UnirenderError(f"{manifest}: not a readable manifest ({error!r}); remake the dataset") from error
     present = {path.name: path for path in sorted(folder.glob("*.tar"))}
     missing = sorted(set(listed) - set(present))
     if missing:
         raise UnirenderError(f"{folder}: shards {', '.join(missing)} of the manifest are missing; remake the dataset")
-    if not present:
-        raise UnirenderError(f"{folder}: no .tar shard found, expected a folder written by `unirender dataset`")
-    return {path: listed.get(name) for name, path in present.items()}
+    if not present or empty.issuperset(present):
+        found = "only shards without groups" if present else "no .tar shard found"
+        raise UnirenderError(f"{folder}: {found}, expected a folder written by `unirender dataset`")
+    return {path: listed.get(name) for name, path in present.items() if name not in empty}
+
+
+def _journal_entries(path: Path) -> list[dict[str, Any]]:
+    """What a run that is writing has to add to its manifest, a line for each shard; one cut short does not count."""
+    entries = []
+    with contextlib.suppress(FileNotFoundError):
+        for line in path.read_text().splitlines():
+            with contextlib.suppress(json.JSONDecodeError):
+                entries.append(json.loads(line))
+    return entries
 
 
 def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
@@ -200,7 +227,7 @@ class _Packer:
     def add(self, key: str, members: dict[str, bytes]) -> Group:
         where = f"{self.path}: group {key}"
         rows: dict[tuple, int] = {}
-        images: list[tuple[int, int, int]] = []  # light, metallic, roughness in percent
+        images: list[tuple[int, int | None, int | None]] = []  # light, metallic, roughness in percent
         lights: dict[int, int] = {}
         for name in sorted(members):
             if name in ("json", "shared.exr"):
@@ -208,33 +235,34 @@ class _Packer:
             match = _LIGHT.fullmatch(name)
             if match is None:
                 raise UnirenderError(f"{where}: unknown member {name!r}; was it written by another version?")
-            light = int(match[1])
+            light = int(match["light"])
             channels, _ = read_exr_bytes(members[name], name=f"{where}.{name}")
-            if match[2]:
+            if match["environment"]:
                 turned = turned_environments(channels_rgb(channels), ENVIRONMENT_SIZE)
                 lights[light] = len(self.environment)
                 self.environment.append(np.ascontiguousarray(np.moveaxis(turned, -1, 1)))
-            elif match[3]:
+            elif match["diffuse"]:
                 rows[light, "diffuse"] = self._row(channels, name, "diffuse")
-            elif match[5]:
-                rows[light, "specular", int(match[4])] = self._row(channels, name, "specular")
+            elif match["specular"]:
+                rows[light, "specular", _percent(match["level"])] = self._row(channels, name, "specular")
             else:
-                image = (light, int(match[6]), int(match[7]))
+                image = (light, _percent(match["metallic"]), _percent(match["roughness"]))
                 rows[image] = self._row(channels, name, "")
                 images.append(image)
+        own_maps = any(metallic is None for _, metallic, _ in images)
         try:
             vary = json.loads(members["json"])["vary"]
             shared, _ = read_exr_bytes(members["shared.exr"], name=f"{where}.shared.exr")
             pairs = tuple(
                 Pair(
                     light=lights[light],
-                    metallic=metallic / 100,
-                    roughness=roughness / 100,
+                    metallic=None if metallic is None else metallic / 100,
+                    roughness=None if roughness is None else roughness / 100,
                     image=rows[light, metallic, roughness],
                     specular=rows[light, "specular", roughness],
                     diffuse=rows[light, "diffuse"],
                 )
-                for light, metallic, roughness in sorted(images)
+                for light, metallic, roughness in sorted(images, key=lambda image: tuple(part or 0 for part in image))
             )
         except KeyError as error:
             raise UnirenderError(f"{where}: member or entry {error} is missing; remake the dataset") from error
@@ -243,6 +271,8 @@ class _Packer:
             channels_rgb(shared, "normal", "XYZ"),
             channels_rgb(shared, "mask", "Y"),
         ]
+        if own_maps:
+            maps += [channels_rgb(shared, "roughness", "Y"), channels_rgb(shared, "metallic", "Y")]
         self.shared.append(np.moveaxis(np.concatenate(maps, axis=-1), -1, 0).astype(np.float16))
         return Group(key=key, vary=vary, shared=len(self.shared) - 1, pairs=pairs)
 
@@ -258,3 +288,7 @@ class _Packer:
         if len(sizes) != 1:
             raise UnirenderError(f"{self.path}: pictures have sizes {sorted(sizes)}, expected one size")
         return np.stack(rows)
+
+
+def _percent(digits: str | None) -> int | None:
+    return None if digits is None else int(digits)

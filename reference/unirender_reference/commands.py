@@ -1,0 +1,189 @@
+"""`unirender dataset`. Light to import: what renders is loaded when the command runs."""
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from unirender.errors import UnirenderError, UsageError
+
+if TYPE_CHECKING:
+    from unirender_reference.dataset import GenerateReport
+    from unirender_reference.dataset_config import DatasetConfig
+
+SHOWN_FAILURES = 20
+SHOWN_LIGHTS = 5
+DEFAULT_PAIRS = {"paper": 121, "sweep": 121}
+OTHER_PAIRS, PAIRS_OF_MAPS = 36, 8
+
+_log = logging.getLogger("unirender.dataset")
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Render a training set with Mitsuba: WebDataset shards, resumable by running the same command again.
+
+    The exit status is 1 where mesh files failed: each is listed with its reason, and the others are there.
+    """
+
+    out: Path
+    """Folder for the shards and `manifest.json`."""
+    objects: int | None = None
+    """How many objects. None: 20 procedural ones, or all meshes."""
+    meshes: str | None = None
+    """A folder of .glb, .gltf, .obj or .ply files (searched recursively) or a quoted glob, instead of procedural
+    objects."""
+    holdout: int = 0
+    """Every N-th mesh file, in order of name, belongs to `--split test`, the others to `--split train`. 0: all files
+    belong to the split asked for."""
+    pairs: int | None = None
+    """Pairs an object. basis: 3 x lights x roughness values, so a multiple of 3. None: 36; 121 with paper and sweep, 8
+    with --materials maps."""
+    resolution: int = 64
+    """Pixels along each side."""
+    vary: Literal["basis", "independent", "one-at-a-time", "paper", "sweep"] | None = None
+    """What changes inside a group. paper: metallic x roughness on an 11 x 11 grid, a light each; sweep: the same grid
+    under one light, from 33 renders. None: basis; independent with --materials maps."""
+    materials: Literal["scalar", "maps"] = "scalar"
+    """scalar: one roughness and metallic per picture, whatever the object has; maps: the object's own maps, each pair
+    under another light."""
+    split: Literal["train", "test"] = "train"
+    """Seeds, object families and lights of this side only."""
+    seed: int = 0
+    """First seed."""
+    spp: int = 64
+    """Samples per pixel of an image; with --noise-floor, to begin with."""
+    noise_floor: float | None = None
+    """Add samples to each image, s and d until a noise-free prediction would score this many dB against it (masked
+    sRGB PSNR). Not with --vary sweep."""
+    denoise: bool = False
+    """Denoise images, s and d with Open Image Denoise. They are marked; not with --split test."""
+    lights: Path | None = None
+    """A folder of your HDR maps and photographs to draw lights from."""
+    light_share: float = 0.5
+    """Share of the lights drawn from --lights, the others are built in; 1: only yours."""
+    light_holdout: int = 8
+    """Every N-th place in --lights, in order of name, belongs to --split test, the others to --split train."""
+    turn_lights: bool = True
+    """Turn, mirror and sometimes tilt what is drawn from --lights at random. Off: as the files are."""
+    light_height: int = 64
+    """Rows of the maps drawn from --lights. More shows in mirror-like materials from 256 pixels on."""
+    workers: int = 0
+    """Processes; 0: one for each core."""
+    cluster: str | None = None
+    """Render on a cluster instead: tcp://HOST:PORT of a dask scheduler, slurm, or slurm:JOBS."""
+    verify: bool = False
+    """Compare every byte of the shards that are there with its sha256; else of the last four, and of the others the
+    size."""
+
+    def check(self) -> "DatasetConfig":
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range, or options contradict each other.
+        """
+        from unirender_reference.dataset_config import DatasetConfig
+
+        if self.cluster is not None and self.workers:
+            raise UsageError(f"--workers {self.workers}: expected none with --cluster, whose workers are its own")
+        vary = self.vary or ("independent" if self.materials == "maps" else "basis")
+        pairs = DEFAULT_PAIRS.get(vary, PAIRS_OF_MAPS if self.materials == "maps" else OTHER_PAIRS)
+        try:
+            if self.cluster is not None:
+                from unirender_reference.cluster import check_address
+
+                check_address(self.cluster)
+            return DatasetConfig(
+                objects=self.objects,
+                pairs=pairs if self.pairs is None else self.pairs,
+                resolution=self.resolution,
+                vary=vary,
+                out=self.out,
+                seed=self.seed,
+                split=self.split,
+                spp=self.spp,
+                workers=self.workers,
+                meshes=self.meshes,
+                holdout=self.holdout,
+                materials=self.materials,
+                noise_floor=self.noise_floor,
+                denoise=self.denoise,
+                lights=self.lights,
+                light_share=self.light_share,
+                light_holdout=self.light_holdout,
+                turn_lights=self.turn_lights,
+                light_height=self.light_height,
+                cluster=self.cluster,
+            )
+        except UnirenderError as error:
+            raise UsageError(str(error)) from error
+
+    def run(self) -> int:
+        """Renders what is missing; returns the exit status: 1 if mesh files failed, now or earlier."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from unirender_reference.dataset import generate
+        from unirender_reference.dataset_config import MOST_SPP
+
+        config = self.check()
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        console = Console(stderr=True)
+        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task("groups", total=None, visible=False)  # until there is something to do
+            report = generate(
+                config,
+                lambda done, total: bar.update(task, completed=done, total=total, visible=True),
+                verify=self.verify,
+            )
+        print(self._summary(report))
+        if report.floor is not None:
+            floor = report.floor
+            print(
+                f"noise floor {self.noise_floor:g} dB: reached by {floor.reached} of {floor.buffers} images, s and d; "
+                f"the lowest is at {floor.minimum_db:.1f} dB"
+            )
+            if floor.reached < floor.buffers:
+                _log.warning(
+                    "%d images, s and d did not reach the noise floor with the %d samples per pixel at which sampling "
+                    "ends; the json of each group says which, and what they reached",
+                    floor.buffers - floor.reached,
+                    MOST_SPP,
+                )
+        if config.vary == "sweep":
+            print(
+                f"{report.negative_pixels} pixels of interpolated pictures have a channel below 0: their noise is "
+                "unbiased and not clipped"
+            )
+        for line in report.unreadable_lights[:SHOWN_LIGHTS]:
+            _log.warning("no light: %s", line)
+        if report.unreadable_lights:
+            _log.warning(
+                "%d files of --lights are no lights, and others were drawn instead; all are listed with reasons in %s",
+                len(report.unreadable_lights),
+                self.out / "manifest.json",
+            )
+        for failure in report.failures[:SHOWN_FAILURES]:
+            _log.warning("%s: %s", failure.file, failure.reason)
+        if report.failures:
+            files = len({failure.file for failure in report.failures})
+            _log.warning("%d files failed; all are listed with reasons in %s", files, self.out / "failures.jsonl")
+        if again := {failure.file for failure in report.failures if failure.machine}:
+            _log.warning(
+                "%d of them lacked time or memory, or their worker died; the same command tries these again",
+                len(again),
+            )
+        return 1 if report.failures else 0
+
+    def _summary(self, report: "GenerateReport") -> str:
+        if report.workers == 0:
+            return (
+                f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"
+            )
+        overhead = f"{report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers)"
+        return (
+            f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
+            f"workers, {overhead if report.render_seconds else 'nothing rendered'}; "
+            f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
+            f"manifest {report.manifest_sha256[:12]}"
+        )

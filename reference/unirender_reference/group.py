@@ -1,0 +1,88 @@
+"""Renders one group, as a worker of `dataset` does: loads object and lights, and blames the file that fails."""
+
+import dataclasses
+import functools
+import time
+
+from unirender.errors import UnirenderError
+from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.faults import FileNotSeen, ObjectFault, blamed_on
+from unirender_reference.lights import Light, LightPool, make_light
+from unirender_reference.members import GroupMembers
+from unirender_reference.plan import GroupPlan
+from unirender_reference.processes import time_limit
+from unirender_reference.render import Renderer
+from unirender_reference.shapes import MeshObject, make_object
+from unirender_reference.shards import RenderedGroup
+
+LOAD_SECONDS = 600.0
+
+
+def render(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
+    """Renders and encodes one group; a pure function of its arguments (and of the files that they name).
+
+    Raises:
+        FileFailure: the object is a file, and it cannot be loaded or rendered.
+        FileNotSeen: this process does not see that file.
+        UnirenderError: anything else went wrong.
+    """
+    start = time.perf_counter()
+    pool = user_lights(config)
+    lights = [make_light(light.seed, config.split, pool) for light in plan.lights]
+    with blamed_on(plan.mesh, ObjectFault):
+        with time_limit(LOAD_SECONDS, "loading it"):
+            renderer = Renderer(_load(config, plan), resolution=config.resolution)
+        group = GroupMembers(config, plan, renderer)
+        group.render(lights)
+    return RenderedGroup(
+        key=f"{renderer.obj.name}_g{plan.number}",
+        members=group.members,
+        samples=plan.samples,
+        nan_pixels=renderer.counters.nan_pixels,
+        render_seconds=renderer.counters.render_seconds,
+        seconds=time.perf_counter() - start,
+        floor=group.floor_count(),
+        negative_pixels=group.negative_pixels,
+        unreadable_lights=tuple(sorted({line for light in lights for line in _skipped(light)})),
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def user_lights(config: DatasetConfig) -> LightPool | None:
+    """The user's lights; their folder is listed once in a process and configuration (`lights_digest` is part of it).
+
+    Raises:
+        UnirenderError: the folder has other files here than where the data set is written.
+    """
+    pool = config.light_pool()
+    if pool is not None and config.lights_digest not in (None, pool.digest):
+        raise UnirenderError(
+            f"lights {config.lights}: other files, or other sizes, than when the command was started, expected the "
+            "same on all machines as long as it runs; run the same command again"
+        )
+    return pool
+
+
+def _skipped(light: Light) -> list[str]:
+    """The files that a draw of this light passed over, with reasons."""
+    return light.provenance.get("skipped", "").splitlines()
+
+
+def _load(config: DatasetConfig, plan: GroupPlan) -> MeshObject:
+    """The group's object; its own roughness and metallic are left out where the pictures choose them."""
+    own_maps = config.materials == "maps"
+    if plan.mesh is None:
+        return make_object(plan.object_seed, config.split, maps=own_maps)
+    from unirender_reference.meshes import load_mesh
+
+    with blamed_on(plan.mesh, UnirenderError, OSError):
+        if not plan.mesh.path.is_file():
+            raise FileNotSeen(f"mesh {plan.mesh.path}: no such file for the process that was to render it")
+        obj = load_mesh(plan.mesh.path, root=plan.mesh.folder)
+    provenance = {**obj.provenance, "file": plan.mesh.name}
+    obj = dataclasses.replace(obj, name=plan.mesh.key, provenance=provenance)
+    if not own_maps:
+        return dataclasses.replace(obj, roughness=None, metallic=None)
+    if obj.roughness is None or obj.metallic is None:
+        raise ObjectFault("has no roughness and metallic of its own, which --materials maps needs; use scalar")
+    return obj
