@@ -10,11 +10,12 @@ from unirender.exposure import exposure_factor
 from unirender.exr import channels_rgb, read_exr_bytes
 from unirender.training.augment import Draw, mirror, mix_lights, permute_channels, quarter_turn, turn_rotation
 from unirender.training.data import GroupDataset
-from unirender_reference.dataset import RenderedGroup, render_group
-from unirender_reference.plan import DatasetConfig, plan_groups
+from unirender_reference.dataset import render_group
+from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.plan import plan_groups
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
-from unirender_reference.shards import write_shard
+from unirender_reference.shards import RenderedGroup, write_shard
 
 SPP = 1024
 DRAWN = Draw(
