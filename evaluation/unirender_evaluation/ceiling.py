@@ -9,21 +9,11 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
-from unirender.color import unpremultiply
+from unirender.color import display_slope, unpremultiply
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.metrics import METRICS, Variant, metric_key, psnr_from_mse
-
-
-def display_slope(linear: Float[np.ndarray, "h w c"], space: str) -> Float[np.ndarray, "h w c"]:
-    """Derivative of the display transform (`clip`, then sRGB for space "srgb"): 0 where the display clips."""
-    x = np.asarray(linear, np.float64)
-    if space == "srgb":
-        slope = np.where(x <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))
-    else:
-        slope = np.ones_like(x)
-    return np.where((x < 0) | (x > 1), 0.0, slope)
+from unirender_reference.noise import masked_noise_mse
 
 
 def noise_mse(mean: Image, variance: Image, mask: Mask, variant: Variant, premultiplied: bool) -> float:
@@ -36,11 +26,8 @@ def noise_mse(mean: Image, variance: Image, mask: Mask, variant: Variant, premul
         variant: mask and space are used.
         premultiplied: whether `mean` is.
     """
-    coverage = np.maximum(mask, 1e-6)
     if variant.mask == "masked":
-        scale = coverage if premultiplied else 1.0
-        error = display_slope(mean / scale, variant.space) ** 2 * variance / np.square(scale)
-        return float(np.sum(mask * error) / (error.shape[-1] * np.sum(mask)))
+        return masked_noise_mse(mean, variance, mask, premultiplied, variant.space)
     frame, spread = (mean, variance) if premultiplied else (mean * mask, variance * np.square(mask))
     return float(np.mean(display_slope(frame + 1 - mask, variant.space) ** 2 * spread))
 

@@ -11,7 +11,7 @@ error everywhere), where the pixels but not their three channels count as indepe
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -163,15 +163,6 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     yield TruthCheck(tuple(checks), twin, seed, tuple(others), tuple(geometry), geometry_twins)
 
 
-def share_bar(pixels: int, alpha: float) -> float:
-    """The least pass share of a member: the suite-wide `PASS_SHARE`, or less where few pixels scatter further."""
-    from scipy.stats import binom
-
-    from unirender_reference.statistics import LEVEL, PASS_SHARE
-
-    return min(PASS_SHARE, 1 - float(binom.isf(alpha, pixels, LEVEL)) / pixels)
-
-
 def member_test(
     mean_a: Float[np.ndarray, "h w 3"],
     variance_a: Float[np.ndarray, "h w 3"],
@@ -183,9 +174,7 @@ def member_test(
     """z-test of (mean, variance, mean, variance) with a chance of a false alarm of at most `alpha` in all."""
     from unirender_reference.statistics import z_test
 
-    test = z_test(mean_a, variance_a, mean_b, variance_b, mask, rounding=HALF_ROUNDING, alpha=alpha / 2)
-    bar = share_bar(test.values // 3, alpha / 2)
-    return replace(test, passed=bool(test.min_p >= test.threshold and test.pass_share >= bar))
+    return z_test(mean_a, variance_a, mean_b, variance_b, mask, rounding=HALF_ROUNDING, alpha=alpha / 2)
 
 
 def _samples(suite: Suite, member: str) -> int:

@@ -24,14 +24,8 @@ from unirender_evaluation.truth_file import (
     specular_member,
     write_tar,
 )
-from unirender_evaluation.truth_render import (
-    TruthBuffer,
-    good_spp,
-    item_seed,
-    render_once,
-    render_to_ceiling,
-    stored_ceiling_db,
-)
+from unirender_evaluation.truth_render import good_spp, item_seed, render_to_ceiling, stored_ceiling_db
+from unirender_reference.noise import noise_floor_db
 
 PART = "part.json"
 Environment = Float[np.ndarray, "eh ew 3"]
@@ -98,13 +92,15 @@ def render_object(job: ObjectJob) -> Path:
             found, channels = render_to_ceiling(buffer.render, mask, spec, first, buffer.kind)
             ceiling = stored_ceiling_db(channels, mask, buffer.kind)
             quality[buffer.name] = {"spp": found.spp, "ceiling_db": round(ceiling, 3), "nan_pixels": found.nan_pixels}
-            made = _made(buffer, found, ceiling, first)
+            made = _made(buffer, found.spp, found.nan_pixels, ceiling, first)
             members[buffer.name] = exr_bytes(channels, attributes={**header, **made})
             if twins and buffer.has_twin:
                 spp, other = good_spp(spec.ceiling_factor * found.spp, spec), item_seed(spec.name, CEILING, buffer.name)
-                twin = render_once(buffer.render, mask, spp, other, buffer.kind)
-                channels = estimate_channels(buffer.kind, twin.mean, None, mask)
-                made = _made(buffer, twin, twin.ceiling_db, other)
+                twin = buffer.render(spp, other)
+                mean, variance = (x[..., :3].astype(np.float64) for x in (twin.mean, twin.variance))
+                channels = estimate_channels(buffer.kind, mean, None, mask)
+                ceiling = noise_floor_db(mean, variance, mask, buffer.kind == "image")
+                made = _made(buffer, spp, twin.nan_pixels, ceiling, other)
                 members[CEILING + buffer.name] = exr_bytes(channels, attributes={**header, **made})
     shared = {**header, "spp": str(spec.geometry_spp), "seed": str(seed)}
     shared["scene"] = shared_scene_hash(h for own in hashes.values() for h in own)
@@ -178,12 +174,12 @@ def _buffers(
         yield _Buffer(image_member(scene.key, (m, r)), "image", image, attributes, (m, r) in (spec.base, *spec.edits))
 
 
-def _made(buffer: _Buffer, found: TruthBuffer, ceiling_db: float, seed: int) -> dict[str, str]:
+def _made(buffer: _Buffer, spp: int, nan_pixels: int, ceiling_db: float, seed: int) -> dict[str, str]:
     """The attributes of a member that tell one render from another."""
     return {
         **buffer.attributes,
-        "spp": str(found.spp),
+        "spp": str(spp),
         "seed": str(seed),
-        "nan_pixels": str(found.nan_pixels),
+        "nan_pixels": str(nan_pixels),
         "noise_ceiling_db": f"{ceiling_db:.3f}",
     }

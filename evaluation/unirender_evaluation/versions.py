@@ -56,6 +56,36 @@ COMMANDS = (
 )
 FROM_RECORDS = ("claims", "comparisons", "protocol", "published", "readme", "statistics", "table*", "verdict")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
+# What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
+NOT_IN_RECORDS = (
+    "adaptive*",
+    "checks/*",
+    "cluster",
+    "commands",
+    "dataset*",
+    "denoise",
+    "effects",
+    "faults",
+    "folder_lock",
+    "group",
+    "journal",
+    "lights/summary",
+    "lights/twins",
+    "lobes",
+    "measure/*",
+    "members",
+    "mesh_folder",
+    "meshes/*",
+    "plan",
+    "principled",
+    "processes",
+    "resume",
+    "shards",
+    "sheets",
+    "sweep*",
+    "versions",
+    "workers",
+)
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
@@ -69,7 +99,7 @@ PARTS: Mapping[str, Part] = {
     REFERENCE: Part(
         {"unirender_reference": ("**/*.py", "data/**/*.*")},
         ("mitsuba", "drjit", "karellen-llvm-core"),
-        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in ("dataset", "plan", "processes", "shards"))),
+        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in NOT_IN_RECORDS)),
         ("UNIRENDER_MITSUBA_VARIANT",),
     ),
 }
