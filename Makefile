@@ -11,7 +11,7 @@
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 PIP_ARGS ?=
 BENCH_ARGS ?=
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n auto
 SUITE ?= tiny
 OUT ?= results
 

@@ -14,15 +14,19 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import notice, usage
+from unirender.options import notice
 from unirender.training.run import Train
 from unirender_evaluation.commands import Bench
+from unirender_reference.commands import Dataset
+from unirender_reference.measure.commands import Reference
+from unirender_reference.measure.lights import Lights
+from unirender_reference.measure.meshes import Meshes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,67 +64,6 @@ class Doctor:
         return 1 if any(row[2] == "error" for row in rows) else 0
 
 
-@dataclass(frozen=True)
-class Dataset:
-    """Render a training set with Mitsuba: WebDataset shards, resumable by running the same command again."""
-
-    out: Path
-    """Folder for the shards and `manifest.json`."""
-    objects: int = 20
-    """Procedural objects; each is one group."""
-    pairs: int = 36
-    """Pairs an object. basis: 3 x lights x roughness values, so a multiple of 3; paper: 121."""
-    resolution: int = 64
-    """Pixels along each side."""
-    vary: Literal["basis", "independent", "one-at-a-time", "paper"] = "basis"
-    """What changes inside a group."""
-    split: Literal["train", "test"] = "train"
-    """Seeds, object families and lights of this side only."""
-    seed: int = 0
-    """First seed."""
-    spp: int = 64
-    """Samples per pixel of an image."""
-    workers: int = 0
-    """Processes; 0: one for each core."""
-
-    def run(self) -> int:
-        """Renders what is missing; returns the exit status."""
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        from unirender_reference.dataset import generate
-        from unirender_reference.plan import DatasetConfig
-
-        with usage():
-            config = DatasetConfig(
-                objects=self.objects,
-                pairs=self.pairs,
-                resolution=self.resolution,
-                vary=self.vary,
-                out=self.out,
-                seed=self.seed,
-                split=self.split,
-                spp=self.spp,
-                workers=self.workers,
-            )
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task("groups", total=None, visible=False)  # until there is something to do
-            report = generate(config, lambda done, total: bar.update(task, completed=done, total=total, visible=True))
-        if report.groups == 0:
-            print(
-                f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"
-            )
-            return 0
-        print(
-            f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
-            f"workers, {report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers); "
-            f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
-            f"manifest {report.manifest_sha256[:12]}"
-        )
-        return 0
-
-
 Command = (
     Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Decompose, tyro.conf.subcommand("decompose")]
@@ -128,6 +71,9 @@ Command = (
     | Annotated[Edit, tyro.conf.subcommand("edit")]
     | Annotated[Relight, tyro.conf.subcommand("relight")]
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
+    | Annotated[Lights, tyro.conf.subcommand("lights")]
+    | Annotated[Meshes, tyro.conf.subcommand("meshes")]
+    | Annotated[Reference, tyro.conf.subcommand("reference")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
