@@ -154,8 +154,8 @@ def test_mixture_of_tinted_lights(renderer: Renderer, key: dict[str, Estimate]) 
 
 
 def test_metallic_between_the_nodes(renderer: Renderer) -> None:
-    nodes = [_rgb(renderer.image(KEY, ROUGHNESS, m, 4 * SPP, seed=10 + i)) for i, m in enumerate(METALLIC_NODES)]
-    truth = _rgb(renderer.image(KEY, ROUGHNESS, 0.3, 4 * SPP, seed=20))
+    nodes = [_rgb(renderer.image(KEY, ROUGHNESS, m, 8 * SPP, seed=10 + i)) for i, m in enumerate(METALLIC_NODES)]
+    truth = _rgb(renderer.image(KEY, ROUGHNESS, 0.3, 8 * SPP, seed=20))
     mask = renderer.geometry(1024, seed=4).require("mask")["mask"]
     means = np.stack([node.mean for node in nodes])
     variance = np.sum([w**2 * np.asarray(n.variance) for w, n in zip(_weights(0.3), nodes, strict=True)], axis=0)
