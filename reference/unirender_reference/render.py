@@ -52,7 +52,7 @@ IMAGE_DEPTH = 4
 DIRECT_DEPTH = 2
 GEOMETRY_SPP = 256
 LARGE = 128  # pixels along a side; above, edges are a small part of the picture
-LARGE_GEOMETRY_SPP = 36  # in few passes as noisy at edges as the image's own alpha of 64 samples in 8
+LARGE_GEOMETRY_SPP = 25  # one jittered 5 x 5 grid: coverage to about 1/25
 
 
 class Renderer:
@@ -187,7 +187,7 @@ def renderer_of(spec: SceneSpec, renderer: Renderer | None = None) -> Renderer:
 def geometry_spp(resolution: int, spp: int) -> int:
     """Camera rays per pixel for the geometry of a sample whose image takes `spp`.
 
-    Up to `LARGE` pixels at least `GEOMETRY_SPP`; above, so many that they take about 3 % of the time of the renders.
+    Up to `LARGE` pixels at least `GEOMETRY_SPP`; above, so many that they take about 3 % of the time of 64-sample renders.
     """
     if resolution <= LARGE:
         return max(GEOMETRY_SPP, spp)
