@@ -271,7 +271,8 @@ def derive_seed(*parts: int | str) -> int:
 
 def _render(scene: Any, integrator: Any, spp: int, seed: int, counters: Counters) -> Float[np.ndarray, "h w c"]:
     start = time.perf_counter()
-    picture = np.array(mitsuba().render(scene, integrator=integrator, spp=spp, seed=seed), dtype=np.float32)
+    rendered = mitsuba().render(scene, integrator=integrator, spp=spp, seed=seed)
+    picture = np.asarray(rendered, dtype=np.float32)  # waits for the render; on the CPU a view of its memory
     counters.render_seconds += time.perf_counter() - start
     counters.renders += 1
     return picture
