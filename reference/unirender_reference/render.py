@@ -187,7 +187,8 @@ def renderer_of(spec: SceneSpec, renderer: Renderer | None = None) -> Renderer:
 def geometry_spp(resolution: int, spp: int) -> int:
     """Camera rays per pixel for the geometry of a sample whose image takes `spp`.
 
-    Up to `LARGE` pixels at least `GEOMETRY_SPP`; above, so many that they take about 3 % of the time of 64-sample renders.
+    Up to `LARGE` pixels at least `GEOMETRY_SPP`; above, so many that they take about 3 % of the time of renders of 64
+    samples.
     """
     if resolution <= LARGE:
         return max(GEOMETRY_SPP, spp)
