@@ -39,6 +39,8 @@ napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 default_role = "literal"
+# A type in a signature may have the name of something else, too: `object`, a field of commands, is also a type.
+suppress_warnings = ["ref.python"]
 
 RESULTS = Path(__file__).parents[1] / "evaluation" / "results"
 

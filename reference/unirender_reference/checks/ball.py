@@ -88,7 +88,7 @@ class BallView:
 
 @functools.lru_cache(maxsize=8)
 def ball_view(camera: Camera, resolution: int, fine: int) -> BallView:
-    """The sphere through `fine`^2 rays on a regular grid in each pixel."""
+    """The sphere through `fine * fine` rays on a regular grid in each pixel."""
     size = resolution * fine
     rays = camera.rays(size, size).astype(np.float64)
     rays = rays.reshape(resolution, fine, resolution, fine, 3).swapaxes(1, 2).reshape(resolution, resolution, -1, 3)
