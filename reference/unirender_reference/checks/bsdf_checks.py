@@ -60,7 +60,7 @@ def bsdf_gradients(seed: int) -> Check:
         scale = np.maximum(values.max(axis=-1) / roughness, 1e-9)
         parameters = mi.traverse(bsdf)
         for name, ours in slopes.items():
-            key = next(k for k in parameters.keys() if k.split(".")[-2] == name)  # noqa: SIM118
+            key = next(k for k in parameters.keys() if k.split(".")[-2] == name)  # noqa: SIM118 - iterating gives pairs
             parameter = parameters[key]
             dr.enable_grad(parameter)
             dr.set_grad(parameter, 1.0)
