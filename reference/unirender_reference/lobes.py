@@ -114,6 +114,9 @@ def render_lobes(
         seed: equal seeds give equal buffers.
         batches: passes that the variance is taken from.
         weighting: see `Lobes`.
+
+    Raises:
+        UnirenderError: `weighting` is neither of the two, or as `Renderer.image`.
     """
     material: dict[str, float | None] = {"roughness": roughness}
     if weighting not in ("object", "plain"):
@@ -150,12 +153,14 @@ def compose(
         The image (h, w, 3) and its variance, from the variances of the buffers.
 
     Raises:
-        UnirenderError: a value is missing, or given where the buffers hold it already; metallic lies outside [0, 1].
+        UnirenderError: a value is missing, or given where the buffers hold it already; albedo or metallic lie outside
+            [0, 1].
     """
-    if metallic is not None and not (np.min(metallic) >= 0 and np.max(metallic) <= 1):
-        raise UnirenderError(
-            f"compose: got metallic in [{np.min(metallic):.4g}, {np.max(metallic):.4g}], expected values in [0, 1]"
-        )
+    for name, value in (("albedo", albedo), ("metallic", metallic)):
+        if value is not None and not (np.min(value) >= 0 and np.max(value) <= 1):
+            raise UnirenderError(
+                f"compose: got {name} in [{np.min(value):.4g}, {np.max(value):.4g}], expected values in [0, 1]"
+            )
     if lobes.weighting == "plain":
         if albedo is None or metallic is None:
             raise UnirenderError("compose: plain buffers hold no material; give albedo and metallic")

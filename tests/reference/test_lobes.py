@@ -213,13 +213,16 @@ def test_compose_says_what_is_missing_or_held_already() -> None:
         compose(Lobes(parts, "object", None), metallic=0.5)
 
 
-def test_metallic_of_a_composition_is_checked() -> None:
+def test_the_material_of_a_composition_is_checked() -> None:
     lobe = Lobe(Estimate(np.ones((2, 2, 3), np.float32), None), np.ones((2, 2, 3), np.float32), None)
     parts = dict.fromkeys(LOBES, lobe)
     base, each = np.full(3, 0.5, np.float32), np.full((2, 2, 1), 0.5, np.float32)
     for wrong in (3.0, -0.1, float("nan"), each - 0.6):
         with pytest.raises(UnirenderError, match=r"metallic in \[.*expected values in \[0, 1\]"):
             compose(Lobes(parts, "plain", None), base, wrong)
+    for wrong in (base + 1.5, base - 0.6):
+        with pytest.raises(UnirenderError, match=r"albedo in \[.*expected values in \[0, 1\]"):
+            compose(Lobes(parts, "plain", None), wrong, 0.5)
     with pytest.raises(UnirenderError, match=r"shape \(2, 2, 1\).*expected one value"):
         compose(Lobes(parts, "object", 0.5), metallic=each)
     plain = compose(Lobes(parts, "plain", None), base, each).mean
