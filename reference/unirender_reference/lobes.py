@@ -34,6 +34,7 @@ from unirender_reference.integrators import path_integrator, python_integrator
 from unirender_reference.passes import (
     TRUTH_BATCHES,
     Estimate,
+    channels,
     derive_seed,
     integrator_passes,
     mean_estimate,
@@ -206,8 +207,8 @@ def _weighted_direct(surface: Any, color: tuple[int, int], metallic: tuple[int, 
     return python_integrator(radiance, [f"weight.{component}" for component in "RGB"])
 
 
-def _lobe(passes: Float[np.ndarray, "n h w 7"], nan_pixels: int, batches: int) -> Lobe:
-    light, weight = passes[..., :3], passes[..., 4:]
+def _lobe(passes: list[Float[np.ndarray, "h w 7"]], nan_pixels: int, batches: int) -> Lobe:
+    light, weight = channels(passes, slice(0, 3)), channels(passes, slice(4, 7))
     return Lobe(
         buffer=weighted_estimate(light, weight, nan_pixels, batches),
         weight=mean_estimate(weight, nan_pixels, 1).mean,

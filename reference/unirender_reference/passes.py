@@ -10,7 +10,7 @@ import hashlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,8 @@ PIXELS_PER_BLOCK = 1 << 13
 MOST_KEPT = 32  # passes, or means of groups of them, in memory
 PIXELS_KEPT = 1 << 25  # in memory, of all of them: of pictures above 1024 x 1024 fewer than `MOST_KEPT` are kept
 MOST_SPLITS = 8  # passes to make of one that is no full grid: small passes are hardly stratified
+
+Picture = Float[np.ndarray, "h w c"]
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Counters:
 
 def render_passes(
     scene: Any, depth: int, spp: int, seed: int, batches: int, counters: Counters
-) -> tuple[Float[np.ndarray, "n h w 4"], int]:
+) -> tuple[list[Float[np.ndarray, "h w 4"]], int]:
     """Premultiplied RGBA passes of path tracing at `depth`, the environment hidden; arguments as `integrator_passes`.
 
     Depth 2 is one bounce, direct light; depth 4 is three bounces.
@@ -67,7 +69,7 @@ def render_passes(
 
 def integrator_passes(
     scene: Any, integrator: Any, spp: int, seed: int, batches: int, counters: Counters
-) -> tuple[Float[np.ndarray, "n h w c"], int]:
+) -> tuple[list[Picture], int]:
     """At least `batches` passes of any Mitsuba integrator, each an `mi.render` with its own seed.
 
     Where there are more than `kept_passes` allows, what comes back are the means of groups of as many passes each.
@@ -100,27 +102,22 @@ def integrator_passes(
     return kept, counters.nan_pixels - before
 
 
-def group_means(
-    passes: Iterable[Float[np.ndarray, "h w c"]], count: int, groups: int
-) -> Float[np.ndarray, "groups h w c"]:
+def group_means(passes: Iterable[Picture], count: int, groups: int) -> list[Picture]:
     """The means of `groups` equal groups of `count` successive passes; the passes themselves where there is one each.
 
     One pass and one float64 sum are in memory besides the result.
     """
-    size, kept = count // groups, np.empty(0, np.float32)
-    total = np.empty(0)
-    for index, picture in enumerate(passes):
-        if index == 0:
-            kept = np.empty((groups, *picture.shape), np.float32)
-            total = np.zeros(picture.shape if size > 1 else 0)
-        if size == 1:
-            kept[index] = picture
-            continue
+    size, left = count // groups, iter(passes)
+    if size == 1:
+        return list(left)
+    return [_mean_of(itertools.islice(left, size), size) for _ in range(groups)]
+
+
+def _mean_of(passes: Iterator[Picture], size: int) -> Picture:
+    total = next(passes).astype(np.float64)
+    for picture in passes:
         total += picture
-        if (index + 1) % size == 0:
-            kept[index // size] = total / size
-            total[:] = 0
-    return kept
+    return (total / size).astype(np.float32)
 
 
 def kept_passes(count: int, batches: int, pixels: int) -> int:
@@ -164,12 +161,12 @@ def finite_pass(
     return picture
 
 
-def mean_estimate(passes: Float[np.ndarray, "n h w c"], nan_pixels: int, batches: int) -> Estimate:
+def mean_estimate(passes: Sequence[Picture], nan_pixels: int, batches: int) -> Estimate:
     """Mean over passes and its variance (None for one batch)."""
-    mean = np.empty(passes.shape[1:], np.float32)
+    mean = np.empty(passes[0].shape, np.float32)
     variance = np.empty_like(mean) if batches > 1 else None
-    for rows in _row_blocks(passes):
-        block = passes[:, rows].astype(np.float64)
+    for rows in _row_blocks(mean):
+        block = _stacked(passes, rows)
         average = block.mean(axis=0)
         mean[rows] = average
         if variance is not None:
@@ -178,23 +175,26 @@ def mean_estimate(passes: Float[np.ndarray, "n h w c"], nan_pixels: int, batches
     return Estimate(mean, variance, nan_pixels)
 
 
-def ratio_estimate(passes: Float[np.ndarray, "n h w 4"], nan_pixels: int, batches: int) -> Estimate:
+def ratio_estimate(passes: Sequence[Float[np.ndarray, "h w 4"]], nan_pixels: int, batches: int) -> Estimate:
     """Sum of radiance over sum of coverage, 0 where nothing is covered; variance of the ratio by the delta method."""
-    return weighted_estimate(passes[..., :3], passes[..., 3:], nan_pixels, batches)
+    return weighted_estimate(channels(passes, slice(0, 3)), channels(passes, slice(3, 4)), nan_pixels, batches)
 
 
 def weighted_estimate(
-    light: Float[np.ndarray, "n h w 3"], weight: Float[np.ndarray, "n h w k"], nan_pixels: int, batches: int
+    light: Sequence[Float[np.ndarray, "h w 3"]],
+    weight: Sequence[Float[np.ndarray, "h w k"]],
+    nan_pixels: int,
+    batches: int,
 ) -> Estimate:
     """Sum of weighted radiance over sum of weights (one a pixel, or one a channel), 0 where the weights are 0.
 
     `light` has its weight in it. Variance of the ratio by the delta method; None for one batch.
     """
-    mean = np.empty(light.shape[1:], np.float32)
+    mean = np.empty(light[0].shape, np.float32)
     variance = np.empty_like(mean) if batches > 1 else None
-    for rows in _row_blocks(light):
+    for rows in _row_blocks(mean):
         radiance, coverage = (
-            np.moveaxis(part[:, rows], -1, 0).astype(np.float64, order="C") for part in (light, weight)
+            np.ascontiguousarray(np.moveaxis(_stacked(part, rows), -1, 0)) for part in (light, weight)
         )
         total = coverage.mean(axis=1)
         covered = np.broadcast_to(total > 0, (len(radiance), *total.shape[1:]))
@@ -208,9 +208,18 @@ def weighted_estimate(
     return Estimate(mean, variance, nan_pixels)
 
 
-def _row_blocks(passes: Float[np.ndarray, "n h w c"]) -> Iterator[slice]:
+def channels(passes: Sequence[Picture], which: slice) -> list[Float[np.ndarray, "h w k"]]:
+    """Some channels of every pass, not copied."""
+    return [picture[..., which] for picture in passes]
+
+
+def _stacked(passes: Sequence[Picture], rows: slice) -> Float[np.ndarray, "n rows w c"]:
+    return np.stack([picture[rows] for picture in passes], dtype=np.float64)
+
+
+def _row_blocks(picture: Picture) -> Iterator[slice]:
     """Rows to average at a time: their float64 copies stay in the processor's cache."""
-    height, width = passes.shape[1:3]
+    height, width = picture.shape[:2]
     step = max(1, PIXELS_PER_BLOCK // width)
     return (slice(start, start + step) for start in range(0, height, step))
 

@@ -46,7 +46,7 @@ def relative(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> float:
 
 def shaded(intrinsics: Intrinsics, light: np.ndarray, geometry: MeshObject | None = None, first: int = 0) -> Estimate:
     """Mean and variance from eight seeds."""
-    passes = np.stack([shade(intrinsics, light, 64, first + seed, geometry=geometry) for seed in range(8)])
+    passes = [shade(intrinsics, light, 64, first + seed, geometry=geometry) for seed in range(8)]
     return mean_estimate(passes, 0, 8)
 
 
