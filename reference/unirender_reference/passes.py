@@ -58,17 +58,17 @@ class Counters:
 
 
 def render_passes(
-    scene: Any, depth: int, spp: int, seed: int, batches: int, counters: Counters
+    scene: Any, depth: int, spp: int, seed: int, batches: int, counters: Counters, sensor: Any = None
 ) -> tuple[list[Float[np.ndarray, "h w 4"]], int]:
     """Premultiplied RGBA passes of path tracing at `depth`, the environment hidden; arguments as `integrator_passes`.
 
     Depth 2 is one bounce, direct light; depth 4 is three bounces.
     """
-    return integrator_passes(scene, path_integrator(depth), spp, seed, batches, counters)
+    return integrator_passes(scene, path_integrator(depth), spp, seed, batches, counters, sensor)
 
 
 def integrator_passes(
-    scene: Any, integrator: Any, spp: int, seed: int, batches: int, counters: Counters
+    scene: Any, integrator: Any, spp: int, seed: int, batches: int, counters: Counters, sensor: Any = None
 ) -> tuple[list[Picture], int]:
     """At least `batches` passes of any Mitsuba integrator, each an `mi.render` with its own seed.
 
@@ -77,24 +77,26 @@ def integrator_passes(
     A pixel that comes out NaN or infinite is taken from a render with another seed; how many is the second result.
 
     Args:
-        scene: a Mitsuba scene with one sensor.
+        scene: a Mitsuba scene.
         integrator: what is rendered; c is 4 (RGBA) and one channel for each of its AOVs.
         spp: samples per pixel of all passes together.
         seed: equal seeds give equal passes.
         batches: least number of passes.
         counters: seconds, calls and repaired pixels are added here.
+        sensor: a loaded Mitsuba sensor; None: the scene's first.
 
     Raises:
         UnirenderError: `spp` cannot be divided, or a pixel stays NaN.
     """
-    width, height = scene.sensors()[0].film().crop_size()
+    sensor = scene.sensors()[0] if sensor is None else sensor
+    width, height = sensor.film().crop_size()
     pixels = int(width * height)
     count = pass_count(spp, batches, SAMPLES_PER_PASS // pixels)
     before = counters.nan_pixels
 
     def drawn(index: int) -> Float[np.ndarray, "h w c"]:
         def draw(attempt: int) -> Float[np.ndarray, "h w c"]:
-            return _render(scene, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
+            return _render(scene, sensor, integrator, spp // count, derive_seed(seed, "pass", index, attempt), counters)
 
         return finite_pass(draw, counters, "render")
 
@@ -278,9 +280,11 @@ def derive_seed(*parts: int | str) -> int:
     return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:4], "little")
 
 
-def _render(scene: Any, integrator: Any, spp: int, seed: int, counters: Counters) -> Float[np.ndarray, "h w c"]:
+def _render(
+    scene: Any, sensor: Any, integrator: Any, spp: int, seed: int, counters: Counters
+) -> Float[np.ndarray, "h w c"]:
     start = time.perf_counter()
-    rendered = mitsuba().render(scene, integrator=integrator, spp=spp, seed=seed)
+    rendered = mitsuba().render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
     picture = np.asarray(rendered, dtype=np.float32)  # waits for the render; on the CPU a view of its memory
     counters.render_seconds += time.perf_counter() - start
     counters.renders += 1

@@ -1,0 +1,114 @@
+"""What the optimiser sees: pictures of one object from known cameras, under one light."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+
+ROTATION_TOLERANCE = 1e-3
+RANGE_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class View:
+    """One picture of the object.
+
+    Attributes:
+        image: (h, w, 3) straight colour, as in a PNG with alpha (not premultiplied; whatever it is where the mask is
+            0): display values in [0, 1], or linear radiance in display units if the views are `hdr`.
+        mask: (h, w, 1) coverage, [0, 1].
+        camera: vertical field of view and principal point.
+        pose: (4, 4) camera to world: columns are the camera's right, up, towards the viewer, and its position.
+        name: for messages and files.
+    """
+
+    image: Float[np.ndarray, "h w 3"]
+    mask: Float[np.ndarray, "h w 1"]
+    camera: Camera
+    pose: Float[np.ndarray, "4 4"]
+    name: str = "view"
+
+    def __post_init__(self) -> None:
+        for label in ("image", "mask", "pose"):
+            object.__setattr__(self, label, np.asarray(getattr(self, label), np.float32))
+        height, width = self.image.shape[:2]
+        if self.image.shape != (height, width, 3) or self.mask.shape != (height, width, 1):
+            raise UnirenderError(
+                f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
+            )
+        if not np.isfinite(self.image).all() or self.image.min() < 0:
+            raise UnirenderError(f"{self.name}: the image has negative, infinite or NaN values; expected values >= 0")
+        if not (self.mask.min() >= 0 and self.mask.max() <= 1):
+            raise UnirenderError(f"{self.name}: the mask leaves [0, 1]; expected coverage")
+        rotation = self.pose[:3, :3].astype(np.float64)
+        if self.pose.shape != (4, 4) or not (
+            np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
+        ):
+            raise UnirenderError(
+                f"{self.name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without "
+                "scale or mirroring"
+            )
+
+
+@dataclass(frozen=True)
+class Views:
+    """Pictures of one object under one light.
+
+    Attributes:
+        seen: what is optimised against.
+        held_out: what the fit is watched by (early stop), never optimised against; may be empty.
+        hdr: images are linear radiance in display units; else display values, clipped at 1.
+    """
+
+    seen: tuple[View, ...]
+    held_out: tuple[View, ...] = ()
+    hdr: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.seen:
+            raise UnirenderError("views: got none, expected at least one picture with its camera")
+        sizes = {view.image.shape for view in (*self.seen, *self.held_out)}
+        if len(sizes) > 1:
+            raise UnirenderError(f"views: got pictures of sizes {sorted(sizes)}, expected one size; resample them")
+        for view in (*self.seen, *self.held_out):
+            if not self.hdr and view.image.max() > 1 + RANGE_TOLERANCE:
+                raise UnirenderError(
+                    f"{view.name}: display values reach {view.image.max():.3g}, expected [0, 1]; linear pictures are "
+                    "`hdr` views"
+                )
+        if not any(view.mask.any() for view in self.seen):
+            raise UnirenderError("views: the masks are empty in all pictures; expected the object's coverage")
+
+    @property
+    def height(self) -> int:
+        return self.seen[0].image.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.seen[0].image.shape[1]
+
+    def linear(self, view: View) -> Float[np.ndarray, "h w 3"]:
+        """The picture as premultiplied linear radiance; display values of 1 may stand for more."""
+        straight = view.image if self.hdr else srgb_decode(np.clip(view.image, 0, 1))
+        return (straight * view.mask).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the record of an optimisation (`history.jsonl`).
+
+    Attributes:
+        stage: "transport", "refine", "shape", ...
+        iteration: within the stage.
+        seconds: since the optimisation began.
+        values: losses and figures by name.
+    """
+
+    stage: str
+    iteration: int
+    seconds: float
+    values: dict[str, float]
