@@ -1,0 +1,116 @@
+"""The unknown light as cells: piecewise constant radiance around the texels of Mitsuba's `envmap`.
+
+Texel (i, j) of an `envmap` of H x W texels lies at theta = pi i / (H - 1) from +y and at the azimuth
+phi = (j + 1/2) 2 pi / W; its cell reaches halfway to its neighbours. Directions are in world axes: (sin phi sin theta,
+cos theta, -cos phi sin theta).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+
+LEAST_SINE = 0.15  # of theta, in the weights of differences: columns meet at the poles
+
+
+@dataclass(frozen=True)
+class LightGrid:
+    """A grid of `rows` x `columns` cells; J = rows * columns, rows outermost."""
+
+    rows: int = 16
+    columns: int = 32
+
+    def __post_init__(self) -> None:
+        if self.rows < 4 or self.columns < 4:
+            raise UnirenderError(f"light: got {self.rows} x {self.columns} cells, expected at least 4 x 4")
+
+    @property
+    def count(self) -> int:
+        return self.rows * self.columns
+
+    @cached_property
+    def cosines(self) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """cos(theta) at the upper and at the lower border of each row."""
+        borders = (np.arange(self.rows + 1) - 0.5) / (self.rows - 1)
+        cosine = np.cos(np.pi * np.clip(borders, 0, 1))
+        return cosine[:-1], cosine[1:]
+
+    @cached_property
+    def solid_angles(self) -> Float[np.ndarray, " rows"]:
+        """Solid angle of one cell of each row, in steradian."""
+        upper, lower = self.cosines
+        return (upper - lower) * 2 * np.pi / self.columns
+
+    def cell_of(self, direction: Any) -> Any:
+        """Index of the cell of world directions (Dr.Jit)."""
+        import drjit as dr
+
+        from unirender_reference.backend import mitsuba
+
+        mi = mitsuba()
+        theta, phi = dr.safe_acos(direction.y), dr.atan2(direction.x, -direction.z)
+        phi = dr.select(phi < 0, phi + 2 * dr.pi, phi)
+        row = dr.minimum(mi.UInt32(theta / dr.pi * (self.rows - 1) + 0.5), self.rows - 1)
+        column = dr.minimum(mi.UInt32(phi / (2 * dr.pi) * self.columns), self.columns - 1)
+        return row * self.columns + column
+
+    def direction(self, cell: Any, u: Any, v: Any) -> Any:
+        """World directions, uniform over the solid angle of cells for (u, v) uniform in [0, 1]^2 (Dr.Jit)."""
+        import drjit as dr
+
+        from unirender_reference.backend import mitsuba
+
+        mi = mitsuba()
+        row = cell // self.columns
+        upper, lower = (dr.gather(mi.Float, mi.Float(border.astype(np.float32)), row) for border in self.cosines)
+        cosine = dr.lerp(upper, lower, u)
+        sine = dr.safe_sqrt(1 - cosine * cosine)
+        phi = (mi.Float(cell % self.columns) + v) / self.columns * 2 * dr.pi
+        return mi.Vector3f(dr.sin(phi) * sine, cosine, -dr.cos(phi) * sine)
+
+    @cached_property
+    def differences(self) -> sp.csr_matrix:
+        """(k, J) differences of neighbouring cells, weighted so that their squares integrate |gradient|^2."""
+        index = np.arange(self.count).reshape(self.rows, self.columns)
+        sine = np.maximum(np.sin(np.pi * np.arange(self.rows) / (self.rows - 1)), LEAST_SINE)
+        along = np.broadcast_to(1 / np.sqrt(sine)[:, None], index.shape)
+        down = np.broadcast_to(np.sqrt(sine)[:-1, None], index[1:].shape)
+        first = np.concatenate([index.ravel(), index[:-1].ravel()])
+        second = np.concatenate([np.roll(index, -1, axis=1).ravel(), index[1:].ravel()])
+        weight = np.concatenate([along.ravel(), down.ravel()])
+        line = np.arange(len(weight))
+        values = np.concatenate([weight, -weight])
+        return sp.csr_matrix(
+            (values, (np.concatenate([line, line]), np.concatenate([first, second]))), shape=(len(line), self.count)
+        )
+
+    def environment(self, cells: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "rows columns 3"]:
+        """The cells as an environment map on Mitsuba's grid (which interpolates between texels)."""
+        return cells.reshape(self.rows, self.columns, 3).astype(np.float32)
+
+    def averages(self, environment: Float[np.ndarray, "h w 3"], oversampling: int = 8) -> Float[np.ndarray, "j 3"]:
+        """Mean radiance of an environment map over each cell (midpoint rule, `oversampling`^2 points a cell)."""
+        height, width = environment.shape[:2]
+        upper, lower = self.cosines
+        part = (np.arange(oversampling) + 0.5) / oversampling
+        theta = np.arccos(np.clip(upper[:, None] + (lower - upper)[:, None] * part, -1, 1)).ravel()
+        y, x = (
+            theta / np.pi * (height - 1),
+            (np.arange(self.columns)[:, None] + part).ravel() / self.columns * width - 0.5,
+        )
+        top, left = np.clip(np.floor(y).astype(int), 0, height - 2), np.floor(x).astype(int)
+        down, right = (y - top)[:, None, None], (x - left)[None, :, None]
+
+        def texels(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+            return environment[row][:, column % width]
+
+        above = texels(top, left) * (1 - right) + texels(top, left + 1) * right
+        below = texels(top + 1, left) * (1 - right) + texels(top + 1, left + 1) * right
+        fine = above * (1 - down) + below * down
+        blocks = fine.reshape(self.rows, oversampling, self.columns, oversampling, 3)
+        return blocks.mean(axis=(1, 3)).reshape(-1, 3).astype(np.float32)

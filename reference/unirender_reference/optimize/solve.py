@@ -1,0 +1,214 @@
+"""The global start: light, base colour, roughness and metallic from pictures of a known mesh, in a few dozen steps.
+
+    1. transport matrices of the pixels that the views show                                (`transport`)
+    2. from several materials, on a coarse light: light and one material                   (`light_solve`)
+    3. the best of them on the full light; then, if asked for, materials of every patch    (`material_search`)
+    4. the base-colour texture, by sparse least squares                                    (`textures`)
+    5. a path-traced image of the estimate: what it has and the matrices lack (interreflection, fine light) is taken
+       from the pictures, and light, materials and texture are solved for again
+
+Descent by gradients (`refine`) goes on from there, and stalls where it starts from grey (docs/optimization.md).
+"""
+
+import itertools
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender_reference.backend import mitsuba
+from unirender_reference.materials import principled_bsdf
+from unirender_reference.multiview import sensor_at
+from unirender_reference.optimize.light_grid import LightGrid
+from unirender_reference.optimize.light_solve import LightPrior, Solved, solve_light
+from unirender_reference.optimize.material_search import search_materials
+from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe, patches
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.surface_points import blocker, trace_points
+from unirender_reference.optimize.textures import fit_texels, footprint, spread
+from unirender_reference.optimize.transport import light_transport, refined
+from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.views import Step, Views
+from unirender_reference.passes import Counters, derive_seed, mean_estimate, render_passes
+from unirender_reference.render import IMAGE_DEPTH
+from unirender_reference.scene import mesh_shape
+from unirender_reference.shapes import MeshObject
+
+GREY = 0.4
+STARTS = tuple(itertools.product((0.25, 0.7), (0.15, 0.85)))  # (roughness, metallic)
+POINTS = 4  # in a pixel
+LATER_ITERATIONS = 3  # after a correction
+
+OnStep = Callable[[Step], bool]
+
+
+def start_solution(views: Views, obj: MeshObject, texture_size: int, light_rows: int) -> Solution:
+    """Grey, roughness and metallic 0.5, and a constant light, about as bright as the pictures."""
+    light = np.full((light_rows, 2 * light_rows, 3), _brightness(views) / GREY, np.float32)
+    size = (texture_size, texture_size)
+    half = np.full(size, 0.5, np.float32)
+    return Solution(
+        replace(obj, albedo=np.full((*size, 3), GREY, np.float32), roughness=half, metallic=half, normal_map=None),
+        light,
+    )
+
+
+def solve_appearance(
+    views: Views,
+    obj: MeshObject,
+    config: TransportConfig,
+    on_step: OnStep | None = None,
+    texture_size: int = 128,
+    light_rows: int = 16,
+    seed: int = 0,
+) -> Solution:
+    """Textures and light of a mesh from pictures of it.
+
+    Args:
+        views: the pictures; the object lies in the unit sphere of their world.
+        obj: the mesh, with texture coordinates of its own for each point of the surface; its textures do not count.
+        config: see there; not `enabled`: `start_solution`.
+        on_step: called with stage "transport" after every solve; False ends it with what there is.
+        texture_size: texels along each side.
+        light_rows: even; the light has twice as many columns.
+        seed: equal seeds draw equal samples.
+    """
+    if not config.enabled:
+        return start_solution(views, obj, texture_size, light_rows)
+    work = _Work(views, obj, config, on_step or (lambda step: True), texture_size, light_rows, seed)
+    return work.run()
+
+
+class _Work:
+    """The steps of one solve."""
+
+    def __init__(
+        self,
+        views: Views,
+        obj: MeshObject,
+        config: TransportConfig,
+        on_step: OnStep,
+        texture_size: int,
+        light_rows: int,
+        seed: int,
+    ) -> None:
+        self.views, self.obj, self.config, self.size, self.seed = views, obj, config, texture_size, seed
+        self._on_step, self._began, self._steps = on_step, time.perf_counter(), 0
+        self.prior = LightPrior(config.smooth_light, config.neutral_light)
+        scene = blocker(obj)
+        self.points = trace_points(scene, views.seen, POINTS, seed, config.pixels)
+        self.shown = self.points.of([views.linear(view) for view in views.seen])
+        coverage = self.points.of([view.mask for view in views.seen])[:, 0]
+        position = self.points.mean_position()
+        seen = observe(self.shown, coverage, patches(position, _footprint_edge(views)), display=not views.hdr)
+        transport = light_transport(scene, self.points, LightGrid(light_rows, 2 * light_rows), seed)
+        self.fit = PixelFit(transport, seen, np.ones_like(self.shown), GREY)
+        self.texels = footprint(self.points, texture_size)
+
+    def run(self) -> Solution:
+        """The solution of all steps."""
+        solved = self._first()
+        if self.config.materials == "maps":
+            moved = search_materials(self.fit, solved.appearance, self.points.mean_position())
+            solved = solve_light(self.fit, moved, self.prior, LATER_ITERATIONS)
+            self._note(solved)
+        solution = self._solution(solved)
+        for index in range(self.config.rounds):
+            rendered = self._rendered(solution, index)
+            base = self.texels @ solution.obj.albedo.reshape(-1, 3)
+            explained = base * (solved.prediction.gain / self.fit.pattern) + solved.mixed.v @ solved.appearance.radiance
+            target = (self.shown - (rendered - explained)).astype(np.float32)
+            pattern = np.clip(base, 0.01, 1).astype(np.float32)
+            self.fit = replace(self.fit, seen=replace(self.fit.seen, radiance=target), pattern=pattern, scale_prior=1.0)
+            solved = solve_light(self.fit, solved.appearance, self.prior, LATER_ITERATIONS)
+            solution = self._solution(solved)
+            if not self._note(solved):
+                break
+        return solution
+
+    def _first(self) -> Solved:
+        """The best of `STARTS` on a coarse light, on the full light."""
+        coarse, count = self.fit.coarse(), len(self.points)
+        level = np.full((coarse.transport.grid.count, 3), np.log(_brightness(self.views) / GREY))
+        found = []
+        for roughness, metallic in STARTS:
+            start = Appearance(level, np.full(count, roughness), np.full(count, metallic))
+            found.append(solve_light(coarse, start, self.prior, self.config.iterations))
+            self._note(found[-1])
+        best = min(found, key=lambda solved: solved.cost).appearance
+        full = replace(best, light=refined(best.light, coarse.transport.grid))
+        solved = solve_light(self.fit, full, self.prior, self.config.iterations)
+        self._note(solved)
+        return solved
+
+    def _solution(self, solved: Solved) -> Solution:
+        """Textures and light of an estimate."""
+        seen, prediction, appearance = self.fit.seen, solved.prediction, solved.appearance
+        weight = seen.weight * np.sqrt(prediction.robust)
+        start = spread(prediction.base, seen.coverage, self.texels)
+        gain = prediction.gain / self.fit.pattern
+        rest = prediction.radiance - prediction.base * gain
+        albedo = fit_texels(self.texels, gain, seen.radiance - rest, weight, start, self.config.smooth_albedo)
+        ones = np.ones((len(seen.patch), 1), np.float32)
+        scalars = {}
+        for name in ("roughness", "metallic"):
+            values = getattr(appearance, name)[:, None]
+            texels = spread(values, seen.coverage, self.texels)
+            scalars[name] = fit_texels(self.texels, ones, values, ones * seen.coverage[:, None], texels, 0.3)
+        shape = (self.size, self.size)
+        obj = replace(
+            self.obj,
+            albedo=albedo.reshape(*shape, 3),
+            normal_map=None,
+            **{name: texture.reshape(shape) for name, texture in scalars.items()},
+        )
+        return Solution(obj, self.fit.transport.grid.environment(appearance.radiance))
+
+    def _rendered(self, solution: Solution, index: int) -> Float[np.ndarray, "n 3"]:
+        """The pixels of a path-traced image of a solution."""
+        spp, seed = self.config.correction_spp, derive_seed(self.seed, "correction", index)
+        return self.points.of(render_solution(solution, self.views, spp, seed))
+
+    def _note(self, solved: Solved) -> bool:
+        self._steps += 1
+        appearance = solved.appearance
+        values = {
+            "cost": solved.cost,
+            "roughness": float(appearance.roughness.mean()),
+            "metallic": float(appearance.metallic.mean()),
+        }
+        return self._on_step(Step("transport", self._steps, time.perf_counter() - self._began, values))
+
+
+def render_solution(solution: Solution, views: Views, spp: int, seed: int) -> list[Float[np.ndarray, "h w 3"]]:
+    """A solution as the seen views would show it: premultiplied linear radiance, path traced."""
+    mi = mitsuba()
+    obj = solution.obj
+    assert obj.roughness is not None  # every solution has both
+    assert obj.metallic is not None
+    bsdf = principled_bsdf(obj.albedo, obj.roughness, obj.metallic)
+    light = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))}
+    scene = mi.load_dict({"type": "scene", "light": light, "object": mesh_shape(obj, bsdf)})
+    images = []
+    for index, view in enumerate(views.seen):
+        sensor = mi.load_dict(sensor_at(view.pose, view.camera, views.height, views.width))
+        passes = render_passes(scene, IMAGE_DEPTH, spp, derive_seed(seed, index), 1, Counters(), sensor)
+        images.append(mean_estimate(*passes, 1).mean[..., :3])
+    return images
+
+
+def _brightness(views: Views) -> float:
+    """Mean radiance of the object in the pictures."""
+    total = sum(float(views.linear(view).sum()) for view in views.seen)
+    return max(total / (3 * sum(float(view.mask.sum()) for view in views.seen)), 1e-3)
+
+
+def _footprint_edge(views: Views) -> float:
+    """About the edge of a pixel on the surface: of the view whose pixels are largest."""
+    edges = []
+    for view in views.seen:
+        distance = float(np.linalg.norm(view.pose[:3, 3]))
+        edges.append(2 * distance * np.tan(np.radians(view.camera.fov_deg) / 2) / views.height)
+    return 1.1 * max(edges)
