@@ -107,7 +107,7 @@ def _normal_equations(fit: PixelFit, solved: Solved, prior: LightPrior) -> tuple
     weights = seen.weight * np.sqrt(prediction.robust)
     hessian, gradient = np.zeros((3 * cells + 2, 3 * cells + 2)), np.zeros(3 * cells + 2)
     jacobian = np.empty((len(seen.patch), cells + 2), np.float32)
-    syrk = get_blas_funcs("syrk", dtype=np.float32)  # half a matrix product
+    (syrk,) = get_blas_funcs(("syrk",), dtype=np.float32)  # half a matrix product
     for c in range(3):
         weight = weights[:, c].astype(np.float32)
         inner = jacobian[:, :cells]
