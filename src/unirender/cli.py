@@ -8,6 +8,7 @@ option, a value outside its range, options that contradict each other, nothing t
 what it was asked for. An error is one line.
 """
 
+import functools
 import importlib.metadata
 import logging
 import os
@@ -27,10 +28,14 @@ from unirender_reference.commands import Dataset
 from unirender_reference.measure.commands import Reference
 from unirender_reference.measure.lights import Lights
 from unirender_reference.measure.meshes import Meshes
+from unirender_reference.optimize.commands import Optimize
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from unirender.camera import Camera
+    from unirender.intrinsics import Intrinsics
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.training.validation import Validate
 
 
@@ -70,6 +75,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Edit, tyro.conf.subcommand("edit")]
     | Annotated[Relight, tyro.conf.subcommand("relight")]
+    | Annotated[Optimize, tyro.conf.subcommand("optimize")]
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Lights, tyro.conf.subcommand("lights")]
     | Annotated[Meshes, tyro.conf.subcommand("meshes")]
@@ -93,12 +99,27 @@ def make_validation(suite: str, scenes: int) -> "Validate":
     return suite_validation(suite, scenes)
 
 
+def predict_maps(image_srgb: "np.ndarray", mask: "np.ndarray", camera: "Camera") -> "Intrinsics":
+    """The shipped model's decomposition of a picture, for `optimize --init unirender`."""
+    return shipped_pipeline().decompose(image_srgb, mask=mask, camera=camera).intrinsics
+
+
+@functools.cache
+def shipped_pipeline() -> "UniRenderPipeline":
+    """The shipped model, loaded once."""
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+    return UniRenderPipeline.from_pretrained()
+
+
 def run(command: Any) -> int:
     """Hands a command what it needs of the other packages; returns its exit status."""
     if isinstance(command, Render | Relight):
         return command.run(read_light)
     if isinstance(command, Train):
         return command.run(make_validation)
+    if isinstance(command, Optimize):
+        return command.run(predict_maps)
     return command.run()
 
 

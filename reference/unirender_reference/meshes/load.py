@@ -22,7 +22,7 @@ from unirender_reference.meshes.obj import read_obj
 from unirender_reference.meshes.surface import Material, Model, Piece
 from unirender_reference.meshes.tiles import Patch
 from unirender_reference.meshes.trimesh_files import read_through_trimesh
-from unirender_reference.shapes import MeshObject, unit_sphere
+from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
 
 READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
@@ -44,6 +44,11 @@ def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
         UnirenderError: one sentence with the reason: a missing, damaged or dangerous file (see `limits`), no faces,
             broken coordinates, a missing texture.
     """
+    return load_mesh_placed(path, root)[0]
+
+
+def load_mesh_placed(path: str | Path, root: Path | None = None) -> tuple[MeshObject, Sphere]:
+    """Loads a mesh like `load_mesh`, and says where it stood: cameras in the file's units move along with it."""
     path = Path(path)
     if not path.is_file():
         raise UnirenderError(f"mesh {path}: no such file; expected one of {', '.join(SUFFIXES)}")
@@ -92,7 +97,7 @@ def _grouped(pieces: list[Piece]) -> list[_Group]:
     return list(groups.values())
 
 
-def _assembled(path: Path, model: Model) -> MeshObject:
+def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
     if not any(len(piece.faces) for piece in model.pieces):
         raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")
     single, doubles = without_doubles([piece for piece in model.pieces if len(piece.faces)])
@@ -104,11 +109,9 @@ def _assembled(path: Path, model: Model) -> MeshObject:
     atlas = build_atlas(patches)
     arrays = {id(piece.vertices): piece.vertices for piece in pieces}  # an OBJ's pieces share one
     starts = dict(zip(arrays, np.cumsum([0, *map(len, arrays.values())]), strict=False))
+    sphere = bounding_sphere(np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces]))
     vertices, faces, normals, uv = split_corners(
-        unit_sphere(
-            np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces]),
-            np.concatenate(list(arrays.values())),
-        ),
+        sphere.to_unit(np.concatenate(list(arrays.values()))).astype(np.float32),
         np.concatenate([piece.faces + starts[id(piece.vertices)] for piece in pieces]),
         np.concatenate([piece_normals(piece) for piece in pieces]),
         atlas.uv,
@@ -117,7 +120,7 @@ def _assembled(path: Path, model: Model) -> MeshObject:
     if "roughness" in maps and uv is None:
         uv = np.zeros((len(vertices), 2), np.float32)
     albedo = np.clip(maps["albedo"], 0, 1)
-    return MeshObject(
+    obj = MeshObject(
         name=path.stem.replace(".", "-"),
         family="mesh",
         vertices=vertices,
@@ -139,6 +142,7 @@ def _assembled(path: Path, model: Model) -> MeshObject:
             "ignored": ", ".join(sorted(model.ignored)),
         },
     )
+    return obj, sphere
 
 
 def _scalar_map(texels: Float[np.ndarray, "h w 1"] | None) -> Float[np.ndarray, "i j"] | None:

@@ -15,15 +15,17 @@ from jaxtyping import Float, Int
 from unirender.errors import UnirenderError
 
 UNIT_TOLERANCE = 1e-3
+RECONSTRUCTION = "reconstruction"  # the family of meshes made from pictures, in the world of their cameras
+RECONSTRUCTION_TOLERANCE = 0.3  # of their radius: the object's size was guessed from masks before its shape was known
 
 
 @dataclass(frozen=True)
 class MeshObject:
-    """A mesh whose bounding sphere is centred at the origin with radius 1.
+    """A mesh whose bounding sphere is centred at the origin with radius 1 (about 1, for a `RECONSTRUCTION`).
 
     Attributes:
         name: without dots (dataset keys are cut at the first dot).
-        family: the generator family, or "mesh" for a loaded file.
+        family: the generator family, "mesh" for a loaded file, or `RECONSTRUCTION`.
         vertices: (n, 3) float32.
         faces: (m, 3) int32, counter-clockwise seen from outside.
         normals: (n, 3) float32 unit shading normals.
@@ -88,7 +90,8 @@ class MeshObject:
         if np.abs(length - 1).max() > UNIT_TOLERANCE:
             raise UnirenderError(f"{self.name}: normals must be unit vectors, got lengths down to {length.min():.4f}")
         radius = float(np.linalg.norm(self.vertices, axis=1).max())
-        if abs(radius - 1) > UNIT_TOLERANCE:
+        tolerance = RECONSTRUCTION_TOLERANCE if self.family == RECONSTRUCTION else UNIT_TOLERANCE
+        if abs(radius - 1) > tolerance:
             raise UnirenderError(f"{self.name}: bounding sphere must have radius 1, got {radius:.4f}")
 
     def _check_texture(self, label: str, texture: np.ndarray, dimensions: int) -> None:
@@ -117,17 +120,28 @@ def signed_volume(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 
 
-def unit_sphere(
-    vertices: Float[np.ndarray, "n 3"], moved: Float[np.ndarray, "k 3"] | None = None
-) -> Float[np.ndarray, "k 3"]:
-    """Moves and scales points so that the bounding sphere of `vertices` has radius 1 about the origin.
+@dataclass(frozen=True)
+class Sphere:
+    """Where an object stands in its own units: points p of the world lie at (p - center) / radius in the unit sphere.
+
+    Attributes:
+        center: (3,) float64.
+        radius: more than 0.
+    """
+
+    center: Float[np.ndarray, "3"]
+    radius: float
+
+    def to_unit(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Points of the world in the unit sphere's coordinates (float64)."""
+        return (points - self.center) / self.radius
+
+
+def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> Sphere:
+    """A sphere around points.
 
     The centre is found with Badoiu and Clarkson's farthest-point steps (within 1 % of the smallest sphere after 100);
     the radius is then exact for that centre.
-
-    Args:
-        vertices: the points that count.
-        moved: the points to return (a mesh with unused vertices); `vertices` if None.
 
     Raises:
         UnirenderError: the points have no extent.
@@ -137,7 +151,22 @@ def unit_sphere(
     for step in range(100):
         offset = points - center
         center = center + offset[np.argmax(np.einsum("ij,ij->i", offset, offset))] / (step + 2)
-    radius = np.linalg.norm(points - center, axis=1).max()
+    radius = float(np.linalg.norm(points - center, axis=1).max())
     if not radius > 1e-12:
         raise UnirenderError(f"mesh has zero extent: its {len(vertices)} vertices are one point; give another mesh")
-    return (((vertices if moved is None else moved) - center) / radius).astype(np.float32)
+    return Sphere(center, radius)
+
+
+def unit_sphere(
+    vertices: Float[np.ndarray, "n 3"], moved: Float[np.ndarray, "k 3"] | None = None
+) -> Float[np.ndarray, "k 3"]:
+    """Moves and scales points so that the bounding sphere of `vertices` has radius 1 about the origin.
+
+    Args:
+        vertices: the points that count.
+        moved: the points to return (a mesh with unused vertices); `vertices` if None.
+
+    Raises:
+        UnirenderError: the points have no extent.
+    """
+    return bounding_sphere(vertices).to_unit(vertices if moved is None else moved).astype(np.float32)

@@ -1,0 +1,212 @@
+"""`unirender optimize`. Light to import: what renders is loaded when the command runs."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.single_config import SingleConfig
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from unirender.camera import Camera
+    from unirender.intrinsics import Intrinsics
+    from unirender_reference.optimize.solution import Solution
+    from unirender_reference.optimize.views import Step, Views
+    from unirender_reference.shapes import MeshObject, Sphere
+
+Predict = Callable[["np.ndarray", "np.ndarray", "Camera"], "Intrinsics"]  # display values, mask, camera -> maps
+
+OF_FOLDERS = ("up", "hold_out", "most_views", "threads")
+OF_PICTURES = ("mask", "fov", "normal", "overwrite")
+
+
+@dataclass(frozen=True)
+class Optimize:
+    """Inverse rendering by optimisation through Mitsuba's derivatives: pictures in; mesh, textures and light out.
+
+    A folder of posed pictures gives `mesh.glb` with its textures and `environment.exr`; it resumes by running the same
+    command again. One picture gives maps, as `unirender decompose` does.
+    """
+
+    input: Annotated[Path, tyro.conf.Positional]
+    """A folder with `transforms.json` and pictures (PNG with alpha, or EXR), or one picture."""
+    out: Path
+    """Folder of the result."""
+    mesh: Path | None = None
+    """The object's mesh (GLB, glTF, OBJ, PLY, STL, OFF), in the units and axes of the poses. None: it is reconstructed
+    from the masks. Of one picture: a mesh that faces the camera."""
+    init: Literal["none", "unirender"] = "none"
+    """unirender: begin with what the learned model predicts."""
+    size: int | None = None
+    """Larger pictures are reduced to this many pixels along their longer side."""
+    up: Literal["y", "z"] = "y"
+    """Which way is up in the poses; z: as in Blender and NeRF's synthetic scenes (a glTF or GLB mesh is y up all the
+    same)."""
+    hold_out: int = 0
+    """Every N-th picture is only watched, for the early stop. 0: those that the folder holds out."""
+    most_views: int | None = None
+    """Of more pictures, this many are taken, evenly spread."""
+    threads: int = 0
+    """Of the renderer. 0: one for each core. 1: equal runs give equal bytes."""
+    mask: Path | None = None
+    """Of one picture: its coverage (white: object). None: the alpha channel, else the whole frame."""
+    fov: float | None = None
+    """Of one picture: vertical field of view in degrees. None: 36."""
+    normal: Path | None = None
+    """Of one picture: normals in camera axes: the output of `unirender decompose`, an EXR with normal.X/Y/Z, or a
+    picture of (n + 1) / 2. None: those of --mesh, of --init, or a guess from the silhouette."""
+    overwrite: bool = False
+    """Of one picture: replace an earlier result."""
+    pictures: bool = True
+    """Render strips to look at: given beside found, a turntable, other lights."""
+    progress: bool = True
+    """Show progress."""
+    config: Annotated[OptimizeConfig, tyro.conf.arg(name="")] = field(default_factory=OptimizeConfig)
+    single: tyro.conf.AvoidSubcommands[SingleConfig] = field(default_factory=SingleConfig)
+    """Of one picture."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range, or options contradict each other.
+        """
+        for name in ("size", "most_views"):
+            value = getattr(self, name)
+            if value is not None and value < (8 if name == "size" else 1):
+                raise UsageError(f"--{name.replace('_', '-')} {value}: expected {8 if name == 'size' else 1} or more")
+        if self.hold_out < 0 or self.hold_out == 1 or self.threads < 0:
+            raise UsageError(
+                f"--hold-out {self.hold_out}, --threads {self.threads}: expected 0, or 2 and more held out in turn; 0 "
+                "or more threads"
+            )
+        self.config.check()
+        folder = self.input.is_dir()
+        wrong, kind = (OF_PICTURES, "one picture") if folder else (OF_FOLDERS, "a folder of pictures")
+        defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
+        given = [f"--{name.replace('_', '-')}" for name in wrong if getattr(self, name) != defaults[name]]
+        if given:
+            raise UsageError(f"{', '.join(given)}: of {kind}, but {self.input} is {'a folder' if folder else 'none'}")
+
+    def run(self, predict: Predict | None = None) -> int:
+        """Optimises, or goes on; returns the exit status.
+
+        Args:
+            predict: the learned model, for `--init unirender`.
+        """
+        self.check()
+        if not self.input.exists():
+            raise UnirenderError(f"{self.input}: no such file or folder, expected posed pictures or one picture")
+        if self.init == "unirender" and predict is None:
+            raise UnirenderError("--init unirender: no model at hand, expected the command line to bring one")
+        chosen = predict if self.init == "unirender" else None
+        return self._run_folder(chosen) if self.input.is_dir() else self._run_picture(chosen)
+
+    def _run_folder(self, predict: Predict | None) -> int:
+        import json
+
+        from rich.console import Console
+
+        from unirender_reference.optimize.export import SOLUTION_FILE
+        from unirender_reference.optimize.live import live_report
+        from unirender_reference.optimize.run import optimize
+
+        views, obj, place = self.read()
+        with live_report(Console(stderr=True, quiet=not self.progress)) as report:
+            start = None if predict is None else self._start(views, obj, predict)
+            optimize(
+                views,
+                obj if start is None else None,
+                self.config,
+                self.out,
+                start,
+                report,
+                place,
+                pictures=self.pictures,
+                threads=self.threads,
+            )
+        record = json.loads((self.out / SOLUTION_FILE).read_text(encoding="utf-8"))
+        figures = ", ".join(f"{name.removesuffix('_psnr_db')} {db:.2f} dB" for name, db in record["figures"].items())
+        stages = record["stages"]
+        seconds = f", {stages[-1]['seconds']:.1f} s" if stages else ""
+        print(f"{self.out}: {len(views.seen)} views{seconds}; masked PSNR of the pictures: {figures}")
+        return 0
+
+    def read(self) -> "tuple[Views, MeshObject | None, Sphere]":
+        """The views with their world in the unit sphere, the mesh, and where it stood."""
+        from unirender_reference.meshes import load_mesh_placed
+        from unirender_reference.optimize.folder import read_views
+        from unirender_reference.optimize.placement import check_alignment, placed, sphere_of_masks
+
+        views = read_views(
+            self.input, up=self.up, hold_out=self.hold_out, most_views=self.most_views, longest_side=self.size
+        )
+        if self.mesh is None:
+            place = sphere_of_masks(views)
+            return placed(views, place), None, place
+        obj, place = load_mesh_placed(self.mesh)
+        views = placed(views, place)
+        check_alignment(views, obj)
+        return views, obj, place
+
+    def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict) -> "Solution":
+        """What the model predicts for every view, on the mesh."""
+        from unirender_reference.optimize.warm import solution_from_predictions
+
+        if obj is None:
+            raise UsageError("--init unirender: expected --mesh beside it, to put the predicted maps on")
+        if views.hdr:
+            raise UsageError("--init unirender: the model sees display pictures, and these are linear (EXR)")
+        predictions = [predict(view.image, view.mask, view.camera) for view in views.seen]
+        return solution_from_predictions(views, obj, predictions, self.config.texture_size, self.config.light_rows)
+
+    def _run_picture(self, predict: Predict | None) -> int:
+        from rich.console import Console
+
+        from unirender.files import new_folder, write_result
+        from unirender_reference.optimize.live import live_report
+        from unirender_reference.optimize.picture import history_text, read_picture_input
+        from unirender_reference.optimize.report import Report
+        from unirender_reference.optimize.single_view import optimize_image
+
+        given = read_picture_input(self.input, self.mask, self.fov, self.normal, self.size)
+        obj = None
+        if self.mesh is not None:
+            from unirender_reference.meshes import load_mesh
+
+            obj = load_mesh(self.mesh)
+        if predict is not None and given.hdr:
+            raise UsageError("--init unirender: the model sees display pictures, and this one is linear (EXR)")
+        steps: list[Step] = []
+        console = Console(stderr=True, quiet=not self.progress)
+        with new_folder(self.out, overwrite=self.overwrite) as folder, live_report(console) as report:
+
+            def on_step(step: "Step") -> None:
+                steps.append(step)
+                report(Report(step, 1, 1, None, None))
+
+            start = None if predict is None else predict(given.image, given.mask, given.camera)
+            found = optimize_image(
+                given.image,
+                given.mask,
+                given.camera,
+                self.single,
+                normal=given.normal,
+                geometry=obj,
+                init=start,
+                hdr=given.hdr,
+                on_step=on_step,
+            )
+            meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
+            write_result(folder, found, meta | {"config": dataclasses.asdict(self.single)})
+            (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
+        seconds = f": {steps[-1].seconds:.1f} s" if steps else ""
+        print(f"{self.out}{seconds}")
+        return 0

@@ -1,0 +1,218 @@
+"""Folders of posed pictures: `transforms.json` with PNG (display values) or EXR (linear radiance), to and from `Views`.
+
+Held out are the frames that say `"held_out": true`; where none does, those of `transforms_val.json` or else of
+`transforms_test.json` beside it (NeRF's synthetic scenes call the first file `transforms_train.json`); and every N-th
+of the rest, if asked for.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.color import srgb_decode, srgb_encode, unpremultiply
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
+from unirender.files import new_folder, write_png
+from unirender.pictures import check_mask, read_mask, read_picture
+from unirender_reference.meshes.images import area_means
+from unirender_reference.optimize.transforms import Frame, read_transforms
+from unirender_reference.optimize.views import View, Views
+
+SEEN_FILES = ("transforms.json", "transforms_train.json")
+HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
+Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)  # from +z up
+
+Up = Literal["y", "z"]
+
+
+def read_views(
+    folder: Path,
+    *,
+    up: Up = "y",
+    hold_out: int = 0,
+    most_views: int | None = None,
+    longest_side: int | None = None,
+) -> Views:
+    """Reads a folder of posed pictures; poses stay in its units (`placement.placed` moves them).
+
+    A picture needs a mask: the file that its `mask_path` names (white: object), else its alpha channel. PNG is straight
+    colour; EXR is linear and premultiplied by its own alpha channel.
+
+    Args:
+        folder: with `transforms.json` (or `transforms_train.json`).
+        up: "z" turns a world with +z up (Blender, NeRF's synthetic scenes) so that +y is up.
+        hold_out: every N-th picture that is not held out by the files is held out, too; 0: none.
+        most_views: of more pictures that are seen, this many are taken, evenly spread in their order.
+        longest_side: larger pictures are reduced to this many pixels, by means of area in linear light.
+
+    Raises:
+        UnirenderError: one sentence that names the file and what is wrong with it.
+    """
+    main = next((folder / name for name in SEEN_FILES if (folder / name).is_file()), None)
+    if main is None:
+        there = "is no folder" if not folder.is_dir() else f"has no {' or '.join(SEEN_FILES)}"
+        raise UnirenderError(f"{folder}: {there}; expected posed pictures (docs/optimization.md has the format)")
+    frames = read_transforms(main)
+    seen = [frame for frame in frames if not frame.held_out]
+    held_out = [frame for frame in frames if frame.held_out]
+    if not held_out:
+        other = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
+        held_out = [] if other is None else read_transforms(other)
+    if hold_out:
+        held_out = held_out + seen[hold_out - 1 :: hold_out]
+        seen = [frame for index, frame in enumerate(seen) if (index + 1) % hold_out]
+    if not seen:
+        raise UnirenderError(f"{main}: all {len(frames)} pictures are held out, expected some to optimise against")
+    both = {frame.file.resolve() for frame in seen} & {frame.file.resolve() for frame in held_out}
+    if both:
+        raise UnirenderError(f"{folder}: {min(both).name} is both seen and held out; expected each picture once")
+    seen, held_out = _spread(seen, most_views), _spread(held_out, most_views)
+    hdr = {frame.file.suffix.lower() == ".exr" for frame in (*seen, *held_out)}
+    if len(hdr) > 1:
+        raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
+    linear = hdr.pop()
+    return Views(
+        seen=tuple(_view(frame, folder, linear, up, longest_side) for frame in seen),
+        held_out=tuple(_view(frame, folder, linear, up, longest_side) for frame in held_out),
+        hdr=linear,
+    )
+
+
+def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
+    if most is None or len(frames) <= most:
+        return frames
+    return [frames[index * len(frames) // most] for index in range(most)]
+
+
+def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None) -> View:
+    """Reads one picture with its mask."""
+    image, mask, _ = read_picture_file(frame.file)
+    if frame.mask is not None:
+        mask = read_mask(frame.mask, image.shape[:2])
+    if mask is None:
+        raise UnirenderError(
+            f"{frame.file}: has no alpha channel, and its frame no mask_path; expected one of them (white: object)"
+        )
+    pose = (Y_UP @ frame.pose if up == "z" else frame.pose).astype(np.float32)
+    camera = frame.camera(*image.shape[:2])
+    try:
+        view = View(image, mask, camera, pose, name=Path(frame.values["file_path"]).as_posix())
+    except UnirenderError as error:
+        raise UnirenderError(f"{folder}: {error}") from error
+    return view if longest_side is None else reduced(view, longest_side, linear)
+
+
+def read_picture_file(
+    path: Path,
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None, bool]:
+    """Straight colour, the alpha channel, and whether it is linear radiance (EXR).
+
+    Raises:
+        UnirenderError: the file is missing, broken, or no picture.
+    """
+    if path.suffix.lower() == ".exr":
+        return *_linear_picture(path), True
+    picture = read_picture(path)
+    return picture.image_srgb, picture.mask, False
+
+
+def _linear_picture(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None]:
+    """Straight linear radiance and the alpha channel of an EXR."""
+    channels, _ = read_exr(path)
+    try:
+        rgb = channels_rgb(channels)
+    except UnirenderError as error:
+        raise UnirenderError(f"{path}: {error}; expected a picture") from error
+    alpha = channels.get("A")
+    values = rgb if alpha is None else np.concatenate([rgb, alpha[..., None]], axis=-1)
+    if not np.isfinite(values).all() or rgb.min() < 0:
+        raise UnirenderError(f"{path}: has negative, infinite or NaN values, expected radiance >= 0; repair them first")
+    if alpha is None:
+        return rgb, None
+    mask = check_mask(alpha[..., None], f"{path} (A)")
+    return unpremultiply(rgb, mask), mask
+
+
+def reduced(view: View, longest_side: int, linear: bool) -> View:
+    """A view with sides of at most `longest_side` pixels: means over areas, of light where it is covered.
+
+    Pixels stay square: of the longer side, less than one new pixel is cut off.
+
+    Args:
+        view: any size.
+        longest_side: in pixels.
+        linear: the image is linear radiance; else display values.
+    """
+    height, width = view.mask.shape[:2]
+    ratio = max(height, width) / longest_side
+    if ratio <= 1:
+        return view
+    new = max(1, round(min(height, width) / ratio))
+    ratio = min(height, width) / new
+    new_height, new_width = math.floor(height / ratio + 1e-9), math.floor(width / ratio + 1e-9)
+    top, left = (height - new_height * ratio) / 2, (width - new_width * ratio) / 2
+
+    def means(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "i j c"]:
+        across = area_means(values, new_width, 1, left, width - left)
+        return area_means(across, new_height, 0, top, height - top)
+
+    straight = view.image if linear else srgb_decode(np.clip(view.image, 0, 1))
+    mask = np.clip(means(view.mask), 0, 1)
+    image = np.maximum(unpremultiply(means(straight * view.mask), mask), 0)
+    x, y = view.camera.principal
+    half = math.tan(math.radians(view.camera.fov_deg) / 2) * (height - 2 * top) / height
+    camera = dataclasses.replace(
+        view.camera,
+        fov_deg=math.degrees(2 * math.atan(half)),
+        principal=((x * width - left) / (width - 2 * left), (y * height - top) / (height - 2 * top)),
+    )
+    shown = image if linear else np.clip(srgb_encode(image), 0, 1)
+    return View(shown, mask, camera, view.pose, view.name)
+
+
+def write_views(views: Views, folder: Path) -> None:
+    """Writes views as `read_views` reads them: PNG with alpha (8 bits), or EXR (float32) where they are `hdr`.
+
+    Raises:
+        UnirenderError: the folder is there already.
+    """
+    with new_folder(folder) as temporary:
+        (temporary / "images").mkdir()
+        frames = [_written(view, temporary, index, views.hdr) for index, view in enumerate(views.seen)]
+        held_out = [
+            {**_written(view, temporary, index, views.hdr), "held_out": True}
+            for index, view in enumerate(views.held_out, len(frames))
+        ]
+        text = json.dumps({"w": views.width, "h": views.height, "frames": [*frames, *held_out]}, indent=1)
+        (temporary / SEEN_FILES[0]).write_text(text + "\n", encoding="utf-8")
+
+
+def _written(view: View, folder: Path, index: int, linear: bool) -> dict[str, object]:
+    """Writes one picture; its frame."""
+    height, width = view.mask.shape[:2]
+    file = f"images/{index:04d}.{'exr' if linear else 'png'}"
+    if linear:
+        rgba = np.concatenate([view.image * view.mask, view.mask], axis=-1)
+        write_exr(folder / file, image_channels(rgba), half=False)
+    else:
+        write_png(folder / file, np.concatenate([view.image, view.mask], axis=-1))
+    focal = height / (2 * math.tan(math.radians(view.camera.fov_deg) / 2))
+    x, y = view.camera.principal
+    return {
+        "file_path": file,
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": x * width,
+        "cy": y * height,
+        "transform_matrix": _matrix(view.pose),
+    }
+
+
+def _matrix(pose: Float[np.ndarray, "4 4"]) -> Sequence[Sequence[float]]:
+    return [[float(value) for value in row] for row in pose]

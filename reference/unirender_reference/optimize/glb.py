@@ -1,0 +1,132 @@
+"""A textured object as binary glTF 2.0 (sections 3.6 to 3.9 and 4.4): one mesh, one material, its pictures inside.
+
+Base colour is stored as sRGB, roughness in G and metallic in B of one linear picture, a normal map as (n + 1) / 2, all
+in 8 bits a channel. Texture coordinates count from the first row here and in glTF alike.
+"""
+
+import importlib.metadata
+import io
+import json
+import struct
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
+from unirender_reference.meshes.tiles import refined
+from unirender_reference.shapes import MeshObject, Sphere
+
+FLOAT, UNSIGNED = 5126, 5125
+ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
+REPEAT, LINEAR = 10497, 9729
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+
+
+def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
+    """A GLB file; equal objects give equal bytes.
+
+    Args:
+        obj: with roughness and metallic; vertices are stored as they are, in the unit sphere.
+        place: where the object stands in its own units: the node that holds the mesh moves it there.
+
+    Raises:
+        UnirenderError: the object lacks texture coordinates or a texture.
+    """
+    pictures = texture_pixels(obj)
+    assert obj.uv is not None  # texture_pixels has looked
+    body = bytearray()
+    views: list[dict[str, int]] = []
+
+    def view(data: bytes, **more: int) -> int:
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data), **more})
+        body.extend(data + b"\0" * (-len(data) % 4))
+        return len(views) - 1
+
+    accessors: list[dict[str, Any]] = []
+
+    def accessor(values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
+        where = view(np.ascontiguousarray(values).tobytes(), target=target)
+        accessors.append({"bufferView": where, "componentType": component, "count": len(values), "type": kind, **more})
+        return len(accessors) - 1
+
+    vertices = obj.vertices.astype("<f4")
+    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
+    attributes = {
+        "POSITION": accessor(vertices, "VEC3", FLOAT, ARRAY_BUFFER, **bounds),
+        "NORMAL": accessor(obj.normals.astype("<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
+        "TEXCOORD_0": accessor(obj.uv.astype("<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
+    }
+    indices = accessor(obj.faces.astype("<u4").reshape(-1), "SCALAR", UNSIGNED, ELEMENT_BUFFER)
+    images = [
+        {"bufferView": view(png_bytes(pixels)), "mimeType": "image/png", "name": name}
+        for name, pixels in pictures.items()
+    ]
+    index = {name: {"index": k} for k, name in enumerate(pictures)}
+    material: dict[str, Any] = {
+        "name": obj.name,
+        "doubleSided": True,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": index["base_color"],
+            "metallicRoughnessTexture": index["metallic_roughness"],
+        },
+    }
+    if "normal" in index:
+        material["normalTexture"] = index["normal"]
+    node: dict[str, Any] = {"mesh": 0, "name": obj.name}
+    if place is not None:
+        node |= {"translation": place.center.tolist(), "scale": [place.radius] * 3}
+    document = {
+        "asset": {"version": "2.0", "generator": f"unirender {importlib.metadata.version('unirender')}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [material],
+        "textures": [{"source": k, "sampler": 0} for k in range(len(images))],
+        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": REPEAT, "wrapT": REPEAT}],
+        "images": images,
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(body), BINARY_CHUNK) + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def texture_pixels(obj: MeshObject) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
+    """The pictures of the material: `base_color`, `metallic_roughness` and, where there is one, `normal`.
+
+    Roughness and metallic share a picture: the smaller of them is interpolated to the size of the larger.
+
+    Raises:
+        UnirenderError: the object lacks texture coordinates or a texture.
+    """
+    if obj.uv is None or obj.albedo.ndim != 3 or obj.roughness is None or obj.metallic is None:
+        raise UnirenderError(
+            f"{obj.name}: has no uv, or no albedo, roughness or metallic texture; expected all of them"
+        )
+    height, width = np.max([obj.roughness.shape, obj.metallic.shape], axis=0).tolist()
+    roughness, metallic = (refined(plane[..., None], height, width) for plane in (obj.roughness, obj.metallic))
+    pixels = {
+        "base_color": _bytes(srgb_encode(obj.albedo)),
+        "metallic_roughness": _bytes(np.concatenate([np.zeros_like(roughness), roughness, metallic], axis=-1)),
+    }
+    if obj.normal_map is not None:
+        pixels["normal"] = _bytes((obj.normal_map + 1) / 2)
+    return pixels
+
+
+def _bytes(values: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def png_bytes(pixels: UInt8[np.ndarray, "h w *c"]) -> bytes:
+    """An 8-bit PNG."""
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format="PNG", optimize=False)
+    return stream.getvalue()

@@ -1,0 +1,86 @@
+"""The last act of a run: everything it found goes into its folder, `solution.json` last."""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from unirender_reference.optimize.export import SOLUTION_FILE, write_record, write_solution
+from unirender_reference.optimize.plots import loss_curve
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.state import RunFolder
+from unirender_reference.optimize.strips import found_images, psnr_db, turntable, views_strip
+from unirender_reference.optimize.views import Views
+from unirender_reference.shapes import Sphere
+
+PART = ".result.part"
+SPP = 64
+
+
+def write_result(
+    solution: Solution,
+    views: Views,
+    folder: RunFolder,
+    header: Mapping[str, Any],
+    place: Sphere | None = None,
+    *,
+    pictures: bool = True,
+) -> dict[str, Any]:
+    """Writes all files of a result; each appears whole, and `solution.json` after all others.
+
+    Args:
+        solution: what was found.
+        views: what it was found from.
+        folder: of the run.
+        header: what the run was given.
+        place: where the object stands in its own units.
+        pictures: whether to render a turntable and strips of the views.
+
+    Returns:
+        The content of `solution.json`.
+    """
+    temporary = folder.out / PART
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    write_solution(solution, temporary, place)
+    every = (*views.seen, *views.held_out)
+    found = found_images(solution, every, SPP)
+    if pictures:
+        views_strip(views, found).save(temporary / "views.png")
+        turntable(solution).save(temporary / "turntable.png")
+    history = folder.history()
+    loss_curve(history, temporary / "loss.png")
+    count = len(views.seen)
+    figures = {"seen_psnr_db": psnr_db(views, views.seen, found[:count])}
+    if views.held_out:
+        figures["held_out_psnr_db"] = psnr_db(views, views.held_out, found[count:])
+    record = {
+        "object": solution.obj.name,
+        "figures": {name: round(value, 3) for name, value in figures.items()},
+        "figures_are": f"masked PSNR of display values, {SPP} spp",
+        "views": {"seen": count, "held_out": len(views.held_out), "hdr": views.hdr},
+        "size": [views.height, views.width],
+        "stages": stage_table(history),
+        "place": None if place is None else {"center": place.center.tolist(), "radius": place.radius},
+        **header,
+    }
+    write_record(temporary, record)
+    _move_in(temporary, folder.out)
+    return record
+
+
+def stage_table(history: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Steps of each stage, and the second of the run at its last step."""
+    rows: dict[str, dict[str, Any]] = {}
+    for line in history:
+        rows[line["stage"]] = {"stage": line["stage"], "steps": line["iteration"], "seconds": line["seconds"]}
+    return list(rows.values())
+
+
+def _move_in(temporary: Path, out: Path) -> None:
+    for path in sorted(temporary.iterdir(), key=lambda path: path.name == SOLUTION_FILE):
+        target = out / path.name
+        if target.is_dir():
+            shutil.rmtree(target)
+        path.replace(target)
+    temporary.rmdir()

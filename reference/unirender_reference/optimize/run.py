@@ -1,0 +1,226 @@
+"""An optimisation from several views, stage by stage: [shape] -> transport -> refinement [-> shape -> refinement].
+
+With a folder it can be killed at any time and goes on where it was (`state`); what it finds is the same, bit for bit,
+as far as the renderer is: `docs/optimization.md` says how far.
+"""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from unirender.errors import UnirenderError
+from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.export import SOLUTION_FILE
+from unirender_reference.optimize.refine import RefineConfig, RefineState, refine
+from unirender_reference.optimize.report import Progress, Report
+from unirender_reference.optimize.result import write_result
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
+from unirender_reference.optimize.state import RunFolder, fingerprint, open_run
+from unirender_reference.optimize.uv import charted
+from unirender_reference.optimize.views import Step, Views
+from unirender_reference.optimize.watch import FIGURE, Watch
+from unirender_reference.shapes import MeshObject, Sphere
+from unirender_reference.versions import versions
+
+SHAPE, TRANSPORT, REFINE, RESHAPE = "shape", "transport", "refine", "reshape"
+
+
+def optimize(
+    views: Views,
+    obj: MeshObject | None,
+    config: OptimizeConfig,
+    out: Path | None = None,
+    init: Solution | None = None,
+    progress: Progress | None = None,
+    place: Sphere | None = None,
+    pictures: bool = True,
+    threads: int = 0,
+) -> Solution:
+    """Finds textures, light and, where it is not given, the shape of an object from pictures of it.
+
+    Args:
+        views: pictures with cameras; the object lies in the unit sphere of their world.
+        obj: the mesh; None: it is reconstructed from the masks. Its own textures do not count. A mesh without
+            texture coordinates of its own for each point of the surface gets new ones.
+        config: the stages.
+        out: folder of the run, which goes on where an earlier process left it; None: nothing is written.
+        init: a start instead of the transport stage (and of `obj`).
+        progress: called after every step.
+        place: where the object stands in its own units, for the mesh file.
+        pictures: whether to render strips to look at, too.
+        threads: of the renderer; 0: as many as it has. With one, equal runs give equal bytes; with more, sums of
+            derivatives round in another order each time.
+
+    Raises:
+        UnirenderError: the folder holds another run, or what a stage says.
+    """
+    config.check()
+    if init is not None and obj is not None:
+        raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")
+    header = {
+        "config": {name: value for name, value in dataclasses.asdict(config).items() if name != "save_seconds"},
+        "inputs": fingerprint(views, obj, init),
+        "versions": versions(denoise=False),
+    }
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(renderer_threads(threads))
+        folder = None if out is None else stack.enter_context(open_run(out, header))
+        run = _Run(views, config, folder, progress or (lambda report: None), _plan(obj, init, config))
+        solution = run.solution(obj, init)
+        if folder is not None and not (folder.progress.live.get("written") and (folder.out / SOLUTION_FILE).is_file()):
+            write_result(solution, views, folder, header, place, pictures=pictures)
+            folder.save(run.seconds, {"written": True})
+    return solution
+
+
+@contextlib.contextmanager
+def renderer_threads(count: int) -> Iterator[None]:
+    """Lets Dr.Jit work with this many threads; 0: as it is."""
+    from unirender_reference.backend import mitsuba
+
+    mitsuba()
+    import drjit as dr
+
+    before = dr.thread_count()
+    if count:
+        dr.set_thread_count(count)
+    try:
+        yield
+    finally:
+        if count:
+            dr.set_thread_count(before)
+
+
+def _plan(obj: MeshObject | None, init: Solution | None, config: OptimizeConfig) -> list[str]:
+    stages = [] if init is not None else [TRANSPORT]
+    if obj is None and init is None:
+        stages = [SHAPE, *stages]
+    stages.append(REFINE)
+    if SHAPE in stages:
+        stages += [name for k in range(1, config.shape_rounds + 1) for name in (f"{RESHAPE}-{k}", f"{REFINE}-{k}")]
+    return stages
+
+
+class _Run:
+    """The stages of one process."""
+
+    def __init__(
+        self, views: Views, config: OptimizeConfig, folder: RunFolder | None, show: Progress, plan: list[str]
+    ) -> None:
+        self.views, self.config, self.folder, self.plan = views, config, folder, plan
+        self._show = show
+        self._began = time.perf_counter()
+        self._before = 0.0 if folder is None else folder.progress.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Of all processes of the run."""
+        return self._before + time.perf_counter() - self._began
+
+    def solution(self, obj: MeshObject | None, init: Solution | None) -> Solution:
+        """The result of all stages."""
+        found: Solution | MeshObject | None = obj if init is None else init
+        if isinstance(found, MeshObject):
+            found = charted(found, self.config.texture_size)
+        for name in self.plan:
+            done = None if self.folder is None else self.folder.result(name)
+            found = self._stage(name, found) if done is None else done
+            if done is None and self.folder is not None:
+                self.folder.finish(name, found, self.seconds)
+        assert isinstance(found, Solution)  # every plan has a refinement
+        return found
+
+    def _stage(self, name: str, found: Solution | MeshObject | None) -> Solution | MeshObject:
+        kind, config = name.split("-")[0], self.config
+        shape = dataclasses.replace(config.shape, seed=config.shape.seed + config.seed)
+        if kind == SHAPE:
+            from unirender_reference.optimize.shape.reconstruct import reconstruct
+
+            return reconstruct(self.views, shape, self._on_step(name, shape.mask_steps))
+        if kind == TRANSPORT:
+            from unirender_reference.optimize.solve import solve_appearance
+
+            assert isinstance(found, MeshObject)
+            return solve_appearance(
+                self.views,
+                found,
+                config.transport,
+                self._on_step(name, None),
+                config.texture_size,
+                config.light_rows,
+                config.seed,
+            )
+        assert isinstance(found, Solution)
+        if kind == RESHAPE:
+            from unirender_reference.optimize.shape.refine_shape import refine_shape
+
+            return refine_shape(self.views, found, shape, self._on_step(name, shape.image_steps))
+        return self._refine(name, found)
+
+    def _on_step(self, name: str, total: int | None, first: int = 0) -> Callable[[Step], bool]:
+        """Records and shows every step of a stage, under its name and with the clock of the run.
+
+        Args:
+            name: of the stage.
+            total: its steps.
+            first: its steps in earlier processes.
+        """
+        began = time.perf_counter()
+
+        def on_step(step: Step) -> bool:
+            step = dataclasses.replace(step, stage=name, seconds=round(self.seconds, 3))
+            if self.folder is not None:
+                self.folder.record(step)
+            pace = (time.perf_counter() - began) / max(step.iteration - first, 1)
+            remaining = None if total is None else pace * (total - step.iteration)
+            self._show(Report(step, self.plan.index(name) + 1, len(self.plan), total, remaining))
+            return True
+
+        return on_step
+
+    def _refine(self, name: str, start: Solution) -> Solution:
+        config = dataclasses.replace(self.config.refine, seed=self.config.refine.seed + self.config.seed)
+        if not config.enabled:
+            return start
+        state, watch = RefineState.begin(start, config), Watch(self.config.patience)
+        if self.folder is not None and self.folder.progress.live.get("stage") == name:
+            state, watch = self._restored(start, self.folder, config)
+        note = self._on_step(name, config.iterations, state.iteration)
+        saved = time.perf_counter()
+
+        def on_step(step: Step) -> bool:
+            nonlocal saved
+            note(step)
+            if FIGURE in step.values and watch.look(step.iteration, step.values[FIGURE]):
+                watch.best = state.solution(start, config)
+            if self.folder is not None and time.perf_counter() - saved >= self.config.save_seconds:
+                self._save(name, self.folder, state, watch)
+                saved = time.perf_counter()
+            return not watch.enough
+
+        if not watch.enough:
+            refine(self.views, start, config, on_step, state)
+        return watch.best if watch.patience and watch.best is not None else state.solution(start, config)
+
+    def _save(self, name: str, folder: RunFolder, state: RefineState, watch: Watch) -> None:
+        live: dict[str, Any] = {"stage": name, "state": f"{name}-{state.iteration}.npz", "best": None}
+        state.save(folder.state / live["state"])
+        if watch.best is not None:
+            live["best"] = f"{name}-best-{watch.best_iteration}.npz"
+            if not (folder.state / live["best"]).exists():
+                write_solution_file(folder.state / live["best"], watch.best)
+        live |= {"best_db": watch.best_db, "best_iteration": watch.best_iteration, "stale": watch.stale}
+        folder.save(self.seconds, live)
+
+    def _restored(self, start: Solution, folder: RunFolder, config: RefineConfig) -> tuple[RefineState, Watch]:
+        live = folder.progress.live
+        state = RefineState.load(folder.state / live["state"], start, config)
+        watch = Watch(self.config.patience, live["best_db"], live["best_iteration"], live["stale"])
+        if live["best"] is not None:
+            best = read_solution_file(folder.state / live["best"])
+            watch.best = best if isinstance(best, Solution) else None
+        return state, watch

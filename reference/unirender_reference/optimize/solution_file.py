@@ -1,0 +1,50 @@
+"""Objects and solutions as npz files: every array bit for bit, for runs that go on."""
+
+import dataclasses
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unirender.errors import UnirenderError
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.shapes import MeshObject
+
+ARRAYS = tuple(
+    field.name for field in dataclasses.fields(MeshObject) if field.name not in ("name", "family", "provenance")
+)
+_TEXT, _ENVIRONMENT = "text", "environment"
+
+
+def write_solution_file(path: Path, found: Solution | MeshObject) -> None:
+    """Writes a solution, or an object alone; a killed run leaves no part of a file."""
+    obj = found.obj if isinstance(found, Solution) else found
+    arrays = {name: getattr(obj, name) for name in ARRAYS if getattr(obj, name) is not None}
+    arrays |= {_ENVIRONMENT: found.environment} if isinstance(found, Solution) else {}
+    text = json.dumps({"name": obj.name, "family": obj.family, "provenance": dict(obj.provenance)})
+    temporary = path.with_name(f".{path.name}.part")
+    with temporary.open("wb") as file:
+        np.savez(file, **arrays, text=np.array(text))
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_solution_file(path: Path) -> Solution | MeshObject:
+    """What `write_solution_file` wrote.
+
+    Raises:
+        UnirenderError: the file is missing or broken.
+    """
+    try:
+        with np.load(path) as file:
+            arrays: dict[str, Any] = {name: file[name] for name in file.files}
+        text = json.loads(str(arrays.pop(_TEXT)))
+        environment = arrays.pop(_ENVIRONMENT, None)
+        obj = MeshObject(**text, **arrays)
+    except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
+        raise UnirenderError(f"{path}: no readable state ({error}); delete the folder to begin anew") from error
+    return obj if environment is None else Solution(obj, environment)

@@ -1,0 +1,176 @@
+"""`transforms.json`, the file that NeRF's data sets, instant-ngp and nerfstudio describe posed pictures with.
+
+    {"camera_angle_x": 0.69, "frames": [{"file_path": "./train/r_0", "transform_matrix": [[...], ...]}, ...]}
+
+Poses are camera to world with +x right, +y up and +z towards the viewer, as everywhere here. The field of view is
+`camera_angle_x` (radians, across the width) or the focal length `fl_x`, `fl_y` in pixels with `cx`, `cy`; each of them
+stands at the top or, for one picture, in its frame. Pixels count in a picture of `w` x `h`, where these are given.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+
+SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp")  # tried where a path of a picture has none
+PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+ASPECT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a `transforms.json`.
+
+    Attributes:
+        file: the picture.
+        mask: a picture of the coverage, or None.
+        pose: (4, 4) camera to world.
+        held_out: whether the file says so.
+        values: what it says of the lens: the frame's own keys over those of the whole file.
+        name: as the file has it, for messages.
+    """
+
+    file: Path
+    mask: Path | None
+    pose: Float[np.ndarray, "4 4"]
+    held_out: bool
+    values: Mapping[str, Any]
+    name: str
+
+    def camera(self, height: int, width: int) -> Camera:
+        """The camera of the picture, which has this size in pixels.
+
+        Raises:
+            UnirenderError: no field of view, one out of its range, a distorted lens, or pixels that are not square.
+        """
+        self._check_lens()
+        stated = (self._number("h", height), self._number("w", width))
+        scale = height / stated[0]
+        if min(stated) <= 0 or abs(width / stated[1] / scale - 1) > ASPECT_TOLERANCE:
+            raise UnirenderError(
+                f"{self.name}: the picture is {width} x {height}, w and h say {stated[1]:g} x {stated[0]:g}; expected "
+                "the same proportions"
+            )
+        focal = self._focal(stated[1], stated[0]) * scale
+        center = (self._number("cx", stated[1] / 2) * scale, self._number("cy", stated[0] / 2) * scale)
+        try:
+            fov_deg = math.degrees(2 * math.atan(height / (2 * focal)))
+            return Camera(fov_deg, (center[0] / width, center[1] / height))
+        except (UnirenderError, ZeroDivisionError) as error:
+            raise UnirenderError(f"{self.name}: focal length {focal:g} pixels, expected more than 0") from error
+
+    def _focal(self, width: float, height: float) -> float:
+        """In pixels of the stated size."""
+        if "fl_x" in self.values or "fl_y" in self.values:
+            focal_y = self._number("fl_y", self._number("fl_x", 0.0))
+            focal_x = self._number("fl_x", focal_y)
+            if focal_y <= 0 or abs(focal_x / focal_y - 1) > ASPECT_TOLERANCE:
+                raise UnirenderError(
+                    f"{self.name}: fl_x {focal_x:g} and fl_y {focal_y:g}, expected one positive focal length (square "
+                    "pixels); resample the picture"
+                )
+            return focal_y
+        for key, side in (("camera_angle_x", width), ("camera_angle_y", height)):
+            if key in self.values:
+                angle = self._number(key, 0.0)
+                if not 0 < angle < math.pi:
+                    raise UnirenderError(
+                        f"{self.name}: {key} {angle:g}, expected radians between 0 and pi; is it in degrees?"
+                    )
+                return side / (2 * math.tan(angle / 2))
+        raise UnirenderError(f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y)")
+
+    def _check_lens(self) -> None:
+        model = self.values.get("camera_model", "PINHOLE")
+        if model not in PINHOLE:
+            raise UnirenderError(f"{self.name}: camera_model {model!r}, expected a pinhole; undistort the pictures")
+        bent = [key for key in DISTORTION if self._number(key, 0.0) != 0]
+        if bent:
+            raise UnirenderError(
+                f"{self.name}: the lens is distorted ({', '.join(bent)} not 0), expected a pinhole camera; undistort "
+                "the pictures (COLMAP: image_undistorter) and set these to 0"
+            )
+
+    def _number(self, key: str, default: float) -> float:
+        value = self.values.get(key, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise UnirenderError(f"{self.name}: {key} is {value!r}, expected a finite number")
+        return float(value)
+
+
+def read_transforms(path: Path) -> list[Frame]:
+    """The frames of a `transforms.json`, in its order; no picture is opened.
+
+    Raises:
+        UnirenderError: the file is missing or no such JSON, has no frames, or one of them lacks something.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected a transforms.json") from error
+    except ValueError as error:
+        raise UnirenderError(f"{path}: not valid JSON ({error}), expected a transforms.json") from error
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise UnirenderError(f"{path}: has no frames, expected a list of file_path and transform_matrix under 'frames'")
+    shared = {key: value for key, value in content.items() if key != "frames"}
+    return [_frame(path, index, entry, shared) for index, entry in enumerate(frames)]
+
+
+def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any]) -> Frame:
+    where = f"{path}: frames[{index}]"
+    if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+        raise UnirenderError(f"{where} has no file_path, expected the path of a picture")
+    held_out = entry.get("held_out", False)
+    if not isinstance(held_out, bool):
+        raise UnirenderError(f"{where}: held_out is {held_out!r}, expected true or false")
+    mask = entry.get("mask_path")
+    if mask is not None and not isinstance(mask, str):
+        raise UnirenderError(f"{where}: mask_path is {mask!r}, expected the path of a picture")
+    return Frame(
+        file=_picture_file(path.parent, entry["file_path"], where),
+        mask=None if mask is None else path.parent / mask,
+        pose=_pose(entry, where),
+        held_out=held_out,
+        values={**shared, **entry},
+        name=f"{where} ({entry['file_path']})",
+    )
+
+
+def _picture_file(folder: Path, name: str, where: str) -> Path:
+    """The picture, whose suffix may be left out."""
+    if (folder / name).is_file():
+        return folder / name
+    found = [folder / (name + suffix) for suffix in SUFFIXES if (folder / (name + suffix)).is_file()]
+    if len(found) > 1:
+        names = " and ".join(file.name for file in found)
+        raise UnirenderError(f"{where}: {name} may be {names}; write the suffix into file_path")
+    if not found:
+        raise UnirenderError(
+            f"{where}: no picture {folder / name}, expected a file (or one with {', '.join(SUFFIXES)} behind it)"
+        )
+    return found[0]
+
+
+def _pose(entry: Mapping[str, Any], where: str) -> Float[np.ndarray, "4 4"]:
+    try:
+        pose = np.asarray(entry.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError):
+        pose = np.zeros(0)
+    if pose.shape == (3, 4):
+        pose = np.concatenate([pose, [[0, 0, 0, 1]]])
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
+        raise UnirenderError(
+            f"{where}: transform_matrix is no 4 x 4 matrix of finite numbers with the last row 0 0 0 1; expected "
+            "camera to world"
+        )
+    return pose

@@ -1,0 +1,259 @@
+"""Folders of posed pictures: round trips, the dialects of transforms.json, and one sentence for each bad folder."""
+
+import json
+import math
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from posed_views import painted_view, painted_views
+
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, write_exr
+from unirender_reference.optimize.folder import read_views, reduced, write_views
+from unirender_reference.optimize.views import Views
+
+
+def same_views(a: Views, b: Views, tolerance: float) -> None:
+    assert (len(a.seen), len(a.held_out), a.hdr) == (len(b.seen), len(b.held_out), b.hdr)
+    for one, other in zip((*a.seen, *a.held_out), (*b.seen, *b.held_out), strict=True):
+        np.testing.assert_allclose(one.image, other.image, rtol=0, atol=tolerance)
+        np.testing.assert_array_equal(one.mask, other.mask)
+        np.testing.assert_array_equal(one.pose, other.pose)
+        assert other.camera.fov_deg == pytest.approx(one.camera.fov_deg, abs=1e-9)
+        assert other.camera.principal == pytest.approx(one.camera.principal, abs=1e-12)
+
+
+def test_display_pictures_come_back_bit_for_bit(tmp_path: Path):
+    views = painted_views()
+    write_views(views, tmp_path / "set")
+    same_views(views, read_views(tmp_path / "set"), 0.0)
+
+
+def test_linear_pictures_come_back_to_rounding(tmp_path: Path):
+    views = painted_views(hdr=True)
+    write_views(views, tmp_path / "set")
+    same_views(views, read_views(tmp_path / "set"), 2e-6)  # of values up to 4, premultiplied and divided again
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_views(painted_views(4, 0), tmp_path / "set")
+    return tmp_path / "set"
+
+
+def edited(folder: Path, change: Callable[[dict], object], name: str = "transforms.json") -> Path:
+    path = folder / name
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    return folder
+
+
+def test_angle_of_view_across_the_width_is_the_same_camera(folder: Path):
+    views = read_views(folder)
+    focal = 12 / (2 * math.tan(math.radians(18)))
+
+    def as_angle(content: dict) -> None:
+        content["camera_angle_x"] = 2 * math.atan(16 / (2 * focal))
+        for frame in content["frames"]:
+            for key in ("fl_x", "fl_y", "cx", "cy"):
+                del frame[key]
+
+    same_views(views, read_views(edited(folder, as_angle)), 0.0)
+
+
+def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path):
+    """Pictures at half the stated size (instant-ngp's images_2) have the same camera."""
+    views = read_views(folder)
+
+    def doubled(content: dict) -> None:
+        content["w"], content["h"] = 32, 24
+        for frame in content["frames"]:
+            for key in ("fl_x", "fl_y", "cx", "cy"):
+                frame[key] *= 2
+
+    same_views(views, read_views(edited(folder, doubled)), 0.0)
+
+
+def test_pictures_without_suffix_in_the_layout_of_nerf_synthetic(folder: Path):
+    def plain(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
+
+    edited(folder, plain)
+    (folder / "transforms.json").rename(folder / "transforms_train.json")
+    shutil.copy(folder / "images/0000.png", folder / "images/other.png")
+    one = json.loads((folder / "transforms_train.json").read_text())
+    one["frames"] = [{**one["frames"][0], "file_path": "images/other"}]
+    (folder / "transforms_val.json").write_text(json.dumps(one))
+    views = read_views(folder)
+    assert (len(views.seen), len(views.held_out)) == (4, 1)
+    np.testing.assert_array_equal(views.held_out[0].image, views.seen[0].image)
+
+
+def test_held_out_by_mark_and_by_number(folder: Path):
+    edited(folder, lambda content: content["frames"][1].update(held_out=True))
+    assert [view.name for view in read_views(folder).held_out] == ["images/0001.png"]
+    views = read_views(folder, hold_out=3)
+    assert [view.name for view in views.held_out] == ["images/0001.png", "images/0003.png"]
+    assert [view.name for view in views.seen] == ["images/0000.png", "images/0002.png"]
+    assert [view.name for view in read_views(folder, most_views=2).seen] == ["images/0000.png", "images/0002.png"]
+
+
+def test_mask_files_stand_in_for_alpha(folder: Path):
+    views = read_views(folder)
+    for index, view in enumerate(views.seen):
+        file = folder / f"images/{index:04d}.png"
+        Image.open(file).convert("RGB").save(file)
+        Image.fromarray(np.round(view.mask[..., 0] * 255).astype(np.uint8)).save(folder / f"mask{index}.png")
+
+    def with_masks(content: dict) -> None:
+        for index, frame in enumerate(content["frames"]):
+            frame["mask_path"] = f"mask{index}.png"
+
+    same_views(views, read_views(edited(folder, with_masks)), 0.0)
+
+
+def test_z_up_turns_the_world_and_not_the_pictures(folder: Path):
+    """A camera above a z-up world looks down from +y, and its right stays its right in the picture."""
+    plain, turned = read_views(folder), read_views(folder, up="z")
+    for one, other in zip(plain.seen, turned.seen, strict=True):
+        x, y, z = one.pose[:3, 3]
+        np.testing.assert_allclose(other.pose[:3, 3], [x, z, -y], atol=1e-6)
+        np.testing.assert_array_equal(one.image, other.image)
+    np.testing.assert_allclose(np.linalg.det(turned.seen[0].pose[:3, :3]), 1, atol=1e-5)
+
+
+def test_reduced_pictures_keep_light_and_rays():
+    """Light per solid angle of a constant disc, and where a point is seen, do not change."""
+    view = painted_view(0, (60, 90))
+    small = reduced(view, 30, linear=False)
+    assert small.mask.shape == (20, 30, 1)
+    light = (srgb_decode(view.image) * view.mask).mean()
+    assert (srgb_decode(small.image) * small.mask).mean() == pytest.approx(light, rel=1e-4)
+    odd = reduced(view, 32, linear=False)  # 90/32 does not divide 60: less than a pixel is cut off
+    assert odd.mask.shape == (21, 31, 1)
+    for other in (small, odd):
+        pitch = math.tan(math.radians(other.camera.fov_deg) / 2) / other.mask.shape[0]
+        wide = math.tan(math.radians(view.camera.fov_deg) / 2) / 60
+        assert pitch / wide == pytest.approx(60 / (21 if other is odd else 20), rel=1e-6)
+        np.testing.assert_allclose(other.camera.rays(*other.mask.shape[:2]).mean((0, 1))[:2], 0, atol=1e-6)
+    twin = reduced(view, 30, linear=True)  # means of display values are another picture
+    assert abs((srgb_decode(twin.image) * twin.mask).mean() / light - 1) > 0.05
+
+
+def broken(change: Callable[[dict], object]) -> Callable[[Path], object]:
+    return lambda folder: edited(folder, change)
+
+
+def first(**values: object) -> Callable[[Path], object]:
+    return broken(lambda content: content["frames"][0].update(values))
+
+
+def without(key: str) -> Callable[[Path], object]:
+    return broken(lambda content: content["frames"][0].pop(key))
+
+
+def cut(folder: Path) -> None:
+    path = folder / "images/0000.png"
+    path.write_bytes(path.read_bytes()[:60])
+
+
+def opaque(folder: Path) -> None:
+    Image.open(folder / "images/0000.png").convert("RGB").save(folder / "images/0000.png")
+
+
+def empty_mask(folder: Path) -> None:
+    image = np.zeros((12, 16, 4), np.uint8)
+    Image.fromarray(image).save(folder / "images/0000.png")
+
+
+def negative_exr(folder: Path) -> None:
+    for index in range(4):
+        write_exr(folder / f"images/{index}.exr", image_channels(np.full((12, 16, 4), -1.0 if index == 2 else 1.0)))
+    edited(folder, lambda content: [f.update(file_path=f"images/{i}.exr") for i, f in enumerate(content["frames"])])
+
+
+def mixed(folder: Path) -> None:
+    write_exr(folder / "one.exr", image_channels(np.ones((12, 16, 4))))
+    edited(folder, lambda content: content["frames"][0].update(file_path="one.exr"))
+
+
+def two_kinds(folder: Path) -> None:
+    shutil.copy(folder / "images/0000.png", folder / "images/0000.jpg")
+    edited(folder, lambda content: content["frames"][0].update(file_path="images/0000"))
+
+
+def other_size(folder: Path) -> None:
+    Image.open(folder / "images/0000.png").resize((32, 24)).save(folder / "images/0000.png")
+
+
+def seen_and_held_out(folder: Path) -> None:
+    shutil.copy(folder / "transforms.json", folder / "transforms_test.json")
+
+
+IDENTITY = np.eye(4).tolist()
+BAD = {
+    "no file": (lambda folder: (folder / "transforms.json").unlink(), "has no transforms.json"),
+    "no JSON": (lambda folder: (folder / "transforms.json").write_text("{"), "not valid JSON"),
+    "not UTF-8": (lambda folder: (folder / "transforms.json").write_bytes(b"\xff\xfe{"), "not valid JSON"),
+    "a list": (lambda folder: (folder / "transforms.json").write_text("[]"), "has no frames"),
+    "no frames": (broken(lambda content: content.update(frames=[])), "has no frames"),
+    "no path": (without("file_path"), r"frames\[0\] has no file_path"),
+    "no picture": (first(file_path="gone"), "no picture .*gone"),
+    "two pictures": (two_kinds, "may be 0000.png and 0000.jpg"),
+    "no pose": (without("transform_matrix"), "transform_matrix is no 4 x 4 matrix"),
+    "text as pose": (first(transform_matrix="left"), "transform_matrix is no 4 x 4 matrix"),
+    "ragged pose": (first(transform_matrix=[[1, 0], [0]]), "transform_matrix is no 4 x 4 matrix"),
+    "NaN pose": (first(transform_matrix=[[math.nan] * 4] * 4), "transform_matrix is no 4 x 4 matrix"),
+    "transposed pose": (first(transform_matrix=(np.eye(4) + np.eye(4, k=-3)).tolist()), "last row 0 0 0 1"),
+    "scaled pose": (first(transform_matrix=np.diag([2, 2, 2, 1]).tolist()), "without scale or mirroring"),
+    "mirrored pose": (first(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "without scale or mirroring"),
+    "no lens": (
+        broken(lambda c: [[f.pop(k) for k in ("fl_x", "fl_y")] for f in c["frames"]]),
+        "no field of view, expected camera_angle_x or fl_x",
+    ),
+    "degrees": (
+        broken(lambda c: [[f.pop(k) for k in ("fl_x", "fl_y")] for f in c["frames"]] and c.update(camera_angle_x=36)),
+        "is it in degrees",
+    ),
+    "focal 0": (first(fl_x=0, fl_y=0), "expected one positive focal length"),
+    "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
+    "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
+    "distortion": (first(k1=0.1), r"distorted \(k1 not 0\)"),
+    "fisheye": (first(camera_model="OPENCV_FISHEYE"), "expected a pinhole"),
+    "proportions": (broken(lambda content: content.update(w=100, h=100)), "expected the same proportions"),
+    "held_out text": (first(held_out="yes"), "held_out is 'yes', expected true or false"),
+    "all held out": (
+        broken(lambda content: [frame.update(held_out=True) for frame in content["frames"]]),
+        "all 4 pictures are held out",
+    ),
+    "seen and held out": (seen_and_held_out, "is both seen and held out"),
+    "no mask": (opaque, "has no alpha channel, and its frame no mask_path"),
+    "empty mask": (empty_mask, "the mask is empty"),
+    "mask missing": (first(mask_path="gone.png"), "gone.png: no such file"),
+    "mask number": (first(mask_path=3), "mask_path is 3"),
+    "cut picture": (cut, "not a readable picture"),
+    "mixed kinds": (mixed, "has EXR beside other pictures"),
+    "negative radiance": (negative_exr, "2.exr: has negative, infinite or NaN"),
+    "other size": (other_size, "expected one size"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_folders_are_one_sentence(folder: Path, name: str):
+    damage, message = BAD[name]
+    damage(folder)
+    with pytest.raises(UnirenderError, match=message) as caught:
+        read_views(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_folder(tmp_path: Path):
+    with pytest.raises(UnirenderError, match="is no folder"):
+        read_views(tmp_path / "nowhere")

@@ -1,0 +1,211 @@
+"""`unirender optimize`: folders in other units with and without a mesh, pictures, and what it refuses."""
+
+import dataclasses
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from optimizer_runs import rendered_views, truth
+from PIL import Image
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.exr import channels_rgb, read_exr
+from unirender.files import read_result, write_png
+from unirender.intrinsics import MAPS, Intrinsics
+from unirender_reference.meshes import load_mesh_placed
+from unirender_reference.optimize.commands import Optimize
+from unirender_reference.optimize.export import write_solution
+from unirender_reference.optimize.folder import write_views
+from unirender_reference.optimize.picture import read_normals, read_picture_input
+from unirender_reference.optimize.placement import placed
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.views import Views
+from unirender_reference.shapes import Sphere
+
+PLACE = Sphere(np.array([4.0, 1.0, -2.0]), 0.5)  # where the object stands in the user's units
+QUICK = [
+    *("--refine.iterations", "2", "--refine.spp", "2", "--refine.spp-gradient", "2", "--refine.depth", "2"),
+    *("--no-progress", "--texture-size", "16", "--light-rows", "8", "--transport.no-enabled"),
+]
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    return truth()
+
+
+@pytest.fixture(scope="module")
+def data(solution: Solution, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of pictures and `mesh.glb`, in units of their own."""
+    folder = tmp_path_factory.mktemp("data")
+    views = placed(rendered_views(solution, seen=6, held_out=1, side=24), inverse(PLACE))
+    write_views(views, folder / "views")
+    write_solution(solution, folder, PLACE)
+    return folder
+
+
+def inverse(place: Sphere) -> Sphere:
+    return Sphere(-place.center / place.radius, 1 / place.radius)
+
+
+def command(*arguments: str | Path) -> Optimize:
+    return tyro.cli(Optimize, args=[*map(str, arguments)])
+
+
+@pytest.mark.slow
+def test_a_folder_with_its_mesh(data: Path, solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "out"
+    assert command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK).run() == 0
+    said = capsys.readouterr().out
+    assert "6 views" in said
+    assert "held_out" in said
+    files = {path.name for path in out.iterdir()}
+    assert files == {
+        *("mesh.glb", "environment.exr", "latlong.exr", "solution.json", "history.jsonl", "mitsuba", "state"),
+        *("views.png", "turntable.png", "loss.png"),
+    }
+    record = json.loads((out / "solution.json").read_text())
+    assert record["views"] == {"seen": 6, "held_out": 1, "hdr": False}
+    assert record["config"]["refine"]["iterations"] == 2
+    assert [row["stage"] for row in record["stages"]] == ["refine"]
+    obj, place = load_mesh_placed(out / "mesh.glb")
+    np.testing.assert_allclose(
+        obj.vertices[obj.faces] * place.radius + place.center,
+        solution.obj.vertices[solution.obj.faces] * PLACE.radius + PLACE.center,
+        atol=1e-5,
+    )
+    assert Image.open(out / "turntable.png").width > 600
+    assert command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK).run() == 0  # again: all there
+    assert capsys.readouterr().out == said
+
+
+@pytest.mark.slow
+def test_a_folder_without_a_mesh(data: Path, solution: Solution, tmp_path: Path):
+    """The reconstruction stands where the object stood, in the units of the poses."""
+    out = tmp_path / "out"
+    quick = [*QUICK, "--shape.cells", "24", "--shape.mask-steps", "2", "--shape.image-steps", "1", "--no-pictures"]
+    assert command(data / "views", "--out", out, *quick).run() == 0
+    record = json.loads((out / "solution.json").read_text())
+    assert [row["stage"] for row in record["stages"]] == ["shape", "refine", "reshape-1", "refine-1"]
+    obj, place = load_mesh_placed(out / "mesh.glb")
+    found = obj.vertices * place.radius + place.center
+    true = solution.obj.vertices * PLACE.radius + PLACE.center
+    for k in (0, 1):
+        bounds = [np.quantile(points, (0.02, 0.98), axis=0)[k] for points in (found, true)]
+        np.testing.assert_allclose(*bounds, atol=0.25 * PLACE.radius)
+
+
+@pytest.mark.slow
+def test_a_warm_start_takes_the_place_of_the_transport(data: Path, tmp_path: Path):
+    calls = []
+
+    def predict(image, mask, camera) -> Intrinsics:
+        calls.append(camera)
+        one = np.ones_like(mask)
+        light = np.full((16, 32, 3), 0.4, np.float32)
+        return Intrinsics(0.3 * np.repeat(one, 3, -1), roughness=0.6 * one, metallic=0.1 * one, environment=light)
+
+    chosen = command(
+        data / "views", "--mesh", data / "mesh.glb", "--out", tmp_path / "o", "--init", "unirender", *QUICK
+    )
+    off = dataclasses.replace(chosen.config, refine=dataclasses.replace(chosen.config.refine, enabled=False))
+    assert dataclasses.replace(chosen, config=off, pictures=False).run(predict) == 0
+    assert len(calls) == 6
+    environment = channels_rgb(read_exr(tmp_path / "o/environment.exr")[0])
+    np.testing.assert_allclose(environment, np.full((8, 16, 3), 0.4), rtol=1e-5)
+    obj, _ = load_mesh_placed(tmp_path / "o/mesh.glb")
+    assert obj.roughness is not None
+    np.testing.assert_allclose(obj.roughness, 0.6, atol=0.003)
+    with pytest.raises(UnirenderError, match="no model at hand"):
+        dataclasses.replace(chosen, out=tmp_path / "p").run()
+
+
+def test_a_mesh_in_other_units_is_refused(data: Path, solution: Solution, tmp_path: Path):
+    write_solution(solution, tmp_path, Sphere(np.zeros(3), 1.0))
+    with pytest.raises(UnirenderError, match="are its units and axes those of the poses"):
+        command(data / "views", "--mesh", tmp_path / "mesh.glb", "--out", tmp_path / "out", *QUICK).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_linear_pictures_are_not_for_the_model(solution: Solution, data: Path, tmp_path: Path):
+    views = rendered_views(solution, 2, 0, 12, hdr=True)
+    write_views(Views(views.seen, (), True), tmp_path / "hdr")
+    write_solution(solution, tmp_path)
+    chosen = command(tmp_path / "hdr", "--mesh", tmp_path / "mesh.glb", "--out", tmp_path / "o", "--init", "unirender")
+    with pytest.raises(UsageError, match="the model sees display pictures"):
+        chosen.run(lambda image, mask, camera: Intrinsics())
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--mask", "m.png"], "--mask: of one picture"),
+        (["--overwrite", "--fov", "40"], "--fov, --overwrite: of one picture"),
+        (["--size", "4"], "--size 4: expected 8 or more"),
+        (["--most-views", "0"], "--most-views 0: expected 1 or more"),
+        (["--hold-out", "1"], "--hold-out 1"),
+        (["--threads", "-1"], "--threads -1"),
+        (["--texture-size", "2"], "--texture-size 2: expected 4 or more"),
+        (["--light-rows", "9"], "--light-rows 9: expected an even number"),
+    ],
+)
+def test_wrong_command_lines_of_a_folder(data: Path, tmp_path: Path, arguments: list[str], message: str):
+    with pytest.raises(UsageError, match=message):
+        command(data / "views", "--out", tmp_path / "out", *arguments).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_wrong_command_lines_of_a_picture(tmp_path: Path):
+    write_png(tmp_path / "one.png", np.ones((12, 12, 4)))
+    for arguments, message in ((["--up", "z"], "--up: of a folder"), (["--hold-out", "3"], "--hold-out: of a folder")):
+        with pytest.raises(UsageError, match=message):
+            command(tmp_path / "one.png", "--out", tmp_path / "out", *arguments).run()
+    with pytest.raises(UnirenderError, match="no such file or folder"):
+        command(tmp_path / "two.png", "--out", tmp_path / "out").run()
+
+
+def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    rng = np.random.default_rng(0)
+    write_png(tmp_path / "one.png", rng.random((12, 16, 3)))
+    normals = rng.normal(size=(12, 16, 3)) + np.array([0, 0, 2])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    write_png(tmp_path / "normal.png", normals / 2 + 0.5)
+    with caplog.at_level(logging.WARNING, "unirender"):
+        given = read_picture_input(tmp_path / "one.png", normal=tmp_path / "normal.png")
+    assert "whole frame" in caplog.text
+    assert "36 degrees assumed" in caplog.text
+    assert given.mask.min() == 1
+    assert given.normal is not None
+    np.testing.assert_allclose(given.normal, normals, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(given.normal, axis=-1), 1, atol=1e-5)
+    half = np.zeros((12, 16, 1), np.float32)
+    half[:, :8] = 1
+    assert not read_normals(tmp_path / "normal.png", half)[:, 8:].any()
+    with pytest.raises(UnirenderError, match="16 x 12 pixels, expected 20 x 10"):
+        read_normals(tmp_path / "normal.png", np.ones((10, 20, 1), np.float32))
+    write_png(tmp_path / "flat.png", np.full((12, 16, 3), 0.5))
+    with pytest.raises(UnirenderError, match="have no normal"):
+        read_normals(tmp_path / "flat.png", half)
+
+
+@pytest.mark.slow
+def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    view = rendered_views(solution, 1, 0, 20).seen[0]
+    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+    few = ["--fov", "36", "--no-progress", "--single.steps", "1", "--single.noise", "0.1", "--single.fine-steps", "1"]
+    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", "--single.light-rows", "8", *few)
+    assert chosen.run() == 0
+    found = read_result(tmp_path / "out")
+    assert found.present == tuple(MAPS)
+    assert (found.height, found.width) == (20, 20)
+    assert found.environment is not None
+    assert found.environment.shape == (8, 16, 3)
+    meta = json.loads((tmp_path / "out/meta.json").read_text())
+    assert (meta["command"], meta["init"], meta["config"]["light_rows"]) == ("optimize", "none", 8)
+    assert (tmp_path / "out/history.jsonl").read_text().count("\n") >= 2
+    with pytest.raises(UnirenderError, match="exists and is not empty"):
+        chosen.run()

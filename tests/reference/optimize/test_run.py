@@ -1,0 +1,238 @@
+"""Runs: killed and resumed to the same bytes, stopped by held-out views, refused where they do not fit."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import optimizer_runs
+import pytest
+from optimizer_runs import CONFIG, REFINE, flat_start, rendered_views, run, truth
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference.optimize.report import Report
+from unirender_reference.optimize.run import optimize
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
+from unirender_reference.optimize.state import HISTORY, PROGRESS, open_run
+from unirender_reference.optimize.views import Step
+from unirender_reference.optimize.watch import Watch
+
+FILES = ("mesh.glb", "environment.exr", "mitsuba/roughness.png", "mitsuba/mesh.ply")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run that nothing interrupted."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    run(out)
+    return out
+
+
+def lines(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / HISTORY).read_text().splitlines()]
+
+
+def values(out: Path) -> list[tuple]:
+    return [(line["stage"], line["iteration"], line["values"]) for line in lines(out)]
+
+
+def killed(out: Path, at: int) -> None:
+    """Begins the run in a process of its own, and kills it once its history has `at` lines."""
+    helper = Path(optimizer_runs.__file__)
+    environment = {**os.environ, "PYTHONPATH": str(helper.parent)}
+    process = subprocess.Popen([sys.executable, str(helper), str(out)], env=environment)
+    history, deadline = out / HISTORY, time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        if history.exists() and history.read_text().count("\n") >= at:
+            break
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    killed(out, 3)
+    assert not (out / "solution.json").exists()
+    assert not (out / "mesh.glb").exists()
+    assert json.loads((out / "state" / PROGRESS).read_text())["lines"] >= 2
+    run(out)
+    for name in FILES:
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    assert values(out) == values(whole)
+    records = [json.loads((folder / "solution.json").read_text()) for folder in (out, whole)]
+    for record in records:
+        del record["stages"]  # seconds
+    assert records[0] == records[1]
+    assert [line["seconds"] for line in lines(out)] == sorted(line["seconds"] for line in lines(out))
+
+
+@pytest.mark.slow
+def test_a_run_that_loses_what_it_saved_ends_elsewhere(whole: Path, tmp_path: Path):
+    """The twin: the saved state is what the run goes on from."""
+    out = tmp_path / "run"
+
+    def stop(report: Report) -> None:
+        if report.step.iteration == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(out, progress=stop)
+    (path,) = [path for path in (out / "state").glob("refine-*.npz") if "best" not in path.name]
+    with np.load(path) as file:
+        arrays = dict(file)
+    arrays["parameter.environment"] = arrays["parameter.environment"] + np.float32(0.1)
+    np.savez(path, **arrays)
+    run(out)
+    assert (out / "environment.exr").read_bytes() != (whole / "environment.exr").read_bytes()
+
+
+def test_the_same_command_again_changes_nothing(whole: Path):
+    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
+    found = run(whole)
+    after = {path: path.stat().st_mtime_ns for path in whole.rglob("*") if path.is_file()}
+    stored = read_solution_file(whole / "state/refine.npz")
+    assert isinstance(stored, Solution)
+    np.testing.assert_array_equal(found.environment, stored.environment)
+    assert {path.name for path in before if before[path] != after.get(path)} <= {".lock"}
+
+
+def test_a_result_that_was_not_finished_is_written_again(whole: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    (out / "solution.json").unlink()
+    (out / "mitsuba/mesh.ply").unlink()
+    (out / ".result.part").mkdir()
+    (out / ".result.part/mesh.glb").write_bytes(b"half")
+    run(out)
+    for path in whole.rglob("*.*"):
+        if path.is_file() and path.parent.name != "state":
+            assert (out / path.relative_to(whole)).read_bytes() == path.read_bytes(), path.name
+    assert not (out / ".result.part").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"config": dataclasses.replace(CONFIG, seed=1)}, "config.seed"),
+        ({"config": dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, spp=8))}, "config.refine"),
+        ({"init": flat_start(truth().obj, 17)}, "inputs.start"),
+    ],
+)
+def test_another_run_is_refused(whole: Path, change: dict, named: str):
+    with pytest.raises(UnirenderError, match=f"holds a run with other {named}"):
+        run(whole, **change)
+
+
+def test_how_often_states_are_saved_is_no_other_run(whole: Path):
+    run(whole, config=dataclasses.replace(CONFIG, save_seconds=99.0))
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(UnirenderError, match="is not empty and holds no run"):
+        run(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_two_processes_on_one_folder(tmp_path: Path):
+    header = {"config": {}, "inputs": {}, "versions": {}}
+    with open_run(tmp_path / "run", header), pytest.raises(UnirenderError, match="another run is writing"):
+        open_run(tmp_path / "run", header).__enter__()
+
+
+def test_history_is_cut_to_what_was_saved(tmp_path: Path):
+    header = {"config": {}, "inputs": {}, "versions": {}}
+    with open_run(tmp_path, header) as folder:
+        folder.record(Step("refine", 1, 0.5, {"loss": 1 / 3}))
+        folder.save(0.5, {})
+        folder.record(Step("refine", 2, 0.7, {}))  # never saved
+        (folder.state / "refine-2.npz").write_bytes(b"orphan")
+        (folder.state / ".refine-2.npz.part").write_bytes(b"orphan")
+    with open_run(tmp_path, header) as folder:
+        assert [line["iteration"] for line in folder.history()] == [1]
+        assert folder.history()[0]["values"] == {"loss": 0.3333333}
+        folder.save(0.5, {})
+        assert sorted(path.name for path in folder.state.iterdir()) == ["progress.json", "run.json"]
+
+
+@pytest.mark.parametrize("damage", ["{", "[]", b"\xff"])
+def test_a_broken_record_is_one_sentence(whole: Path, tmp_path: Path, damage: str | bytes):
+    header = {"config": {}, "inputs": {}, "versions": {}}
+    with open_run(tmp_path, header):
+        pass
+    path = tmp_path / "state/run.json"
+    path.write_bytes(damage if isinstance(damage, bytes) else damage.encode())
+    with pytest.raises(UnirenderError, match=r"run\.json: .*delete the folder"), open_run(tmp_path, header):
+        pass
+
+
+def test_a_broken_state_is_one_sentence(tmp_path: Path):
+    path = tmp_path / "start.npz"
+    write_solution_file(path, truth())
+    back = read_solution_file(path)
+    assert isinstance(back, Solution)
+    for name in ("vertices", "faces", "normals", "uv", "albedo", "roughness", "metallic"):
+        np.testing.assert_array_equal(getattr(back.obj, name), getattr(truth().obj, name))
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(UnirenderError, match="no readable state"):
+        read_solution_file(path)
+
+
+def test_the_best_look_counts_and_patience_ends():
+    watch = Watch(patience=2)
+    assert [watch.look(k, db) for k, db in enumerate((20.0, 21.0, 21.01, 20.5))] == [True, True, False, False]
+    assert watch.enough
+    assert (watch.best_db, watch.best_iteration) == (21.0, 1)
+    endless = Watch(patience=0)
+    for k in range(9):
+        endless.look(k, 20.0)
+    assert not endless.enough
+
+
+def test_a_run_that_gets_worse_is_stopped_and_its_best_state_kept():
+    """A light that moves by a factor of e each step ruins the fit; the best state is not the last."""
+    config = dataclasses.replace(CONFIG, patience=2, refine=dataclasses.replace(REFINE, light_rate=1.0, iterations=40))
+    steps: list[Step] = []
+    found = run(None, config=config, progress=lambda report: steps.append(report.step))
+    assert steps[-1].iteration < 40
+    looks = {step.iteration: step.values["held_out_psnr"] for step in steps if "held_out_psnr" in step.values}
+    best = max(looks, key=lambda iteration: looks[iteration])
+    assert steps[-1].iteration > best
+    again = dataclasses.replace(
+        config, patience=0, refine=dataclasses.replace(config.refine, iterations=steps[-1].iteration)
+    )
+    last = run(None, config=again)
+    assert np.abs(np.log(found.environment) - np.log(last.environment)).max() > 0.1  # not the last state
+
+
+def test_reports_count_down():
+    reports: list[Report] = []
+    run(None, progress=reports.append)
+    assert [report.step.iteration for report in reports] == list(range(1, 9))
+    assert {(report.stage, report.stages, report.total) for report in reports} == {(1, 1, 8)}
+    assert reports[-1].remaining == 0
+    assert all(report.remaining is not None and report.remaining >= 0 for report in reports)
+
+
+def test_refinement_off_returns_the_start():
+    config = dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, enabled=False))
+    start = flat_start(truth().obj)
+    assert run(None, config=config, init=start) is start
+
+
+def test_values_out_of_range():
+    for change in ({"texture_size": 2}, {"patience": -1}, {"seed": -1}, {"save_seconds": float("nan")}):
+        with pytest.raises(UsageError, match="expected"):
+            run(None, config=dataclasses.replace(CONFIG, **change))
+    start = flat_start(truth().obj)
+    with pytest.raises(UnirenderError, match="expected one of them"):
+        optimize(rendered_views(truth()), start.obj, CONFIG, init=start)
