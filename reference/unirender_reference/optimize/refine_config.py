@@ -1,0 +1,96 @@
+"""What the refinement is made of: every ingredient is a field, every field can be switched off."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """Refinement of textures and light by Mitsuba's derivatives."""
+
+    enabled: bool = True
+    """Off: the start is returned as it is."""
+    iterations: int = 60
+    """Steps of Adam."""
+    loss: Literal["log", "srgb", "linear", "relative", "slope"] = "slope"
+    """How pictures are compared; `losses` has the equations. "log" is NvDiffRec's."""
+    one_sided: bool = True
+    """More light than a display shows is no error where the picture is saturated."""
+    spp: int = 16
+    """Samples per pixel of the picture."""
+    spp_gradient: int = 8
+    """Samples per pixel of its derivative."""
+    depth: int = 4
+    """Longest path: 2 is direct light with its shadows, 4 has three bounces."""
+    decorrelated: bool = True
+    """Picture and derivative draw different samples; off: the same, with a biased gradient."""
+    common_random_numbers: bool = False
+    """Every iteration draws the same samples."""
+    parametrisation: Literal["perceptual", "linear"] = "perceptual"
+    """Steps in display values of albedo and logarithms of light, or in the linear values themselves."""
+    albedo_rate: float = 0.01
+    """Learning rate of the albedo, in display values or linear ones."""
+    roughness_rate: float = 0.005
+    """Learning rate of roughness."""
+    metallic_rate: float = 0.005
+    """Learning rate of metallic."""
+    light_rate: float = 0.005
+    """Learning rate of the light, in natural logarithms or linear radiance."""
+    decay: float = 0.1
+    """What is left of the learning rates at the end."""
+    albedo_levels: int = 3
+    """Levels of the albedo's pyramid; 1: texels alone."""
+    material_levels: int = 4
+    """Levels of the pyramid of roughness and metallic."""
+    light_levels: int = 2
+    """Levels of the light's pyramid."""
+    uniform: bool = True
+    """One step length for all texels of a level."""
+    light_rows: int = 0
+    """Rows of the light that is refined: the start is interpolated; 0: as many as the start has."""
+    white_light: float = 0.0
+    """Weight of NvDiffRec's regulariser: mean |E_c - mean E|."""
+    neutral_light: float = 0.0
+    """Weight of the same on logarithms, squared: free of scale."""
+    light_smoothness: float = 0.0
+    """Weight of the smoothness of the light's logarithm."""
+    albedo_smoothness: float = 0.0
+    """Weight of the smoothness of the albedo."""
+    material_smoothness: float = 0.0
+    """Weight of the smoothness of roughness and metallic."""
+    light_anchor: float = 0.0
+    """Weight of the squared distance of the light's logarithm from the start."""
+    material_anchor: float = 0.0
+    """Weight of the squared distance of roughness and metallic from the start."""
+    albedo_anchor: float = 0.0
+    """Weight of the squared distance of the albedo from the start."""
+    demodulated: float = 0.0
+    """Weight of NvDiffRecMC's light regulariser: the light on a white object shall be as bright as the picture."""
+    random_background: bool = False
+    """Pictures are compared over a colour drawn for each iteration."""
+    held_out_every: int = 0
+    """Iterations between measures of the fit to held-out views; 0: never."""
+    seed: int = 0
+    """Equal seeds draw equal samples."""
+
+    @classmethod
+    def plain(cls, iterations: int = 800) -> "RefineConfig":
+        """The loop of Mitsuba's tutorials: Adam, 16 samples, squared error of display values, nothing else."""
+        return cls(
+            iterations=iterations,
+            loss="srgb",
+            one_sided=False,
+            spp=16,
+            spp_gradient=16,
+            decorrelated=True,
+            parametrisation="linear",
+            albedo_rate=0.02,
+            roughness_rate=0.02,
+            metallic_rate=0.02,
+            light_rate=0.02,
+            decay=1.0,
+            albedo_levels=1,
+            material_levels=1,
+            light_levels=1,
+            uniform=False,
+        )

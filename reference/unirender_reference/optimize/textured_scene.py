@@ -1,0 +1,206 @@
+"""All views of a solution as one differentiable Mitsuba scene: numpy in, numpy out.
+
+One launch renders every camera (Mitsuba's `batch` sensor: the pictures lie side by side on one film), and one launch
+differentiates them by path replay (`prb`). Image and gradient are separate calls, with a seed each:
+
+    image = scene.image(maps, spp, seed=2 * step)
+    gradients = scene.gradients(maps, loss_gradient(image), spp, seed=2 * step + 1)
+
+A loss that is not linear in the image has a biased gradient if both use the same samples.
+
+What is exact and what is not: `prb` differentiates everything that does not move visibility (albedo, roughness,
+metallic, light). Vertices also move silhouettes and shadows; their gradient comes from `prb_projective`, which samples
+the silhouettes that a camera sees; of the shadows' edges it is blind (`sppi=0`: 27 times as fast).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender_reference import materials
+from unirender_reference.backend import mitsuba
+from unirender_reference.multiview import sensor_at
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.views import View
+from unirender_reference.passes import NAN_ATTEMPTS, Counters, derive_seed, finite_pass
+from unirender_reference.scene import LIGHT, OBJECT, mesh_shape
+from unirender_reference.shader import MOST_METALLIC, gradient, tensors, wrapped
+
+Parameter = Literal["albedo", "roughness", "metallic", "environment", "vertices"]
+Maps = Mapping[str, Float[np.ndarray, "..."]]
+APPEARANCE: tuple[Parameter, ...] = ("albedo", "roughness", "metallic", "environment")
+PLUGIN_MAPS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}
+
+
+def maps_of(solution: Solution) -> dict[str, Float[np.ndarray, "..."]]:
+    """Textures and light of a solution, by name; copies."""
+    obj = solution.obj
+    assert obj.roughness is not None
+    assert obj.metallic is not None
+    return {
+        "albedo": obj.albedo.copy(),
+        "roughness": obj.roughness.copy(),
+        "metallic": obj.metallic.copy(),
+        "environment": np.array(solution.environment, np.float32),
+    }
+
+
+class TexturedScene:
+    """Renders an object with textures from all views at once, and differentiates what it rendered.
+
+    Images are stacks (n, h, w, 4) of premultiplied linear RGBA, one picture for each view. Maps are those of `maps_of`,
+    and `vertices`; their sizes stay as they were, one that is left out keeps its last value. A metallic of 1 counts as
+    `MOST_METALLIC`. Vertices, once given, have Mitsuba's vertex normals instead of the mesh's own.
+
+    Args:
+        solution: mesh, first maps and light.
+        views: cameras; all pictures have one size.
+        depth: 2 is direct light, 4 three bounces.
+    """
+
+    def __init__(self, solution: Solution, views: Sequence[View], depth: int = 4) -> None:
+        mi = mitsuba()
+        obj = solution.obj
+        self.count, (self.height, self.width) = len(views), views[0].image.shape[:2]
+        first = maps_of(solution)
+        surface = materials.principled_bsdf(first["albedo"], first["roughness"], first["metallic"])
+        mesh = mesh_shape(obj, surface)
+        if obj.normal_map is not None:
+            mesh.set_bsdf(materials.with_normal_map(mesh.bsdf(), materials.normal_texture_of(obj.normal_map)))
+        light = mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))
+        self._scene = mi.load_dict({"type": "scene", LIGHT: {"type": "envmap", "bitmap": light}, OBJECT: mesh})
+        self._sensors = [sensor_at(view.pose, view.camera, self.height, self.width) for view in views]
+        self._batch = mi.load_dict(batch_dict(self._sensors))
+        self._hidden = {"max_depth": depth, "hide_emitters": True}
+        self._path = mi.load_dict({"type": "path", **self._hidden})
+        self._replay = mi.load_dict({"type": "prb", **self._hidden})
+        parameters = mi.traverse(self._scene)
+        self._parameters = parameters
+        suffixes = {
+            "environment": f"{LIGHT}.data",
+            "vertices": "vertex_positions",
+            **{name: f"{plugin}.data" for name, plugin in PLUGIN_MAPS.items()},
+        }
+        self._keys = {name: parameter_name(parameters, suffix) for name, suffix in suffixes.items()}
+
+    def image(self, maps: Maps, spp: int, seed: int) -> Float[np.ndarray, "n h w 4"]:
+        """The pictures; equal seeds draw equal samples. Pixels that come out NaN or infinite are drawn again."""
+        import drjit as dr
+
+        mi = mitsuba()
+        self._show(maps, ())
+
+        def draw(attempt: int) -> Float[np.ndarray, "n h w 4"]:
+            drawn = dr.opaque(mi.UInt32, pass_seed(seed, attempt))
+            return self._stack(
+                np.array(mi.render(self._scene, sensor=self._batch, integrator=self._path, spp=spp, seed=drawn))
+            )
+
+        return finite_pass(draw, Counters(), "textured scene")
+
+    def gradients(
+        self,
+        maps: Maps,
+        image_gradient: Float[np.ndarray, "n h w 3"],
+        spp: int,
+        seed: int,
+        wrt: Sequence[Parameter] = APPEARANCE,
+    ) -> dict[str, Float[np.ndarray, "..."]]:
+        """Derivatives of sum(image_gradient * image) with respect to maps, each of its map's shape.
+
+        Args:
+            maps: the point at which to differentiate.
+            image_gradient: derivative of a loss with respect to the radiance (premultiplied) of `image`.
+            spp: samples per pixel.
+            seed: equal seeds draw equal samples.
+            wrt: what to differentiate with respect to. With `vertices` among them every view is a launch of its own.
+
+        Raises:
+            UnirenderError: the image gradient has another size or is not finite, or derivatives stay NaN.
+        """
+        expected = (self.count, self.height, self.width, 3)
+        if image_gradient.shape != expected or not np.isfinite(image_gradient).all():
+            raise UnirenderError(
+                f"textured scene: got an image gradient of shape {image_gradient.shape}, expected finite {expected}"
+            )
+        for attempt in range(NAN_ATTEMPTS + 1):
+            attached = self._show(maps, wrt)
+            drawn = pass_seed(seed, attempt)
+            if "vertices" in wrt:
+                self._backward_each(image_gradient, spp, drawn)
+            else:
+                self._backward(self._batch, self._replay, np.concatenate(list(image_gradient), axis=1), spp, drawn)
+            found = {name: gradient(tensor) for name, tensor in attached.items()}
+            if all(np.isfinite(values).all() for values in found.values()):
+                return {name: values.reshape(maps[name].shape) for name, values in found.items()}
+        raise UnirenderError(
+            f"textured scene: derivatives stay NaN after {NAN_ATTEMPTS} seeds, expected finite values; check the "
+            "normals and the light"
+        )
+
+    def _show(self, maps: Maps, attached: Sequence[str]) -> dict[str, Any]:
+        """Puts maps into the scene; returns the tensors that are differentiated."""
+        import drjit as dr
+
+        mi = mitsuba()
+        made = tensors(maps, attached)
+        for name, tensor in made.items():
+            if self._keys.get(name) is None:
+                raise UnirenderError(f"textured scene: got a map {name!r}, expected some of {', '.join(self._keys)}")
+            if name == "environment":
+                value = wrapped(tensor)
+            elif name == "vertices":
+                value = mi.Float(tensor.array)
+            else:
+                height, width, *rest = tensor.shape
+                most = MOST_METALLIC if name == "metallic" else 1
+                clipped = dr.replace_grad(dr.clip(tensor.array, 0, most), tensor.array)
+                value = mi.TensorXf(clipped, shape=(height, width, *(rest or [1])))
+            self._parameters[self._keys[name]] = value
+        self._parameters.update()
+        return {name: made[name] for name in attached}
+
+    def _backward_each(self, image_gradient: Float[np.ndarray, "n h w 3"], spp: int, seed: int) -> None:
+        mi = mitsuba()
+        moving = mi.load_dict({"type": "prb_projective", "sppi": 0, **self._hidden})
+        for index, (sensor, wanted) in enumerate(zip(self._sensors, image_gradient, strict=True)):
+            self._backward(moving_sensor(sensor), moving, wanted, spp, derive_seed(seed, "view", index))
+
+    def _backward(self, sensor: Any, integrator: Any, wanted: Float[np.ndarray, "h w 3"], spp: int, seed: int) -> None:
+        import drjit as dr
+
+        mi = mitsuba()
+        alpha = np.zeros((*wanted.shape[:2], 1), np.float32)
+        grad = mi.TensorXf(np.ascontiguousarray(np.concatenate([wanted, alpha], axis=-1), np.float32))
+        integrator.render_backward(self._scene, None, grad, sensor, dr.opaque(mi.UInt32, seed), spp)
+
+    def _stack(self, film: Float[np.ndarray, "h nw 4"]) -> Float[np.ndarray, "n h w 4"]:
+        return np.stack(np.split(film, self.count, axis=1))
+
+
+def batch_dict(sensors: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One sensor of many, of equal films: their pictures lie side by side."""
+    film = {**sensors[0]["film"], "width": sensors[0]["film"]["width"] * len(sensors)}
+    named = {f"view{index:05d}": sensor for index, sensor in enumerate(sensors)}
+    return {"type": "batch", "film": film, "sampler": {"type": "multijitter"}, **named}
+
+
+def parameter_name(parameters: Any, suffix: str) -> str:
+    """The one parameter of a scene whose name ends in `suffix`."""
+    found = [key for key in parameters.keys() if key.endswith(suffix)]  # noqa: SIM118  (iterates over pairs)
+    if len(found) != 1:
+        raise UnirenderError(f"Mitsuba scene: {len(found)} parameters end in {suffix!r}; an untested Mitsuba version?")
+    return found[0]
+
+
+def pass_seed(seed: int, attempt: int) -> int:
+    """Of a picture and of its derivative alike: with one seed both draw the same samples."""
+    return derive_seed(seed, "textured scene", attempt)
+
+
+def moving_sensor(sensor: dict[str, Any]) -> Any:
+    """A loaded sensor under which outlines may cross the picture's border."""
+    return mitsuba().load_dict({**sensor, "film": {**sensor["film"], "sample_border": True}})

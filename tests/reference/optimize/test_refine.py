@@ -1,0 +1,198 @@
+"""Refinement: it improves on its start, its state resumes exactly, ingredients do what they say."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import refine_problems as problems
+
+from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
+from unirender_reference.optimize.parameters import Name
+from unirender_reference.optimize.refine import Fit, RefineConfig, RefineState, refine
+from unirender_reference.optimize.refine_state import interpolated_light
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.optimize.views import Step, Views
+
+FAST = RefineConfig(iterations=6, spp=4, spp_gradient=4, depth=2)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Solution:
+    return problems.solution()
+
+
+@pytest.fixture(scope="module")
+def views(truth: Solution) -> Views:
+    return problems.rendered_views(truth, 4, held_out=1)
+
+
+def grey(truth: Solution) -> Solution:
+    """True but for the base colour, which is one grey."""
+    return Solution(dataclasses.replace(truth.obj, albedo=np.full_like(truth.obj.albedo, 0.4)), truth.environment)
+
+
+def albedo_psnr(found: Solution, truth: Solution) -> float:
+    """Of texels that the ball shows, in display values."""
+    inside = slice(1, -1)
+    error = srgb_encode(found.obj.albedo) - srgb_encode(truth.obj.albedo)
+    return float(-10 * np.log10((error[inside, inside] ** 2).mean()))
+
+
+def differences(one: Solution, other: Solution) -> float:
+    a, b = maps_of(one), maps_of(other)
+    return max(float(np.abs(a[name] - b[name]).max()) for name in a)
+
+
+@pytest.mark.slow
+def test_it_finds_the_base_colour_where_the_rest_is_known(views: Views, truth: Solution) -> None:
+    config = RefineConfig(
+        iterations=30, depth=2, spp=4, albedo_rate=0.1, roughness_rate=0, metallic_rate=0, light_rate=0
+    )
+    start, steps = grey(truth), []
+
+    def note(step: Step) -> bool:
+        steps.append(step)
+        return True
+
+    found = refine(views, start, config, note)
+    assert albedo_psnr(start, truth) < 20
+    assert albedo_psnr(found, truth) > 25
+    assert [step.iteration for step in steps] == list(range(1, 31))
+    assert steps[0].stage == "refine"
+    assert np.mean([step.values["psnr"] for step in steps[-5:]]) > steps[0].values["psnr"] + 2
+    np.testing.assert_allclose(found.environment, start.environment, rtol=1e-5)  # rates of 0 move nothing
+    np.testing.assert_allclose(maps_of(found)["roughness"], maps_of(truth)["roughness"], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_saved_state_resumes_exactly(views: Views, truth: Solution, tmp_path: Path) -> None:
+    """Up to the order in which threads add up a gradient: two runs from the start differ as much."""
+    start = grey(truth)
+    whole, again = refine(views, start, FAST), refine(views, start, FAST)
+    state, path = RefineState.begin(start, FAST), tmp_path / "state.npz"
+
+    def stop(step: Step) -> bool:
+        state.save(path)
+        return step.iteration < 3
+
+    refine(views, start, FAST, stop, state)
+    assert state.iteration == 3
+    loaded = RefineState.load(path, start, FAST)
+    assert loaded.iteration == 3
+    rest: list[int] = []
+
+    def note(step: Step) -> bool:
+        rest.append(step.iteration)
+        return True
+
+    resumed = refine(views, start, FAST, note, loaded)
+    assert rest == [4, 5, 6]
+    tolerance = max(10 * differences(whole, again), 1e-4)
+    assert differences(resumed, whole) <= tolerance
+    forgetful = RefineState.load(path, start, FAST)  # the twin: Adam's moments are lost
+    forgetful.moments = RefineState.begin(start, FAST).moments
+    assert differences(refine(views, start, FAST, state=forgetful), whole) > tolerance
+
+
+def test_a_state_of_something_else_is_refused(truth: Solution, tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    RefineState.begin(truth, FAST).save(path)
+    with pytest.raises(UnirenderError, match="belongs to another start or configuration"):
+        RefineState.load(path, truth, dataclasses.replace(FAST, light_rows=12))
+    path.write_bytes(b"nothing")
+    with pytest.raises(UnirenderError, match="no readable state"):
+        RefineState.load(path, truth, FAST)
+
+
+def test_without_refinement_the_start_is_returned(views: Views, truth: Solution) -> None:
+    assert refine(views, truth, dataclasses.replace(FAST, enabled=False)) is truth
+
+
+def test_the_fit_to_held_out_views_is_reported(views: Views, truth: Solution) -> None:
+    config, seen = dataclasses.replace(FAST, held_out_every=2, iterations=4), []
+
+    def note(step: Step) -> bool:
+        seen.append(step.values.get("held_out_psnr"))
+        return True
+
+    refine(views, truth, config, note)
+    assert [value is not None for value in seen] == [False, True, False, True]
+    assert min(value for value in seen if value is not None) > 10
+
+
+PRIORS: dict[str, Name] = {
+    "white_light": "environment",
+    "neutral_light": "environment",
+    "light_smoothness": "environment",
+    "albedo_smoothness": "albedo",
+    "material_smoothness": "roughness",
+    "light_anchor": "environment",
+    "albedo_anchor": "albedo",
+    "material_anchor": "metallic",
+}
+
+
+@pytest.mark.parametrize("field", PRIORS)
+def test_every_prior_reaches_its_map(views: Views, truth: Solution, field: str) -> None:
+    """The derivative of the priors against central differences, in the space of steps; without weight there is none."""
+    fit = Fit.__new__(Fit)
+    fit.config = dataclasses.replace(FAST, **{field: 2.0})
+    state = RefineState.begin(truth, fit.config)
+    rng, name = np.random.default_rng(0), PRIORS[field]
+    state.parameters = {
+        key: np.clip(value + rng.uniform(-0.1, 0.1, value.shape), -1.6, 0.95).astype(np.float32)
+        for key, value in state.parameters.items()
+    }
+    slopes = [slope[name] for _, slope in fit.priors(state).values() if name in slope]
+    move, step = rng.normal(size=slopes[0].shape), 1e-3
+
+    def total(scale: float) -> float:
+        moved = dataclasses.replace(state, parameters={**state.parameters, name: state.parameters[name] + scale * move})
+        return 2.0 * sum(value for value, slope in fit.priors(moved).values() if name in slope)
+
+    along = float((slopes[0] * move).sum())
+    assert along == pytest.approx((total(step) - total(-step)) / (2 * step), rel=0.02)
+    assert along != 0
+    fit.config = FAST
+    assert not fit.priors(state)
+
+
+@pytest.mark.slow
+def test_the_demodulated_loss_is_of_light_alone(views: Views, truth: Solution) -> None:
+    plain, with_light = (Fit(views, truth, dataclasses.replace(FAST, demodulated=w)) for w in (0.0, 1.0))
+    state = RefineState.begin(truth, FAST)
+    (values, one), (more, other) = plain.pictures(state), with_light.pictures(state)
+    assert "demodulated" in more
+    assert "demodulated" not in values
+    assert np.abs(other["environment"] - one["environment"]).max() > 1e-4
+    np.testing.assert_allclose(other["albedo"], one["albedo"], atol=1e-6)
+
+
+def test_common_random_numbers_draw_the_same_pictures(views: Views, truth: Solution) -> None:
+    for common in (True, False):
+        fit = Fit(views, truth, dataclasses.replace(FAST, common_random_numbers=common))
+        state = RefineState.begin(truth, FAST)
+        first = fit.pictures(state)[0]["loss"]
+        state.iteration = 1
+        assert (fit.pictures(state)[0]["loss"] == pytest.approx(first, rel=1e-5)) == common
+
+
+def test_a_light_is_interpolated_as_the_renderer_does(truth: Solution) -> None:
+    finer = interpolated_light(truth.environment, 11)  # rows of the poles stay: 5 intervals become 10
+    assert finer.shape == (11, 22, 3)
+    views = problems.blank_views(1)
+    maps, other = maps_of(truth), Solution(truth.obj, finer)
+    one = TexturedScene(truth, views).image(maps, 256, 0)[..., :3].mean()
+    assert TexturedScene(other, views).image(maps_of(other), 256, 0)[..., :3].mean() == pytest.approx(one, rel=0.03)
+    np.testing.assert_allclose(finer[::2].mean(1), truth.environment.mean(1), rtol=0.02)
+
+
+def test_the_plain_loop_has_no_ingredient() -> None:
+    plain = RefineConfig.plain()
+    assert plain.spp == plain.spp_gradient == 16
+    assert (plain.one_sided, plain.uniform, plain.decay, plain.light_rows) == (False, False, 1, 0)
+    assert plain.parametrisation == "linear"
+    assert plain.albedo_levels == plain.material_levels == plain.light_levels == 1
