@@ -1,0 +1,296 @@
+"""The solver of single-view optimisation: Levenberg-Marquardt over log albedo, log light and two material offsets.
+
+Unknown are u (n, 3), the change of log albedo at each pixel, and theta = (e, g, delta_m, delta_r): the coarse log light
+of each channel, the channels' gains, and what is added to metallic and roughness of all pixels. The picture is
+
+    I = b (1 - m) D E + b m (G - W) E + 0.04 (1 - m) (G - W) E + W E,    E = exp(log E_0 + P e)
+
+(`picture_transport`), and the cost
+
+    sum of Huber(w (I - I_seen))  +  u^T Q u  +  e^T K e  +  g^T K_g g  +  (delta_m / s_m)^2  +  (delta_r / s_r)^2
+
+with w = d display / d linear over the expected misfit; light beyond a saturated value costs nothing. The u are
+eliminated from each step channel by channel: their block of the Hessian is sparse, Q plus a diagonal.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Float
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from unirender.color import display_slope
+from unirender_reference.optimize.picture_transport import NODES
+from unirender_reference.optimize.single_config import Priors
+from unirender_reference.optimize.single_picture import Picture
+from unirender_reference.optimize.single_priors import (
+    LIGHT_GRID,
+    albedo_precision,
+    gain_precision,
+    light_interpolation,
+    light_precision,
+)
+
+HUBER = 4.0  # expected misfits beyond which a residual counts linearly
+DARKEST = 0.02  # log albedo is log(albedo + DARKEST)
+TOP = 400.0  # precision that holds log albedo below that of 1
+DIELECTRIC = 0.04
+LOG_RADIANCE = (-8.0, 9.0)
+FINISHED = 2e-3  # relative gain of a step below which the search ends
+
+Eliminated = tuple[
+    np.ndarray, np.ndarray, np.ndarray
+]  # theta's indices, -du / dtheta (n, t), -du where theta stays (n,)
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """A point of the search: u (n, 3), e (3 c,), g (3,), and the offsets of metallic and roughness."""
+
+    pixel: Float[np.ndarray, "n 3"]
+    light: Float[np.ndarray, " c"]
+    gain: Float[np.ndarray, "3"]
+    metallic: float = 0.0
+    roughness: float = 0.0
+
+    @property
+    def theta(self) -> Float[np.ndarray, " t"]:
+        return np.concatenate([self.light, self.gain, [self.metallic, self.roughness]])
+
+
+@dataclass(frozen=True)
+class Model:
+    """The picture's parts at a point: rows b x + z, with x (n, 3) and z (n, 3), and what their derivatives need."""
+
+    metallic: Float[np.ndarray, "n 1"]
+    roughness: Float[np.ndarray, "n 1"]
+    diffuse: Float[np.ndarray, "n j"]
+    lobe: Float[np.ndarray, "n j"]
+    grazing: Float[np.ndarray, "n j"]
+    environment: Float[np.ndarray, "j 3"]
+    exponent: Float[np.ndarray, "n 3"]
+    albedo: Float[np.ndarray, "n 3"]
+    above: Float[np.ndarray, "n 3"]
+    image: Float[np.ndarray, "n 3"]
+
+    @property
+    def carried(self) -> Float[np.ndarray, "n j"]:
+        """Rows of the light that is multiplied by albedo."""
+        m = self.metallic.astype(np.float32)
+        return (1 - m) * self.diffuse + m * (self.lobe - self.grazing)
+
+    @property
+    def untinted(self) -> Float[np.ndarray, "n j"]:
+        """Rows of the light that is not."""
+        m = self.metallic.astype(np.float32)
+        return DIELECTRIC * (1 - m) * (self.lobe - self.grazing) + self.grazing
+
+
+class Fit:
+    """One picture, its start and its priors.
+
+    Args:
+        picture: with start maps albedo, roughness and metallic.
+        log_light: (j, 3) log radiance of the start.
+        priors: widths about the start.
+        noise: expected misfit in display values.
+    """
+
+    def __init__(self, picture: Picture, log_light: Float[np.ndarray, "j 3"], priors: Priors, noise: float) -> None:
+        self.picture, self.priors = picture, priors
+        self.log_albedo = np.log(picture.maps["albedo"] + DARKEST)
+        self.log_light = log_light
+        self.interpolation = light_interpolation(picture.transport.shape)
+        self.coarse = LIGHT_GRID[0] * LIGHT_GRID[1]
+        self.slope = display_slope(np.where(picture.coverage > 0, picture.radiance / picture.coverage, 0))
+        self.noise = noise
+        self.q = albedo_precision(picture.display, picture.coverage, picture.pairs, priors)
+        self.k_light, self.k_gain = light_precision(priors), gain_precision(priors)
+        self._rows: tuple[float, tuple[np.ndarray, ...]] | None = None
+
+    def start(self) -> Unknowns:
+        return Unknowns(np.zeros_like(self.log_albedo), np.zeros(3 * self.coarse), np.zeros(3))
+
+    def level(self) -> float:
+        """Log of the factor by which the start's light must change for the start's picture to be as bright as seen."""
+        image = self.model(self.start()).image
+        return float(np.log(max(self.picture.radiance.sum(), 1e-6) / max(image.sum(), 1e-9)))
+
+    def materials(self, at: Unknowns) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1"]]:
+        maps = self.picture.maps
+        metallic = np.clip(maps["metallic"] + at.metallic, 0, 1)
+        return metallic, np.clip(maps["roughness"] + at.roughness, NODES[0], NODES[-1])
+
+    def _nodes(self, roughness: Float[np.ndarray, "n 1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        nodes = np.array(NODES)
+        first = np.clip(np.searchsorted(nodes, roughness[:, 0]) - 1, 0, len(nodes) - 2)
+        width = nodes[first + 1] - nodes[first]
+        return first, width, (roughness[:, 0] - nodes[first]) / width
+
+    def _lobes(self, offset: float, roughness: Float[np.ndarray, "n 1"]) -> tuple[np.ndarray, ...]:
+        """Rows of the diffuse lobe, of G and of W at the pixels' roughness, premultiplied by coverage."""
+        if self._rows is not None and self._rows[0] == offset:
+            return self._rows[1]
+        transport, r = self.picture.transport, roughness.astype(np.float32)
+        first, _, share = self._nodes(roughness)
+        share, pixel = share[:, None].astype(np.float32), np.arange(len(first))
+        coverage = self.picture.coverage.astype(np.float32)
+        diffuse = transport.diffuse[0] + r * transport.diffuse[1] + r * r * transport.diffuse[2]
+        lobe, grazing = (
+            (1 - share) * table[first, pixel] + share * table[first + 1, pixel]
+            for table in (transport.lobe, transport.grazing)
+        )
+        rows = (diffuse * coverage, lobe * coverage, grazing * coverage)
+        self._rows = (offset, rows)
+        return rows
+
+    def environment(self, at: Unknowns) -> Float[np.ndarray, "j 3"]:
+        change = self.interpolation @ at.light.reshape(3, self.coarse).T
+        return np.exp(np.clip(self.log_light + change, *LOG_RADIANCE))
+
+    def model(self, at: Unknowns) -> Model:
+        metallic, roughness = self.materials(at)
+        diffuse, lobe, grazing = self._lobes(at.roughness, roughness)
+        light = self.environment(at)
+        log_albedo, top = self.log_albedo + at.gain + at.pixel, np.log(1 + DARKEST)
+        exponent = np.exp(np.minimum(log_albedo, top))
+        albedo = np.maximum(exponent - DARKEST, 0)
+        made = Model(
+            metallic,
+            roughness,
+            diffuse,
+            lobe,
+            grazing,
+            light,
+            exponent,
+            albedo,
+            np.maximum(log_albedo - top, 0),
+            np.empty_like(albedo),
+        )
+        light32 = light.astype(np.float32)
+        return replace(made, image=albedo * (made.carried @ light32) + made.untinted @ light32)
+
+    def residuals(self, model: Model) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """w (I - I_seen), and the weight of each under Huber's loss (0 beyond saturated values)."""
+        residual = self.slope / self.noise * (model.image - self.picture.radiance)
+        beyond = self.picture.saturated & (residual > 0)
+        residual = np.where(beyond, 0, residual)
+        share = np.where(beyond, 0, np.minimum(1, HUBER / np.maximum(np.abs(residual), 1e-9)))
+        return residual, share
+
+    def misfit(self, model: Model) -> float:
+        """Root mean square of display values, by coverage."""
+        residual = np.minimum(np.abs(self.residuals(model)[0]) * self.noise, 0.3)
+        return float(np.sqrt(np.square(residual).mean() / np.mean(self.picture.coverage)))
+
+    def cost(self, at: Unknowns, model: Model) -> float:
+        size = np.abs(self.residuals(model)[0])
+        data = np.where(size > HUBER, 2 * HUBER * size - HUBER**2, size**2).sum()
+        pixels = np.sum(at.pixel * (self.q @ at.pixel)) + TOP * np.square(model.above).sum()
+        light, gain = at.light @ self.k_light @ at.light, at.gain @ self.k_gain @ at.gain
+        return float(data + pixels + light + gain + self._material_cost(at))
+
+    def _material_cost(self, at: Unknowns) -> float:
+        return (at.metallic / self.priors.metallic) ** 2 + (at.roughness / self.priors.roughness) ** 2
+
+    def normal_equations(
+        self, at: Unknowns, model: Model, damping: float
+    ) -> tuple[Float[np.ndarray, "t t"], Float[np.ndarray, " t"], list[Eliminated]]:
+        """Hessian and half gradient of theta with u eliminated; per channel how u follows from theta."""
+        c, light = self.coarse, model.environment.astype(np.float32)
+        hessian, gradient = np.zeros((3 * c + 5, 3 * c + 5)), np.zeros(3 * c + 5)
+        hessian[: 3 * c, : 3 * c], gradient[: 3 * c] = self.k_light, self.k_light @ at.light
+        gains = slice(3 * c, 3 * c + 3)
+        hessian[gains, gains], gradient[gains] = self.k_gain, self.k_gain @ at.gain
+        for place, offset, width in (
+            (-2, at.metallic, self.priors.metallic),
+            (-1, at.roughness, self.priors.roughness),
+        ):
+            hessian[place, place], gradient[place] = width**-2, offset * width**-2
+        residual, share = self.residuals(model)
+        by_metallic, by_roughness = self._material_derivatives(model)
+        lit, plain, eliminated = model.carried @ light, (model.carried, model.untinted), []
+        for k in range(3):
+            root = np.sqrt(share[:, k])
+            weight = self.slope[:, k] / self.noise * root
+            jacobian = np.empty((len(weight), c + 3))
+            rows = model.albedo[:, k : k + 1].astype(np.float32) * plain[0] + plain[1]
+            jacobian[:, :c] = (rows * light[:, k] * weight[:, None].astype(np.float32)) @ self.interpolation
+            free, held = model.above[:, k] == 0, TOP * (model.above[:, k] > 0)
+            own = weight * lit[:, k] * model.exponent[:, k] * free
+            jacobian[:, c] = own
+            jacobian[:, c + 1], jacobian[:, c + 2] = weight * by_metallic[:, k], weight * by_roughness[:, k]
+            seen = root * residual[:, k]
+            block = sparse.csc_array(self.q + sparse.diags_array(own**2 * (1 + damping) + held))
+            factor = splu(block, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+            cross = own[:, None] * jacobian
+            cross[:, c] += held
+            pull = own * seen + self.q @ at.pixel[:, k] + TOP * model.above[:, k]
+            solved = factor.solve(np.column_stack([cross, pull]))
+            index = np.concatenate([np.arange(k * c, (k + 1) * c), [3 * c + k, 3 * c + 3, 3 * c + 4]])
+            added = jacobian.T @ jacobian
+            added[c, c] += held.sum()
+            hessian[np.ix_(index, index)] += added - cross.T @ solved[:, :-1]
+            gradient[index] += jacobian.T @ seen - cross.T @ solved[:, -1]
+            gradient[3 * c + k] += TOP * model.above[:, k].sum()
+            eliminated.append((index, solved[:, :-1], solved[:, -1]))
+        return hessian, gradient, eliminated
+
+    def _material_derivatives(self, model: Model) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Of the image with respect to metallic and roughness."""
+        transport, light = self.picture.transport, model.environment.astype(np.float32)
+        diffuse, lobe, grazing = model.diffuse @ light, model.lobe @ light, model.grazing @ light
+        m, coverage = model.metallic, self.picture.coverage
+        by_metallic = model.albedo * (lobe - grazing - diffuse) - DIELECTRIC * (lobe - grazing)
+        first, width, _ = self._nodes(model.roughness)
+        pixel, width = np.arange(len(first)), width[:, None]
+        d_lobe, d_grazing = (
+            coverage * ((table[first + 1, pixel] - table[first, pixel]) @ light) / width
+            for table in (transport.lobe, transport.grazing)
+        )
+        slope = transport.diffuse[1] + 2 * model.roughness.astype(np.float32) * transport.diffuse[2]
+        d_diffuse = coverage * (slope @ light)
+        tinted = (1 - m) * d_diffuse + m * (d_lobe - d_grazing)
+        return by_metallic, model.albedo * tinted + DIELECTRIC * (1 - m) * (d_lobe - d_grazing) + d_grazing
+
+    def step(
+        self, at: Unknowns, model: Model, cost: float, damping: float, fixed: tuple[str, ...]
+    ) -> tuple[Unknowns, Model, float, float, bool] | None:
+        """One step: the new point, its model and cost, the next damping, whether the first try was taken. None: no
+        step found that costs less."""
+        hessian, gradient, eliminated = self.normal_equations(at, model, damping)
+        for place, name in ((-2, "metallic"), (-1, "roughness")):
+            if name in fixed:
+                hessian[place], hessian[:, place], gradient[place] = 0, 0, 0
+                hessian[place, place] = 1
+        for trial in range(5):
+            damped = hessian + damping * np.diag(np.diag(hessian))
+            move = -scipy.linalg.solve(damped, gradient, assume_a="pos", check_finite=False)
+            scale = min(1.0, 1.5 / np.abs(move[:-2]).max()) if np.abs(move[:-2]).max() > 0 else 1.0
+            new = self._moved(at, move * scale, scale, eliminated)
+            made = self.model(new)
+            found = self.cost(new, made)
+            if found < cost:
+                return new, made, found, max(damping / 4, 1e-5), trial == 0
+            damping *= 8
+        return None
+
+    def _moved(
+        self,
+        at: Unknowns,
+        move: Float[np.ndarray, " t"],
+        scale: float,
+        eliminated: list[Eliminated],
+    ) -> Unknowns:
+        maps, c = self.picture.maps, 3 * self.coarse
+        metallic = at.metallic + float(np.clip(move[-2], -0.25, 0.25))
+        roughness = at.roughness + float(np.clip(move[-1], -0.2, 0.2))
+        metallic = float(np.clip(metallic, -maps["metallic"].max(), 1 - maps["metallic"].min()))
+        low, high = NODES[0] - maps["roughness"].max(), NODES[-1] - maps["roughness"].min()
+        roughness = float(np.clip(roughness, low, high))
+        move = np.concatenate([move[:-2], [metallic - at.metallic, roughness - at.roughness]])
+        follow = [-(constant * scale + per @ move[index]) for index, per, constant in eliminated]
+        pixel = at.pixel + np.clip(np.stack(follow, axis=1), -1, 1)
+        return Unknowns(pixel, at.light + move[:c], at.gain + move[c : c + 3], metallic, roughness)

@@ -1,0 +1,140 @@
+"""One picture prepared for optimisation: its covered pixels, averaged to a size that the solver can afford."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from unirender.camera import Camera
+from unirender.color import image_srgb, unpremultiply
+from unirender_reference.optimize.picture_transport import Transport, build_transport, mapped_points, mesh_points
+from unirender_reference.shapes import MeshObject
+
+SATURATED = 0.999  # display value from which a channel may stand for more
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The n pixels of a (shrunk) picture that show the object.
+
+    Attributes:
+        transport: of its pixels.
+        size: rows and columns of the shrunk picture.
+        block: pixels of the picture along a side of a shrunk pixel.
+        normal: (n, 3) mean of the pixel's shading normals, unit.
+        coverage: (n, 1).
+        radiance: (n, 3) linear, premultiplied.
+        display: (n, 3) straight display values.
+        saturated: (n, 3) whether the radiance is only a lower bound.
+        maps: start values by name, (n, c).
+        pairs: (2, k) neighbours.
+    """
+
+    transport: Transport
+    size: tuple[int, int]
+    block: int
+    normal: Float[np.ndarray, "n 3"]
+    coverage: Float[np.ndarray, "n 1"]
+    radiance: Float[np.ndarray, "n 3"]
+    display: Float[np.ndarray, "n 3"]
+    saturated: np.ndarray
+    maps: Mapping[str, Float[np.ndarray, "n _"]]
+    pairs: Int[np.ndarray, "2 k"]
+
+    def frame(self, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
+        """Values of the pixels on their places in the shrunk picture, 0 elsewhere."""
+        out = np.zeros((self.size[0] * self.size[1], values.shape[1]), np.float64)
+        out[self.transport.pixel] = values
+        return out.reshape(*self.size, values.shape[1])
+
+
+def make_picture(
+    image_linear: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+    camera: Camera,
+    maps: Mapping[str, Float[np.ndarray, "h w _"]],
+    geometry: MeshObject | None,
+    pixels: int,
+    light_shape: tuple[int, int],
+    hdr: bool,
+    seed: int,
+) -> Picture:
+    """Shrinks a picture by whole blocks until at most about `pixels` covered ones are left, and traces their transport.
+
+    Args:
+        image_linear: premultiplied.
+        mask: coverage.
+        camera: of the picture.
+        maps: straight start values: `normal` (used where no geometry is given), albedo, roughness, metallic.
+        geometry: the object itself, or None.
+        pixels: covered ones, at most (blocks are squares of whole pixels).
+        light_shape: rows and columns of the light.
+        hdr: no value is clipped.
+        seed: of the points' places.
+    """
+    height, width = mask.shape[:2]
+    block = max(1, math.ceil(math.sqrt((mask > 0).sum() / pixels) - 0.05))
+    coverage = shrink(mask, block)
+    radiance = shrink(image_linear, block)
+    small = {name: _straight(shrink(values * mask, block), coverage) for name, values in maps.items()}
+    if geometry is not None:
+        points = mesh_points(coverage, geometry, camera, (height / block, width / block), seed)
+    else:
+        view = _unit(shrink(camera.view_directions(height, width) * (mask > 0), block))
+        points = mapped_points(coverage, _unit(small["normal"]), view)
+    transport = build_transport(points, light_shape, seed)
+    size, pixel = coverage.shape[:2], transport.pixel
+
+    def chosen(values: np.ndarray) -> np.ndarray:
+        return values.reshape(-1, values.shape[-1])[pixel].astype(np.float64)
+
+    display = image_srgb(unpremultiply(radiance, coverage)).astype(np.float64)
+    saturated = np.zeros((len(pixel), 3), bool) if hdr else chosen(shrink(_clipped(image_linear, mask), block)) > 0
+    return Picture(
+        transport,
+        size,
+        block,
+        _unit((points.normal * points.valid[:, None]).reshape(-1, points.count, 3).sum(axis=1)),
+        chosen(coverage),
+        chosen(radiance),
+        chosen(display),
+        saturated,
+        {name: chosen(values) for name, values in small.items()},
+        neighbours(pixel, size),
+    )
+
+
+def shrink(values: Float[np.ndarray, "h w c"], block: int) -> Float[np.ndarray, "h2 w2 c"]:
+    """Means over blocks; blocks that stick out of the picture are filled with 0."""
+    height, width, channels = values.shape
+    rows, columns = -(-height // block), -(-width // block)
+    padded = np.zeros((rows * block, columns * block, channels), np.float64)
+    padded[:height, :width] = values
+    return padded.reshape(rows, block, columns, block, channels).mean(axis=(1, 3)).astype(np.float32)
+
+
+def neighbours(pixel: Int[np.ndarray, " n"], size: tuple[int, int]) -> Int[np.ndarray, "2 k"]:
+    """Pairs of indices of pixels that lie side by side."""
+    index = np.full(size[0] * size[1], -1)
+    index[pixel] = np.arange(len(pixel))
+    index = index.reshape(size)
+    first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
+    second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
+    both = (first >= 0) & (second >= 0)
+    return np.stack([first[both], second[both]])
+
+
+def _clipped(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
+    """1 where a channel's display value is at its end."""
+    full = image_srgb(unpremultiply(image_linear, mask)) >= SATURATED
+    return (full & (mask > 0)).astype(np.float32)
+
+
+def _straight(values: Float[np.ndarray, "h w c"], coverage: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
+    return np.where(coverage > 0, values / np.maximum(coverage, 1e-6), 0).astype(np.float32)
+
+
+def _unit(values: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return (values / np.maximum(np.linalg.norm(values, axis=-1, keepdims=True), 1e-9)).astype(np.float32)

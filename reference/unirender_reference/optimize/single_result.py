@@ -1,0 +1,132 @@
+"""From a single-view fit to a complete `Intrinsics` at the picture's own size.
+
+What was found on blocks of pixels is interpolated; a grey start, which has no detail, takes that of the picture. s and
+d are those of the light that was found: with shadows on a known mesh. A predicted s and d move towards them; without a
+mesh they change by the ratio of the two lights on the normals, since the prediction knows something of shadows. A
+predicted albedo keeps its mean in each channel, and the light makes up for it.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.color import unpremultiply
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import resample_environment
+from unirender_reference.optimize.inflate import nearest
+from unirender_reference.optimize.single_config import Trust
+from unirender_reference.optimize.single_fit import DARKEST, Fit, Unknowns
+from unirender_reference.optimize.single_picture import Picture, shrink
+
+MOST_GAIN = 4.0
+DARK = 1e-4  # least radiance whose logarithm counts
+FLOOR = 0.01  # radiance below which a ratio says nothing
+
+
+def result(
+    fit: Fit,
+    at: Unknowns,
+    image_linear: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+    camera: Camera,
+    maps: dict[str, Float[np.ndarray, "h w _"]],
+    init: Intrinsics | None,
+    known_mesh: bool,
+    trust: Trust,
+) -> Intrinsics:
+    """The maps and the light of a point of the search.
+
+    Args:
+        fit: of the (shrunk) picture.
+        at: the point.
+        image_linear: the picture at its own size, premultiplied.
+        mask: its coverage.
+        camera: its camera.
+        maps: start values of albedo, normal, roughness and metallic at its own size.
+        init: the prediction, or None.
+        known_mesh: normals and shadows are the mesh's.
+        trust: what part of the changes of albedo and of a predicted light is kept.
+    """
+    picture, covered, size = fit.picture, mask > 0, mask.shape[:2]
+
+    def wide(values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
+        return enlarge(picture, values, size)
+
+    change = np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo
+    albedo = np.exp(np.log(maps["albedo"] + DARKEST) + trust.albedo * wide(change)) - DARKEST
+    albedo = np.clip(albedo, 0, 1)
+    gauge = np.ones(3)
+    if init is not None:
+        gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
+        albedo = albedo / np.maximum(gauge, DARK)
+    elif picture.block > 1:
+        albedo = albedo * _ratio(unpremultiply(image_linear, mask), _blurred(picture, image_linear, mask))
+    light = fit.environment(at) * gauge
+    if init is not None and init.environment is not None:
+        predicted = resample_environment(init.environment, picture.transport.shape).reshape(light.shape)
+        light = np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
+    specular, diffuse = (wide(values) for values in light_buffers(fit, at, fit.environment(at) * gauge))
+    if init is not None and init.specular is not None and init.diffuse is not None:
+        start = fit.start()
+        before = (init.specular, init.diffuse)
+        if not known_mesh:  # what a normal map cannot show of the light stands in the prediction alone
+            before = (wide(values) for values in light_buffers(fit, start, fit.environment(start)))
+        specular, diffuse = (
+            own * _ratio(new, old) ** trust.shading
+            for own, new, old in zip((init.specular, init.diffuse), (specular, diffuse), before, strict=True)
+        )
+    normal = maps["normal"]
+    if known_mesh:
+        normal = wide(picture.normal)
+        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    found = {
+        "albedo": np.clip(albedo, 0, 1),
+        "normal": normal,
+        "roughness": np.clip(maps["roughness"] + at.roughness, 0, 1),
+        "metallic": np.clip(maps["metallic"] + at.metallic, 0, 1),
+        "specular": specular,
+        "diffuse": diffuse,
+    }
+    found = {name: np.where(covered, values, 0).astype(np.float32) for name, values in found.items()}
+    environment = light.reshape(*picture.transport.shape, 3).astype(np.float32)
+    return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
+
+
+def light_buffers(
+    fit: Fit, at: Unknowns, light: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """s and d of the picture's pixels under a light, with the roughness of a point; not premultiplied."""
+    light = light.astype(np.float32)
+    return (fit.model(at).lobe @ light) / fit.picture.coverage, fit.picture.transport.white @ light
+
+
+def enlarge(picture: Picture, values: Float[np.ndarray, "n c"], size: tuple[int, int]) -> Float[np.ndarray, "h w c"]:
+    """Values of blocks at the pixels of a picture of `size`: bilinear; blocks without one have their neighbour's."""
+    import scipy.ndimage as ndimage
+
+    known = np.zeros(picture.size[0] * picture.size[1], bool)
+    known[picture.transport.pixel] = True
+    filled = picture.frame(values)[nearest(known.reshape(picture.size))]
+    if picture.block == 1:
+        return filled
+    rows, columns = ((np.arange(n) + 0.5) / picture.block - 0.5 for n in size)
+    places = np.stack(np.meshgrid(rows, columns, indexing="ij"))
+    layers = [ndimage.map_coordinates(layer, places, order=1, mode="nearest") for layer in np.moveaxis(filled, -1, 0)]
+    return np.stack(layers, axis=-1)
+
+
+def _mean(values: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "3"]:
+    return (values * mask).sum(axis=(0, 1)) / mask.sum()
+
+
+def _blurred(
+    picture: Picture, image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]
+) -> Float[np.ndarray, "h w 3"]:
+    """The picture as its blocks show it, straight."""
+    coverage = shrink(mask, picture.block)
+    blocks = unpremultiply(shrink(image_linear, picture.block), coverage)
+    return enlarge(picture, blocks.reshape(-1, 3)[picture.transport.pixel], mask.shape[:2])
+
+
+def _ratio(new: Float[np.ndarray, "h w 3"], old: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    return np.clip((new + FLOOR) / (old + FLOOR), 1 / MOST_GAIN, MOST_GAIN)

@@ -1,0 +1,175 @@
+"""Single-view optimisation: what it finds of made pictures, what it leaves alone, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import reference_scenes as scenes
+
+from unirender.camera import Camera
+from unirender.color import image_srgb, unpremultiply
+from unirender.errors import UnirenderError, UsageError
+from unirender.intrinsics import MAPS, Intrinsics
+from unirender.lighting import resample_environment
+from unirender_reference.optimize.single_config import Priors, SingleConfig, Trust
+from unirender_reference.optimize.single_fit import Fit, Unknowns
+from unirender_reference.optimize.single_picture import make_picture
+from unirender_reference.optimize.single_view import optimize_image
+from unirender_reference.optimize.views import Step
+from unirender_reference.render import Renderer
+from unirender_reference.shade import shade
+
+SIZE, ROUGHNESS = 32, 0.3
+CAMERA = Camera()
+QUICK = SingleConfig(light_rows=8, steps=(4, 4), noise=(0.1, 0.03), fine_steps=3)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Intrinsics:
+    """A half-metallic sphere with upright stripes under a light with lamps, and its true maps."""
+    maps = Renderer(scenes.sphere(), resolution=SIZE).geometry(64)
+    assert maps.mask is not None
+    assert maps.normal is not None
+    stripes = np.where((np.arange(SIZE) // 4 % 2)[:, None] > 0, [1.0, 1.0, 1.0], [0.3, 0.7, 1.5])
+    inside = (maps.mask > 0).astype(np.float32)
+    return Intrinsics(
+        albedo=np.array([0.7, 0.5, 0.3]) * stripes * inside,
+        normal=maps.normal,
+        roughness=ROUGHNESS * inside,
+        metallic=0.5 * inside,
+        environment=resample_environment(1.5 * scenes.environment(3), (8, 16)),
+        mask=maps.mask,
+    )
+
+
+@pytest.fixture(scope="module")
+def picture(truth: Intrinsics) -> np.ndarray:
+    """Display values, as a method is shown them."""
+    assert truth.mask is not None
+    shown = image_srgb(unpremultiply(shade(truth, spp=400), truth.mask))
+    return (np.round(shown * 255) / 255).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def prediction(truth: Intrinsics) -> Intrinsics:
+    """The truth with a smooth light, one albedo and too much roughness."""
+    maps = truth.require("albedo", "roughness", "environment", "mask")
+    weight = maps["mask"] / maps["mask"].sum()
+    one = (weight * maps["albedo"]).sum(axis=(0, 1))
+    even = maps["environment"].mean(axis=(0, 1), keepdims=True) * np.ones_like(maps["environment"])
+    return truth.replace(
+        albedo=one * (maps["mask"] > 0),
+        roughness=np.clip(maps["roughness"] * 2, 0, 1),
+        environment=0.5 * maps["environment"] + 0.5 * even,
+    )
+
+
+def albedo_error(found: Intrinsics, truth: Intrinsics) -> float:
+    """Root mean square of display values inside the mask."""
+    maps, true = found.require("albedo"), truth.require("albedo", "mask")
+    squared = np.square(image_srgb(maps["albedo"]) - image_srgb(true["albedo"])) * true["mask"]
+    return float(np.sqrt(squared.sum() / true["mask"].sum() / 3))
+
+
+def object_value(maps: Intrinsics, name: str) -> float:
+    return float(maps.maps[name].max())
+
+
+def test_a_prediction_is_refined_and_what_is_not_trusted_stays(
+    truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics
+) -> None:
+    mask = truth.require("mask")["mask"]
+    trusting = replace(QUICK, trust=Trust())
+    steps: list[Step] = []
+    found = optimize_image(picture, mask, CAMERA, trusting, init=prediction, on_step=steps.append)
+    assert found.present == tuple(MAPS)
+    assert albedo_error(found, truth) < 0.6 * albedo_error(prediction, truth)
+    wrong = object_value(prediction, "roughness") - ROUGHNESS
+    assert abs(object_value(found, "roughness") - ROUGHNESS) < 0.8 * wrong
+    misfit = [step.values["misfit"] for step in steps]
+    assert misfit[-1] < 0.5 * misfit[0]
+    assert [step.iteration for step in steps] == list(range(1, len(steps) + 1))
+    untrusting = replace(QUICK, trust=Trust(0, 0, 0, 0, 0))
+    same = optimize_image(picture, mask, CAMERA, untrusting, init=prediction)
+    for name in ("albedo", "roughness", "metallic", "environment"):
+        np.testing.assert_allclose(same.maps[name], prediction.maps[name], rtol=0, atol=2e-4)
+
+
+def test_the_result_renders_to_the_picture(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
+    mask = truth.require("mask")["mask"]
+
+    def error(maps: Intrinsics) -> float:
+        shown = image_srgb(unpremultiply(shade(maps, spp=256), mask))
+        return float(np.sqrt((np.square(shown - picture) * mask).sum() / mask.sum() / 3))
+
+    found = optimize_image(picture, mask, CAMERA, replace(QUICK, trust=Trust()), init=prediction)
+    assert error(found) < 0.03
+    assert error(prediction) > 0.06
+
+
+def test_a_known_mesh_gives_normals_and_needs_no_start(truth: Intrinsics, picture: np.ndarray) -> None:
+    maps = truth.require("mask", "normal")
+    found = optimize_image(picture, maps["mask"], CAMERA, QUICK, geometry=scenes.sphere())
+    assert found.present == tuple(MAPS)
+    cosine = np.sum(found.require("normal")["normal"] * maps["normal"], axis=-1)
+    whole = maps["mask"][..., 0] > 0.99
+    assert cosine[whole].min() > 0.99
+    assert abs(object_value(found, "roughness") - ROUGHNESS) < 0.2
+    flat = optimize_image(
+        picture, maps["mask"], CAMERA, replace(QUICK, trust=Trust(roughness=0)), geometry=scenes.sphere()
+    )
+    assert object_value(flat, "roughness") == 0.5
+
+
+def test_a_silhouette_is_enough_for_a_picture_of_any_size(picture: np.ndarray, truth: Intrinsics) -> None:
+    mask = truth.require("mask")["mask"]
+    image, cover = (np.kron(x, np.ones((2, 2, 1), np.float32))[:61] for x in (picture, mask))
+    config = replace(QUICK, pixels=200, coarse_pixels=100)
+    found = optimize_image(image, cover, CAMERA, config)
+    assert found.present == tuple(MAPS)
+    assert found.require("albedo")["albedo"].shape == image.shape
+    linear = optimize_image(image * 3, cover, CAMERA, config, hdr=True)
+    assert linear.present == tuple(MAPS)
+
+
+def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, prediction: Intrinsics) -> None:
+    mask = truth.require("mask")["mask"]
+    for image, cover, init, reason in (
+        (picture + 1, mask, None, "`hdr`"),
+        (picture, np.zeros_like(mask), None, "mask is empty"),
+        (picture, mask, prediction.replace(albedo=None), "albedo missing"),
+        (picture[:16], mask[:16], prediction, "picture's size"),
+    ):
+        with pytest.raises(UnirenderError, match=reason):
+            optimize_image(image, cover, CAMERA, QUICK, init=init)
+    with pytest.raises(UsageError, match="as many"):
+        SingleConfig(steps=(1, 2), noise=(0.1,))
+
+
+def test_the_gradient_is_that_of_the_cost(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
+    """Against central differences, with pixels held (a stiff prior) and without Huber's corner (a wide misfit)."""
+    maps = prediction.require("albedo", "roughness", "metallic", "normal", "mask", "environment")
+    seen = shade(truth, spp=64)
+    start = {name: maps[name] for name in ("albedo", "roughness", "metallic", "normal")}
+    small = make_picture(seen, maps["mask"], CAMERA, start, None, 200, (8, 16), True, 0)
+    light = np.log(maps["environment"].reshape(-1, 3).astype(np.float64))
+    fit = Fit(small, light, Priors(albedo=1e-5), 0.5)
+    rng = np.random.default_rng(0)
+    base = rng.normal(0, 0.05, 3 * fit.coarse + 5)
+    base[-1] = 0.03  # between two nodes of the roughness table
+
+    def at(theta: np.ndarray) -> Unknowns:
+        c = 3 * fit.coarse
+        zero = np.zeros((len(small.coverage), 3))
+        return Unknowns(zero, theta[:c], theta[c : c + 3], float(theta[-2]), float(theta[-1]))
+
+    def cost(theta: np.ndarray) -> float:
+        return fit.cost(at(theta), fit.model(at(theta)))
+
+    half = fit.normal_equations(at(base), fit.model(at(base)), 0.0)[1]
+    brightest = int(np.argmax(np.abs(half[: 3 * fit.coarse])))
+    for index in (brightest, brightest // 2, -5, -4, -3, -2, -1):
+        step = np.zeros_like(base)
+        step[index] = 1e-3
+        found = (cost(base + step) - cost(base - step)) / 2e-3
+        assert 2 * half[index] == pytest.approx(found, rel=2e-2, abs=1e-2 * np.abs(half).max())
