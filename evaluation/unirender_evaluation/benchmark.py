@@ -25,8 +25,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.files import checkpoint_sha256
-from unirender_evaluation import bounds, physics_rows
+from unirender_evaluation import bounds, multiview_methods, physics_rows
+from unirender_evaluation.claims import OURS
 from unirender_evaluation.engine import Store
+from unirender_evaluation.multiview_pictures import MultiviewPictures
+from unirender_evaluation.multiview_rows import multiview_jobs, multiview_rows
+from unirender_evaluation.multiview_scenes import multiview_scenes
+from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.prediction_check import check_predictions
@@ -43,13 +48,14 @@ from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import installed_version, versions
 from unirender_evaluation.workers import Run, run_in_workers
 
-GROUPS = ("ours", "trivial", "plugins")
+GROUPS = ("ours", "optimisation", "trivial", "plugins")
 FEW = 100  # records: fewer are not worth starting processes
 BOUNDS = (  # keys that no row of a stranger may have
     bounds.CEILING_KEY,
     bounds.REFERENCE_KEY,
     slug(bounds.Shade.name),
     *(info.key for info in physics_rows.INFOS),
+    *map(slug, multiview_methods.NAMES),
 )
 
 
@@ -61,7 +67,8 @@ class BenchConfig:
         suite: name of a bundled suite, or path of a TOML file.
         out: folder of the run; an earlier run in it is continued.
         checkpoint: folder of our model; None = the shipped one.
-        methods: groups of rows: ours, trivial, plugins (installed); a stranger's row always brings the trivial ones.
+        methods: groups of rows: ours; optimisation (each picture, and the multi-view table); trivial; plugins
+            (installed). A stranger's row always brings the trivial ones.
         method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
         predictions: name -> folder of somebody's predictions.
         limit: scenes (evenly spaced); the tables are then watermarked.
@@ -124,6 +131,9 @@ def build_rows(config: BenchConfig) -> list[Row]:
         folder, device = config.checkpoint or shipped_checkpoint(), str(resolve_device(config.device))
         pipeline = LazyPipeline(lambda: _load_pipeline(folder, device))
         rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
+    if "optimisation" in config.methods and config.subsets.optimise != 0:
+        main = next((row.method for row in rows if row.info.key == OURS), None)
+        rows += optimized_rows(config.subsets.optimise, config.subsets.pictures, main)
     plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
     strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
     if "trivial" in config.methods or strangers:
@@ -167,6 +177,7 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
         check = run_check(request, here, store, progress, partial(console.print, highlight=False))
         _work(here, config, store, progress)
+        _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
     info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
@@ -197,10 +208,35 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
         progress.advance(bar, len(records))
 
 
+def _views_rows(config: BenchConfig) -> list[Row]:
+    """The rows of the multi-view table, if the run has one."""
+    return multiview_rows() if "optimisation" in config.methods and config.subsets.views != 0 else []
+
+
+def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
+    """The multi-view table: one optimisation after another, in this process, since their seconds are part of it."""
+    rows = _views_rows(config)
+    scenes = multiview_scenes(here.scenes, config.subsets.views) if rows else []
+    jobs = [
+        job
+        for scene in scenes
+        for job in multiview_jobs(
+            here.suite, scene, rows, here.key_of(scene), here.backbones, MultiviewPictures(here.pictures)
+        )
+    ]
+    missing = [job for job in jobs if not job.is_done(store.has)]
+    bar = progress.add_task("multi-view", total=len(missing), visible=bool(missing))
+    for job in missing:
+        progress.update(bar, description=job.label)
+        store.add(job.make())
+        progress.advance(bar)
+
+
 def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: list[Record]) -> RunInfo:
     suite, scenes = here.suite, here.scenes
     used = {record.method for record in records}
     infos = [row.described(len(scenes)) for row in here.rows] + [
+        *(row.info for row in _views_rows(config)),
         bounds.ceiling_info(suite),
         reference_row(check, scenes),
         *physics_rows.INFOS,

@@ -24,8 +24,9 @@ class BenchRun:
     """Folder of the run."""
     checkpoint: Path | None = None
     """Folder of our model; None: the shipped tiny."""
-    methods: tuple[str, ...] = ("ours", "trivial", "plugins")
-    """Groups of rows; plugins: what is installed. The trivial rows also run whenever there is a row of yours."""
+    methods: tuple[str, ...] = ("ours", "optimisation", "trivial", "plugins")
+    """Groups of rows; optimisation: of each picture, and the multi-view table; plugins: what is installed. The trivial
+    rows also run whenever there is a row of yours."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class;
     repeatable."""
@@ -43,13 +44,17 @@ class BenchRun:
     """Render them again also where the folder holds a check of the same truth, code and seed."""
     sample_scenes: int | None = None
     """Scenes of the sampling rows; 0 leaves them out. None: 4, with `--full` all."""
+    optimise_scenes: int | None = None
+    """Scenes of the rows that optimise each picture; 0 leaves them out. None: 4, with `--full` all."""
+    view_objects: int | None = None
+    """Objects of the multi-view table; 0 leaves it out. None: 4, with `--full` all."""
     jobs: int = 2
     """Worker processes of one thread each; 0: all in this one."""
     device: Device = "cpu"
     """Where our model runs. auto: cuda, then mps, then cpu, whichever is there."""
     full: bool = False
-    """Run what is slow on all scenes instead of on its fixed subset: sampling rows, `shade(true maps)`, the physics
-    table."""
+    """Run what is slow on all scenes instead of on its fixed subset: sampling and optimisation rows, `shade(true
+    maps)`, the physics and the multi-view table."""
 
     def check(self) -> None:
         """Looks at the values.
@@ -59,6 +64,7 @@ class BenchRun:
         """
         at_least(1, limit=self.limit, check_scenes=self.check_scenes)
         at_least(0, check_seed=self.check_seed, sample_scenes=self.sample_scenes, jobs=self.jobs)
+        at_least(0, optimise_scenes=self.optimise_scenes, view_objects=self.view_objects)
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         named_folders(self.predictions)
@@ -66,8 +72,8 @@ class BenchRun:
     @property
     def subsets(self) -> Subsets:
         """On how many scenes the slow rows run."""
-        subsets = WHOLE if self.full else STANDARD
-        return subsets if self.sample_scenes is None else replace(subsets, sample=self.sample_scenes)
+        given = {"sample": self.sample_scenes, "optimise": self.optimise_scenes, "views": self.view_objects}
+        return replace(WHOLE if self.full else STANDARD, **{k: v for k, v in given.items() if v is not None})
 
     def run(self) -> int:
         """Returns the exit status: 1 where predictions cannot be scored or the truth does not stand up to Mitsuba."""

@@ -83,7 +83,7 @@ def verdicts(
     *,
     variant: Variant = DEFAULT_VARIANT,
     kind: str = "ours",
-    against: Sequence[str] = ("trivial", "baseline"),
+    against: Sequence[str] = ("trivial", "baseline", "optimisation"),
 ) -> list[tuple[Column, Comparison]]:
     """Every row of one kind against every row of other kinds, column by column; `records` is one `Selection`.
 

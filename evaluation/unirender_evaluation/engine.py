@@ -57,7 +57,7 @@ def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any]
 
 
 def answer(row: Row, task: Task) -> Prediction:
-    """Asks a method one question; it is handed `task.inputs`, never the truth."""
+    """Asks a method one question; it is handed `task.inputs` and what its row declares, never the truth."""
     start = time.perf_counter()
     if row.predictions is not None:
         image, maps = row.predictions.answer(task)
@@ -66,7 +66,8 @@ def answer(row: Row, task: Task) -> Prediction:
     for capability in task.asks:
         if not callable(getattr(row.method, capability, None)):
             continue
-        result = ask(row, capability, task.identity, **task.inputs[capability])
+        told = {name: getattr(task, name)() for name in row.told}
+        result = ask(row, capability, task.identity, **task.inputs[capability], **told)
         if capability == "decompose":
             maps = result
         else:

@@ -53,15 +53,11 @@ class Pictures:
         """Stores what the gallery would show of a prediction; `key` is the record's content key."""
         wanted = _pictures(task, task.truth_image, task.truth_maps)
         made = {n: p for n, p in _pictures(task, prediction.image, prediction.maps).items() if n in wanted}
-        _write_sheet(self._path(task.identity, method), made, key)
+        write_sheet(self._path(task.identity, method), made, key)
 
     def has(self, task: Task, method: str, key: str) -> bool:
         """Whether a prediction is stored under this key."""
-        path = self._path(task.identity, method)
-        if not path.is_file():
-            return False
-        with PngImage.open(path) as image:
-            return image.info.get("key") == key
+        return sheet_key(self._path(task.identity, method)) == key
 
     def items(self, records: Sequence[Record], main: str) -> list[GalleryItem]:
         """The gallery.
@@ -95,7 +91,7 @@ class Pictures:
         predictions: dict[str, dict[str, Picture]] = {}
         for record in sorted(records, key=lambda record: record.method != about["leader"]):
             path = self._path(task.identity, record.method)
-            made = _read_sheet(path, task.mask.shape[1]) if path.is_file() else {}
+            made = read_sheet(path, task.mask.shape[1]) if path.is_file() else {}
             if made:
                 predictions[record.method] = made
         if not predictions:
@@ -178,7 +174,16 @@ def _scores(task: Task, record: Record, names: Iterable[str]) -> dict[str, str]:
     return texts
 
 
-def _write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
+def sheet_key(path: Path) -> str | None:
+    """The content key of a sheet; None where there is none."""
+    if not path.is_file():
+        return None
+    with PngImage.open(path) as image:
+        return image.info.get("key")
+
+
+def write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
+    """Writes display pictures of one size side by side, with their names and a content key in the PNG's text."""
     levels = [np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in pictures.values()]
     sheet = np.concatenate(levels, axis=1) if levels else np.zeros((1, 1, 3), np.uint8)
     text = PngInfo()
@@ -189,7 +194,8 @@ def _write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
     os.replace(temporary, path)
 
 
-def _read_sheet(path: Path, width: int) -> dict[str, Picture]:
+def read_sheet(path: Path, width: int) -> dict[str, Picture]:
+    """The pictures of a sheet by name, each `width` pixels wide."""
     with PngImage.open(path) as image:
         names, sheet = json.loads(image.info["names"]), np.asarray(image, dtype=np.float32) / 255
     return {name: sheet[:, i * width : (i + 1) * width] for i, name in enumerate(names)}

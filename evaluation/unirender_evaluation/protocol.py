@@ -25,6 +25,7 @@ def protocol_line(
     with_published: bool,
 ) -> tuple[tuple[str, str], ...]:
     """(what, value) pairs in the order in which they are printed."""
+    spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
     items = [
         ("given", protocol.given),
@@ -34,13 +35,13 @@ def protocol_line(
         ("exposure", run.exposure),
         ("resolution", f"{run.resolution} x {run.resolution}"),
         ("n", f"{len(samples)} samples of {len(objects)} objects"),
-        ("coverage", "-" if run.coverage is None else f"{run.coverage:.3f}"),
+        ("coverage", "-" if run.coverage is None or protocol.truth else f"{run.coverage:.3f}"),
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
         ("LPIPS", f"v0.1, {' and '.join(run.lpips)}" if run.lpips else "n/a (no weights)"),
         ("interval", f"{CONFIDENCE:.0%} bootstrap over objects, {RESAMPLES} draws, seed {SEED}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
-        ("truth", f"Mitsuba {run.mitsuba or '-'}, {'-' if run.truth_spp is None else run.truth_spp} spp"),
+        ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
         ("code", f"{run.code or '-'}, {run.date or '-'}"),
     ]
     if with_published:

@@ -29,6 +29,7 @@ SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
     ("inverse", "single-image", "main"),
     ("relighting", "from-image-hdri", "main"),
+    ("multi-view", "known-mesh", "main"),
     ("physics", "physics", "main"),
 )
 

@@ -19,7 +19,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 from unirender.errors import UnirenderError
 
@@ -27,8 +27,8 @@ SCHEMA_VERSION = 1
 
 T = TypeVar("T")
 
-MethodKind = Literal["ours", "paper", "baseline", "trivial", "ceiling", "reference", "external"]
-METHOD_KINDS: tuple[str, ...] = ("ours", "paper", "baseline", "trivial", "ceiling", "reference", "external")
+MethodKind = Literal["ours", "paper", "optimisation", "baseline", "trivial", "ceiling", "reference", "external"]
+METHOD_KINDS: tuple[str, ...] = get_args(MethodKind)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Record:
     bootstrap draws.
     """
 
-    table: str  # "rendering", "inverse", "relighting", "physics"
+    table: str  # "rendering", "inverse", "relighting", "physics", "multi-view"
     protocol: str  # key of `tables.PROTOCOLS`, e.g. "from-image", "given", "given-light"
     method: str  # key of a MethodInfo
     sample: str  # key of the suite's sample (and edit, where one input has several)

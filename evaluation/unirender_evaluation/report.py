@@ -19,6 +19,7 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.gallery import GalleryItem, hero, shelves
 from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
+from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics import PHYSICS_TABLE
 from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_records, read_run
 from unirender_evaluation.report_plots import heading, strip_plots, tiles
@@ -38,12 +39,13 @@ if TYPE_CHECKING:
     from unirender_evaluation.suites import Suite
 
 TEMPLATES = Path(__file__).parent / "templates"
-ALL_TABLES = {**TABLES, PHYSICS_TABLE.name: PHYSICS_TABLE}
+ALL_TABLES = {**TABLES, **{spec.name: spec for spec in (MULTIVIEW_TABLE, PHYSICS_TABLE)}}
 HEADLINE = ("psnr", "mse", "cosine")  # metrics of the verdicts, the tiles and the distributions
 DENSE = 8  # columns: from here on the interval stands below its mean
 KIND_NAMES = {
     "ours": "ours",
     "paper": "published only",
+    "optimisation": "optimisation",
     "baseline": "closed form",
     "external": "other systems",
     "trivial": "trivial",
@@ -271,11 +273,13 @@ def rebuild(folder: Path, suite: str | None = None) -> Path:
 
 def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Record], tables: Sequence[Table]) -> Path:
     """Writes `report.html` of a run, with the gallery from its kept pictures; returns its path."""
+    from unirender_evaluation.multiview_pictures import MultiviewPictures
     from unirender_evaluation.pictures import Pictures
     from unirender_evaluation.tasks import scene_ids
 
     pictures = Pictures(folder / "pictures", suite, scene_ids(suite, run.limit))
     items = pictures.items(records, leading_row(run))
+    items += MultiviewPictures(folder / "pictures").items(records, suite)
     return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES)
 
 

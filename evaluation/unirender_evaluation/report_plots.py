@@ -16,7 +16,7 @@ from unirender_evaluation.tables import Row, Table
 WIDTH = 1000  # of a strip's own coordinates; strokes do not scale with it
 FEW = " (n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{})"  # behind the label of a row that has fewer samples than the others
 LEADING = ("ours", "external")  # kinds whose rows the report is about; the first that is there
-MARKED = ("trivial", "baseline", "external", "ours")  # kinds whose best row is marked on a tile's scale
+MARKED = ("trivial", "baseline", "optimisation", "external", "ours")  # kinds whose best row is marked on a tile's scale
 
 
 def strip_plots(

@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,10 +27,11 @@ from unirender_evaluation.pipeline_method import PipelineMethod
 from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites import Scene, material_key
 from unirender_evaluation.tasks import Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
+T = TypeVar("T")
 SAMPLE_STEPS, SAMPLE_COUNT = 20, 5
 KEY_LETTERS = "a letter from a to z or a digit: its key is made of them"
 
@@ -45,7 +46,10 @@ class Row:
         predictions: the folder, if it is one.
         protocols: (table, protocol) pairs that it takes part in; None = all that its capabilities allow.
         scenes: runs on that many of the run's scenes, evenly spaced; None = all.
+        pictures: in `inverse`, of that many of a scene's materials, evenly spaced; None = all.
         uses: the parts (`versions.PARTS`) that its answers depend on besides the core.
+        told: what it is handed beyond the inputs that all rows have, by the name of the task's field: "geometry", the
+            object's true mesh. Its label and note say so.
     """
 
     info: MethodInfo
@@ -53,12 +57,14 @@ class Row:
     predictions: PredictionFolder | None = None
     protocols: frozenset[tuple[str, str]] | None = None
     scenes: int | None = None
+    pictures: int | None = None
     uses: frozenset[str] = frozenset()
+    told: frozenset[str] = frozenset()
 
     @property
     def config(self) -> dict[str, Any]:
         """What its results depend on."""
-        return dict(self.info.config)
+        return {**self.info.config, **({"told": sorted(self.told)} if self.told else {})}
 
     @property
     def scored_with(self) -> frozenset[str]:
@@ -69,9 +75,11 @@ class Row:
         """Whether the row takes part in a task of a run over `scenes`."""
         if self.protocols is not None and (task.table, task.protocol) not in self.protocols:
             return False
-        if self.scenes is not None and self.scenes < len(scenes):
-            chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, self.scenes).round().astype(int)]
-            if task.scene not in chosen:
+        if self.scenes is not None and task.scene not in evenly(scenes, self.scenes):
+            return False
+        if task.table == "inverse" and self.pictures is not None:
+            chosen = evenly(task.scene.materials, self.pictures)
+            if not any(task.sample == f"{task.scene.key}_{material_key(material)}" for material in chosen):
                 return False
         if self.predictions is not None:
             return self.predictions.has(task)
@@ -79,10 +87,19 @@ class Row:
 
     def described(self, scenes: int) -> MethodInfo:
         """How a run of that many scenes names it: where the row had fewer, its note says how many."""
-        if self.scenes is None or self.scenes >= scenes:
-            return self.info
-        only = f"{self.scenes} scenes only"
-        return replace(self.info, note=f"{self.info.note}; {only}" if self.info.note else only)
+        fewer = [self.info.note] if self.info.note else []
+        if self.scenes is not None and self.scenes < scenes:
+            fewer.append(f"{self.scenes} scenes only")
+        if self.pictures is not None:
+            fewer.append(f"inverse: {self.pictures} pictures of each scene only")
+        return replace(self.info, note="; ".join(fewer))
+
+
+def evenly(items: Sequence[T], count: int | None) -> list[T]:
+    """`count` of the items, evenly spaced; all where None, or where there are not more."""
+    if count is None or count >= len(items):
+        return list(items)
+    return [items[i] for i in np.linspace(0, len(items) - 1, count).round().astype(int)]
 
 
 def slug(name: str) -> str:
@@ -96,7 +113,9 @@ def make_row(method: Any, kind: MethodKind, label: str | None = None, **options:
     Raises:
         UnirenderError: the method's name has nothing for a key, or its config is no JSON object.
     """
-    fields = {name: options.pop(name) for name in ("protocols", "scenes", "uses") if name in options}
+    fields = {
+        name: options.pop(name) for name in ("protocols", "scenes", "pictures", "uses", "told") if name in options
+    }
     if not isinstance(method.name, str) or not slug(method.name):
         raise UnirenderError(f"{method!r}: got the name {method.name!r}, expected a string with {KEY_LETTERS}")
     try:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from unirender_evaluation.metrics import METRICS, Metric, Variant, metric_key
+from unirender_evaluation.multiview_settings import STANDARD as VIEWS
 
 GRID_MSE = 0.100  # mean of (x - 0.5)^2 over x in {0, .1 .. 1}: what a constant 0.5 scores on the paper's materials
 GRID_TOLERANCE = 0.002  # a suite whose constant scores within it has the paper's distribution of materials
@@ -22,6 +23,7 @@ class Protocol:
     label: str  # as in headings
     given: str  # one sentence
     published: bool = False  # whether the paper's numbers were taken this way
+    truth: str = ""  # where it is not the suite's stored truth: what results are scored against
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -41,6 +43,14 @@ PROTOCOLS: dict[str, Protocol] = {
         ),
         Protocol("from-image-hdri", "from the image, HDRI given", "one image and its mask, and the target's HDRI"),
         Protocol("physics", "physics", "what each test says"),
+        Protocol(
+            "known-mesh",
+            f"{VIEWS.seen} views, known mesh",
+            f"{VIEWS.seen} pictures from all around (8-bit sRGB) with masks and cameras, and the true mesh without its "
+            "looks; neither light nor material",
+            truth=f"rendered in this run, {VIEWS.seen} seen and {VIEWS.held_out} held-out cameras; pictures are scored "
+            f"on the held-out ones, {VIEWS.truth_spp} spp, against results at {VIEWS.spp} spp",
+        ),
     )
 }
 

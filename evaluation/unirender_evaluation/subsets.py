@@ -11,12 +11,18 @@ class Subsets:
         sample: of the sampling rows, which cost steps x samples; 0 = leave them out.
         shade: of `shade(true maps)`, which renders with Mitsuba.
         physics: of the physics table: renderer tests and closed loops.
+        optimise: of the rows that optimise each picture.
+        pictures: pictures of each such scene in the inverse table.
+        views: objects of the multi-view table; 0 = leave it out.
     """
 
     sample: int | None = 4
     shade: int | None = 12
     physics: int | None = 12
+    optimise: int | None = 4
+    pictures: int | None = 3
+    views: int | None = 4
 
 
 STANDARD = Subsets()
-WHOLE = Subsets(sample=None, shade=None, physics=None)
+WHOLE = Subsets(sample=None, shade=None, physics=None, optimise=None, pictures=None, views=None)

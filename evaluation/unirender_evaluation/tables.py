@@ -18,8 +18,8 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
 
-RANKED_KINDS = ("ours", "paper", "baseline", "external", "trivial")  # bounds are no competitors
-KIND_ORDER = ("ours", "paper", "external", "baseline", "trivial", "ceiling", "reference")
+RANKED_KINDS = ("ours", "paper", "optimisation", "baseline", "external", "trivial")  # bounds are no competitors
+KIND_ORDER = ("ours", "paper", "optimisation", "external", "baseline", "trivial", "ceiling", "reference")
 SECTIONS = {
     "data-driven": "Data-driven methods",
     "optimisation": "Optimisation",

@@ -11,11 +11,12 @@ score against.
     relighting  from-image-hdri   picture, another light                  the relit picture
 
 A picture is what a camera would store: 8-bit sRGB. No other truth reaches a method; the mask and the camera are inputs
-everywhere.
+everywhere. A row that is told more declares it (`rows.Row.told`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,9 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Image, Mask, quantise
+from unirender_evaluation.suite_objects import known_mesh
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
+from unirender_reference.shapes import MeshObject
 
 Capability = Literal["decompose", "edit", "relight", "render"]
 PROTOCOLS: tuple[tuple[str, str], ...] = (
@@ -54,6 +57,7 @@ class Task:
     answer: str
     mask: Mask
     inputs: dict[str, dict[str, Any]] = field(repr=False)  # by capability
+    geometry: Callable[[], MeshObject] | None = field(default=None, repr=False)  # of the object: for `Row.told` alone
     truth_image: Image | None = field(default=None, repr=False)
     truth_variance: Image | None = field(default=None, repr=False)
     truth_twin: Image | None = field(default=None, repr=False)  # of many times the samples, where the suite has one
@@ -124,6 +128,7 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             answer=f"edit_{material_key(target)}",
             mask=suite.mask(scene),
             inputs={"edit": {**seen, **change}},
+            geometry=partial(known_mesh, suite, scene),
             truth_image=suite.image(scene, target),
             truth_variance=suite.image_variance(scene, target),
             truth_twin=suite.ceiling_image(scene, target),
@@ -165,6 +170,7 @@ def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             answer="intrinsics",
             mask=suite.mask(scene),
             inputs={"decompose": picture(suite, scene, material)},
+            geometry=partial(known_mesh, suite, scene),
             truth_maps=suite.intrinsics(scene, material).replace(specular=None, diffuse=None, environment=None),
         )
 
@@ -187,6 +193,7 @@ def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         answer=f"relight_{target.key.rsplit('_', 1)[1]}_{'sd' if given_sd else 'hdri'}",
         mask=suite.mask(scene),
         inputs={"relight": {**seen, **light}, "decompose": seen},
+        geometry=partial(known_mesh, suite, scene),
         truth_image=suite.image(target, base),
         truth_variance=suite.image_variance(target, base),
         truth_twin=suite.ceiling_image(target, base),

@@ -7,6 +7,8 @@ uses, so that a change of the network's code leaves the composite's records vali
     lpips       the backbones' weights, by content: every row whose pictures are scored
     model       the network, its diffusion and pipeline: our rows, and plug-ins, which may call them
     reference   Mitsuba, the generators of shapes and the lights with their data: every row that renders
+    optimizer   inverse rendering by optimisation: its rows
+    multiview   scenes and scores of the multi-view table: its rows
 """
 
 import hashlib
@@ -21,6 +23,7 @@ from pathlib import Path
 from unirender.errors import UnirenderError
 
 MODEL, REFERENCE, LPIPS = "model", "reference", "lpips"
+OPTIMIZER, MULTIVIEW = "optimizer", "multiview"
 SEPARATOR = "/"  # between the core's version and those of the other parts
 
 
@@ -56,6 +59,9 @@ COMMANDS = (
 )
 FROM_RECORDS = ("claims", "comparisons", "protocol", "published", "readme", "statistics", "table*", "verdict")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
+# Parts of their own: a change there concerns no other row.
+OPTIMIZED = ("optimized_*",)
+VIEWS = ("light_metrics", "multiview_*")
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
     "adaptive*",
@@ -76,6 +82,8 @@ NOT_IN_RECORDS = (
     "members",
     "mesh_folder",
     "meshes/*",
+    "multiview",
+    "optimize/*",
     "plan",
     "principled",
     "processes",
@@ -86,13 +94,18 @@ NOT_IN_RECORDS = (
     "versions",
     "workers",
 )
+# Commands and files of the optimiser: what it finds does not depend on them.
+NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR"),
         (
             *(f"unirender/{name}.py" for name in ("cli", "commands", "options")),
-            *(f"unirender_evaluation/{name}.py" for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, "versions")),
+            *(
+                f"unirender_evaluation/{name}.py"
+                for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, *OPTIMIZED, *VIEWS, "versions")
+            ),
         ),
     ),
     MODEL: Part({"unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py")}, ("torch", "diffusers")),
@@ -101,6 +114,21 @@ PARTS: Mapping[str, Part] = {
         ("mitsuba", "drjit", "karellen-llvm-core"),
         ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in NOT_IN_RECORDS)),
         ("UNIRENDER_MITSUBA_VARIANT",),
+    ),
+    OPTIMIZER: Part(
+        {
+            "unirender_reference": ("optimize/**/*.py", "multiview.py"),
+            "unirender_evaluation": tuple(f"{name}.py" for name in OPTIMIZED),
+        },
+        ("cholespy", "xatlas"),
+        tuple(f"unirender_reference/optimize/{name}.py" for name in NOT_IN_OPTIMIZED),
+    ),
+    MULTIVIEW: Part(
+        {
+            "unirender_reference": ("multiview.py", "optimize/solution.py", "optimize/views.py"),
+            "unirender_evaluation": tuple(f"{name}.py" for name in VIEWS),
+        },
+        (),
     ),
 }
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from unirender_evaluation.bounds import ceiling_jobs
+from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import Job, content_key, method_jobs
 from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
@@ -40,16 +40,21 @@ class Run:
     subsets: Subsets = STANDARD
 
     def jobs(self, scene: Scene) -> Iterator[Job]:
-        """Every record that the run wants of one scene."""
-
-        def key_of(what: str, info: MethodInfo, uses: Collection[str]) -> str:
-            return content_key(self.suite, scene, what, info.config, self.versions.of(uses))
-
+        """Every record that the run wants of one scene, the multi-view table's aside."""
+        key_of = self.key_of(scene)
         keeper = Pictures(self.pictures, self.suite, self.scenes)
         yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.versions, self.backbones, keeper)
         yield from ceiling_jobs(self.suite, scene, key_of, self.backbones)
         if scene in physics_scenes(self.suite, self.scenes, self.subsets.physics):
             yield from physics_jobs(self.suite, scene, self.rows, key_of)
+
+    def key_of(self, scene: Scene) -> KeyOf:
+        """Makes the content keys of records of a scene."""
+
+        def key_of(what: str, info: MethodInfo, uses: Collection[str]) -> str:
+            return content_key(self.suite, scene, what, info.config, self.versions.of(uses))
+
+        return key_of
 
 
 _here: tuple[Run, frozenset[str]] | None = None
@@ -65,6 +70,7 @@ def _start(
     subsets: Subsets,
     known: frozenset[str],
 ) -> None:
+    from unirender_reference.backend import set_threads
     from unirender_reference.processes import exit_with_parent
 
     exit_with_parent()
@@ -72,6 +78,7 @@ def _start(
 
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
+    set_threads(1)  # nor do renders of 64 px
     loaded = load_suite(suite)
     run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     _here = run, known

@@ -29,7 +29,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 
 
 def test_row_groups_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(UnirenderError, match="expected some of ours, trivial, plugins"):
+    with pytest.raises(UnirenderError, match="expected some of ours, optimisation, trivial, plugins"):
         build_rows(BenchConfig(methods=("everything",)))
     with pytest.raises(UnirenderError, match="no checkpoint in"):
         build_rows(BenchConfig(methods=("ours",), checkpoint=tmp_path))

@@ -1,5 +1,6 @@
 """On how many scenes the slow rows run: one value for all of them, and notes that say what was run."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -7,10 +8,12 @@ from tiny_suites import make_suite
 
 from unirender_evaluation.benchmark import BenchConfig, build_rows
 from unirender_evaluation.commands import BenchRun
+from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.physics_rows import physics_scenes
 from unirender_evaluation.rows import Row
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 from unirender_evaluation.suites import Suite
+from unirender_evaluation.tasks import PROTOCOLS, tasks
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run
 
@@ -39,7 +42,7 @@ def test_a_default_run_keeps_to_the_stated_subsets(suite: Suite, tmp_path: Path)
         zip(SLOW, (4, 12), strict=True)
     )
     assert physics_labels(suite, Subsets(physics=3), tmp_path) == 3
-    assert BenchRun().subsets == BenchConfig().subsets == STANDARD == Subsets(4, 12, 12)
+    assert BenchRun().subsets == BenchConfig().subsets == STANDARD == Subsets(4, 12, 12, 4, 3, 4)
 
 
 def test_a_full_run_has_no_subset(suite: Suite, tmp_path: Path) -> None:
@@ -50,10 +53,36 @@ def test_a_full_run_has_no_subset(suite: Suite, tmp_path: Path) -> None:
     assert physics_labels(suite, WHOLE, tmp_path) == len(suite.scenes) == 8
 
 
-def test_the_sampling_rows_have_an_option_of_their_own() -> None:
-    assert BenchRun(full=True, sample_scenes=3).subsets == Subsets(3, None, None)
-    assert BenchRun(sample_scenes=0).subsets == Subsets(0, 12, 12)
+def test_the_slowest_rows_have_options_of_their_own() -> None:
+    assert BenchRun(full=True, sample_scenes=3).subsets == Subsets(3, None, None, None, None, None)
+    assert BenchRun(sample_scenes=0).subsets == Subsets(0, 12, 12, 4, 3, 4)
+    assert BenchRun(full=True, optimise_scenes=2, view_objects=0).subsets == Subsets(None, None, None, 2, None, 0)
     assert "ours-sample" not in rows_of(Subsets(sample=0))
+
+
+def test_optimisation_rows_take_some_pictures_of_some_scenes(suite: Suite) -> None:
+    """Four scenes of eight; of each all edits and relightings, which share a picture, and some of the materials."""
+    rows = {row.info.key: row for row in optimized_rows(4, 1)}
+    scenes = list(suite.scenes)
+    for row in rows.values():
+        asked = [task for table, protocol in PROTOCOLS for task in tasks(suite, table, protocol, scenes)]
+        asked = [task for task in asked if row.answers(task, scenes)]
+        assert {scenes.index(task.scene) for task in asked} == {0, 2, 5, 7}
+        assert Counter(task.table for task in asked) == {"rendering": 12, "inverse": 4, "relighting": 8}
+        assert not any(task.protocol in ("given", "given-light") for task in asked)
+        assert row.described(8).note.endswith("; 4 scenes only; inverse: 1 pictures of each scene only")
+    whole = optimized_rows(None)[0]
+    assert all(whole.answers(task, scenes) for task in tasks(suite, "inverse", "single-image", scenes))
+
+
+def test_only_the_row_that_says_so_is_told_the_mesh(suite: Suite) -> None:
+    """Its key is another one, its label says it, and no published value stands beside it."""
+    plain, told = optimized_rows(4)
+    assert (plain.told, told.told) == (frozenset(), {"geometry"})
+    assert plain.info.config == told.info.config
+    assert plain.config != told.config
+    assert "true mesh" in told.info.label
+    assert (plain.info.published, told.info.published) == ("NvDiffrec", None)
 
 
 def test_physics_scenes_are_the_runs_own(suite: Suite) -> None:

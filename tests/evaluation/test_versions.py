@@ -10,6 +10,8 @@ from unirender_evaluation import lpips
 from unirender_evaluation.versions import (
     LPIPS,
     MODEL,
+    MULTIVIEW,
+    OPTIMIZER,
     PARTS,
     REFERENCE,
     Part,
@@ -60,6 +62,10 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/sampling.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
+        (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
+        (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
+        (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
+        (MULTIVIEW, "unirender_evaluation", ("light_metrics.py", "multiview_scoring.py", "multiview_settings.py")),
     ],
 )
 def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:
@@ -67,6 +73,19 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
     covered = {path for pattern in PARTS[part].files[package] for path in root.glob(pattern)}
     assert {root / name for name in files} <= covered
     assert not [name for name in files for pattern in PARTS[part].without if fnmatch(f"{package}/{name}", pattern)]
+
+
+@pytest.mark.parametrize(
+    ("part", "package", "files"),
+    [
+        ("core", "unirender_evaluation", ("optimized_method.py", "multiview_scoring.py", "light_metrics.py")),
+        (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
+        (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
+    ],
+)
+def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str, files: tuple[str, ...]) -> None:
+    for name in files:
+        assert any(fnmatch(f"{package}/{name}", pattern) for pattern in PARTS[part].without), name
 
 
 def test_a_record_follows_the_parts_that_its_row_uses() -> None:
@@ -96,7 +115,7 @@ def test_lpips_values_follow_the_weights(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_versions_of_this_installation() -> None:
     found = versions(("alex",))
-    assert set(found.parts) == {MODEL, REFERENCE, LPIPS}
+    assert set(found.parts) == {MODEL, REFERENCE, LPIPS, OPTIMIZER, MULTIVIEW}
     assert {len(value) for value in (found.core, found.code, *found.parts.values())} == {64}
     assert found == versions(("alex",))
     assert found.of({LPIPS}) != versions(()).of({LPIPS})

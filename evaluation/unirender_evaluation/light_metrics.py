@@ -1,0 +1,131 @@
+"""How far a found light is from the true one when its scale is free: log-RMSE at the best scale, and the direction that
+it comes from.
+
+Both lights are brought to 16 x 32 texels first (`lighting.resample_environment`, which keeps the energy). Notation: p
+found, t true, w the texels' solid angles, eps = `metrics.LOG_EPSILON`.
+"""
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from unirender.errors import UnirenderError
+from unirender.lighting import (
+    environment_directions,
+    resample_environment,
+    sample_environment,
+    texel_solid_angles,
+)
+from unirender_evaluation import metrics
+from unirender_evaluation.metrics import LOG_EPSILON, Metric
+
+SHAPE = (16, 32)
+CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
+CONE_SHAPE = (46, 90)  # directions and quadrature of the cones: 4 degrees
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LARGEST_SCALE = 1e4
+UNIFORM = 1e-3  # relative differences between cones below which a light has no brightest direction
+
+SCALED_LOG_RMSE = Metric(
+    "log_rmse_scaled",
+    "log-RMSE",
+    "",
+    False,
+    0.0,
+    (),
+    3,
+    f"min over one factor k of sqrt(sum w (ln(k p + {LOG_EPSILON}) - ln(t + {LOG_EPSILON}))^2 / sum w), "
+    f"{SHAPE[0]} x {SHAPE[1]} texels, w solid angle",
+)
+PEAK_ANGLE = Metric(
+    "peak_deg",
+    "angle",
+    "deg",
+    False,
+    0.0,
+    (),
+    1,
+    f"between the brightest directions (centroid of the luminance in the cone of {CONE_DEG:g} degrees that holds the "
+    "most); 90 for a uniform light",
+)
+
+
+def light_values(
+    found: Float[np.ndarray, "h w 3"], true: Float[np.ndarray, "th tw 3"], quantity: str = "environment"
+) -> dict[str, float]:
+    """Metric key -> value of a light, both metrics.
+
+    Args:
+        found: lat-long radiance, any resolution, any scale.
+        true: the same; both in the same axes.
+        quantity: name in the metric keys.
+    """
+    p, t = (resample_environment(light, SHAPE) for light in (found, true))
+    return {
+        metrics.metric_key(quantity, SCALED_LOG_RMSE): scaled_log_rmse(p, t),
+        metrics.metric_key(quantity, PEAK_ANGLE): peak_angle_deg(p, t),
+    }
+
+
+def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:
+    """The log-RMSE of `k p` against `t` for the best single factor k, weighted by solid angle.
+
+    Raises:
+        UnirenderError: `p` is black, which no factor makes a light.
+    """
+    if not p.max() > 0:
+        raise UnirenderError("light metric: the found light is black, expected some radiance")
+    w = texel_solid_angles(*p.shape[:2])[..., None]
+
+    def error(log_scale: float) -> float:
+        return metrics.log_rmse(p * math.exp(log_scale), t, w)
+
+    limit = math.log(LARGEST_SCALE)
+    grid = np.linspace(-limit, limit, 41)
+    start = grid[int(np.argmin([error(k) for k in grid]))]
+    step = grid[1] - grid[0]
+    best: Any = minimize_scalar(error, bounds=(start - step, start + step), method="bounded")
+    return float(best.fun)
+
+
+def peak_angle_deg(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:
+    """Angle between the brightest directions of two lights, in degrees; 90, the mean over random directions, where one
+    of them is uniform."""
+    a, b = brightest_direction(p), brightest_direction(t)
+    if a is None or b is None:
+        return 90.0
+    chord = float(np.linalg.norm(a - b))
+    return float(np.degrees(2 * np.arcsin(min(chord / 2, 1.0))))
+
+
+def brightest_direction(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"] | None:
+    """Unit centroid of the luminance in the cone of `CONE_DEG` that holds the most of it, weighted by solid angle; None
+    for uniform light.
+
+    Cones are centred on, and integrated over, the texel directions of a grid of `CONE_SHAPE`, between which the light
+    is bilinear.
+    """
+    directions, weights, inside = _cones()
+    luminance = sample_environment(environment, directions).astype(np.float64) @ LUMINANCE * weights
+    means = inside @ luminance
+    if np.ptp(means) <= UNIFORM * means.max():
+        return None
+    best = int(np.argmax(means))
+    centroid = (luminance * inside[best]) @ directions.astype(np.float64)
+    return centroid / np.linalg.norm(centroid)
+
+
+@functools.cache
+def _cones() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Directions, their solid angles, and which lie in the cone around each: row i is the cone around direction i.
+
+    Rows are divided by their cone's own solid angle on the grid, which varies by the grid's coarseness.
+    """
+    directions = environment_directions(*CONE_SHAPE).reshape(-1, 3)
+    weights = texel_solid_angles(*CONE_SHAPE).ravel().astype(np.float64)
+    inside = (directions @ directions.T >= math.cos(math.radians(CONE_DEG))).astype(np.float32)
+    return directions, weights, inside / (inside @ weights)[:, None].astype(np.float32)

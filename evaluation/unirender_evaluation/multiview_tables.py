@@ -1,0 +1,37 @@
+"""The multi-view table: its columns."""
+
+from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
+from unirender_evaluation.metrics import METRICS, Metric
+from unirender_evaluation.specs import Column, TableSpec
+
+PROTOCOL = "known-mesh"
+SECONDS = Metric("seconds", "time", "s", False, 0.0, (), 1, "wall clock of one object, optimisation only")
+_IN_MASK = {"mask": "masked"}
+_ALIGNED = {"scale": "aligned"}
+
+
+def _column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
+    found = METRICS[metric] if isinstance(metric, str) else metric
+    return Column(group, quantity, found, overrides, published=False)
+
+
+MULTIVIEW_TABLE = TableSpec(
+    "multi-view",
+    "Multi-view inverse rendering",
+    (
+        _column("Albedo", "albedo", "psnr", scale="raw"),
+        _column("Albedo (aligned)", "albedo", "psnr", **_ALIGNED),
+        _column("Roughness", "roughness", "mse", **_IN_MASK),
+        _column("Metallic", "metallic", "mse", **_IN_MASK),
+        _column("Light", "environment", SCALED_LOG_RMSE),
+        _column("Light", "environment", PEAK_ANGLE),
+        _column("Relit", "relit", "psnr", scale="raw"),
+        _column("Relit (aligned)", "relit", "psnr", **_ALIGNED),
+        *(_column("Novel view", "novel", name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")),
+        _column("Optimisation", "time", SECONDS),
+    ),
+    (PROTOCOL,),
+    "Pictures of an object under one light in; textures and light out. Maps: all cameras. Relit (under the object's "
+    "other light) and novel view: held-out cameras. Aligned: one least-squares factor, since albedo and light share an "
+    "unknown one.",
+)

@@ -1,0 +1,108 @@
+"""Lights whose scale is free: the best factor, and the direction that the light comes from."""
+
+import math
+
+import numpy as np
+import pytest
+from reference_scenes import environment
+
+from unirender.errors import UnirenderError
+from unirender.lighting import environment_directions, resample_environment, rotate_environment, texel_solid_angles
+from unirender_evaluation import metrics
+from unirender_evaluation.light_metrics import (
+    SHAPE,
+    brightest_direction,
+    light_values,
+    peak_angle_deg,
+    scaled_log_rmse,
+)
+
+
+def lamp(row: float, column: float, width_deg: float = 8.0, radiance: float = 20.0) -> np.ndarray:
+    """Dim light with one round lamp, a Gaussian of the angle, at fractional texels of a 16 x 32 map."""
+    cosine = environment_directions(*SHAPE) @ direction(row, column)
+    apart = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    shape = np.exp(-np.square(apart / width_deg) / 2)
+    return (0.1 + radiance * shape[..., None] * np.ones(3)).astype(np.float32)
+
+
+def direction(row: float, column: float) -> np.ndarray:
+    theta, phi = math.pi * row / (SHAPE[0] - 1), 2 * math.pi * (column + 0.5) / SHAPE[1]
+    return np.array([math.sin(theta) * math.sin(phi), math.cos(theta), -math.sin(theta) * math.cos(phi)])
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return math.degrees(math.acos(np.clip(a @ b, -1, 1)))
+
+
+def test_scale_is_free_and_colour_is_not() -> None:
+    true = 2 + environment(3)  # bright against the epsilon of the logarithm
+    assert scaled_log_rmse(7.3 * true, true) < 1e-4
+    assert scaled_log_rmse(0.02 * true, true) < 1e-4
+    tinted = true * np.array([2.0, 1.0, 0.5], np.float32)
+    assert scaled_log_rmse(tinted, true) == pytest.approx(math.log(2) * math.sqrt(2 / 3), rel=0.02)
+
+
+def test_the_best_scale_is_the_best() -> None:
+    """No factor of a dense grid does better, nor does the least-squares factor, which follows the brightest texel."""
+    found, true = environment(4), environment(5)
+    w = texel_solid_angles(*SHAPE)[..., None]
+    best = scaled_log_rmse(found, true)
+    factors = np.geomspace(1e-3, 1e3, 2001)
+    dense = min(metrics.log_rmse((found * k).astype(np.float32), true, w) for k in factors)
+    assert best == pytest.approx(dense, rel=1e-4)
+    assert best <= metrics.log_rmse(metrics.align_scale(found, true, w, "aligned"), true, w)
+
+
+@pytest.mark.parametrize(("row", "column"), [(7.5, 3.0), (4.3, 31.6), (1.0, 12.0), (11.2, 20.4)])
+def test_the_lamp_is_found_between_texels_too(row: float, column: float) -> None:
+    found = brightest_direction(lamp(row, column))
+    assert found is not None
+    assert angle(found, direction(row, column)) < 2.5
+
+
+def test_angle_is_that_of_the_turn() -> None:
+    """A quarter of the equator is a quarter; a mirrored light is caught."""
+    light = lamp(7.5, 8.0)
+    assert peak_angle_deg(light, light) == pytest.approx(0, abs=1e-6)
+    assert peak_angle_deg(np.roll(light, 8, axis=1), light) == pytest.approx(90, abs=2)
+    a = math.radians(35)
+    turn = np.array([[1, 0, 0], [0, math.cos(a), -math.sin(a)], [0, math.sin(a), math.cos(a)]], np.float32)
+    assert peak_angle_deg(rotate_environment(lamp(7.5, 15.5), turn), lamp(7.5, 15.5)) == pytest.approx(35, abs=2)
+    assert peak_angle_deg(light[:, ::-1].copy(), light) > 80
+
+
+def test_a_lamp_counts_by_the_light_in_its_cone() -> None:
+    """One hot texel against a larger lamp of less radiance and more light; a whole polar row against a smaller lamp of
+    more: solid angles count, not texels."""
+    wide = lamp(7.5, 8.0, width_deg=16.0, radiance=5.0)
+    wide[8, 24] = 7.0
+    found = brightest_direction(wide)
+    assert found is not None
+    assert angle(found, direction(7.5, 8.0)) < 5
+    pole = np.full((*SHAPE, 3), 0.1, np.float32)
+    pole[0], pole[6:9, 8:11] = 3.0, 4.0
+    found = brightest_direction(pole)
+    assert found is not None
+    assert angle(found, direction(7, 9)) < 5
+
+
+def test_a_uniform_light_has_no_direction() -> None:
+    uniform = np.full((*SHAPE, 3), 0.3, np.float32)
+    assert brightest_direction(uniform) is None
+    assert peak_angle_deg(uniform, lamp(7.5, 8.0)) == 90.0
+
+
+def test_resolutions_are_brought_together() -> None:
+    light = environment(6, (64, 128), peaks=2)
+    small = resample_environment(light, SHAPE)
+    values = light_values(3 * small, light)
+    assert values["environment.log_rmse_scaled"] < 0.01
+    assert values["environment.peak_deg"] < 0.1
+    assert light_values(environment(7), light)["environment.log_rmse_scaled"] > 0.1
+
+
+def test_a_black_light_is_refused() -> None:
+    black = np.zeros((*SHAPE, 3), np.float32)
+    with pytest.raises(UnirenderError, match="the found light is black"):
+        light_values(black, lamp(7.5, 8.0))
