@@ -38,7 +38,7 @@ from unirender_reference.shapes import MeshObject
 
 GREY = 0.4
 STARTS = tuple(itertools.product((0.25, 0.7), (0.15, 0.85)))  # (roughness, metallic)
-POINTS = 4  # in a pixel
+POINTS = 16  # in a pixel
 LATER_ITERATIONS = 3  # after a correction
 
 OnStep = Callable[[Step], bool]
@@ -103,7 +103,7 @@ class _Work:
         coverage = self.points.of([view.mask for view in views.seen])[:, 0]
         position = self.points.mean_position()
         seen = observe(self.shown, coverage, patches(position, _footprint_edge(views)), display=not views.hdr)
-        transport = light_transport(scene, self.points, LightGrid(light_rows, 2 * light_rows), seed)
+        transport = light_transport(scene, self.points, LightGrid(light_rows, 2 * light_rows), seed, coverage)
         self.fit = PixelFit(transport, seen, np.ones_like(self.shown), GREY)
         self.texels = footprint(self.points, texture_size)
 

@@ -9,8 +9,9 @@ The radiance of a pixel under a light of cells with radiance E_j is
     F_j = F0 G_j + (1 - F0) W_j        the dielectric Fresnel term as Schlick approximates it, F0 = 0.04
 
 Each entry is an integral over the cell of lobe x cosine x visibility, averaged over the pixel's points. It is estimated
-with two kinds of samples under the balance heuristic: one direction in each cell, and `BSDF_SAMPLES` of the GGX lobe's
-visible normals, so that narrow lobes are sharp and wide ones smooth. Visibility is Mitsuba's. What the matrices leave
+with two kinds of samples under the balance heuristic: `CELL_SAMPLES` directions in each cell for a pixel, in turn from
+its points, and `BSDF_SAMPLES` of the GGX lobe's visible normals from every point, so that narrow lobes are sharp and
+wide ones smooth. Visibility is Mitsuba's. What the matrices leave
 out (interreflection, the exact Fresnel term, what is smaller than a cell) is what a path-traced image corrects.
 """
 
@@ -27,7 +28,8 @@ from unirender_reference.optimize.surface_points import SurfacePoints
 from unirender_reference.passes import derive_seed
 
 F0 = 0.04
-BSDF_SAMPLES = 16  # directions of the GGX lobe at each point, for each roughness node
+CELL_SAMPLES = 4  # directions in each cell for a pixel
+BSDF_SAMPLES = 4  # directions of the GGX lobe at each point, for each roughness node
 LANES = 1 << 22
 
 Matrix = Float[np.ndarray, "n j"]
@@ -67,12 +69,19 @@ def refined(cells: Float[np.ndarray, "j 3"], grid: LightGrid) -> Float[np.ndarra
     return light.repeat(2, axis=0).repeat(2, axis=1).reshape(-1, 3)
 
 
-def light_transport(scene: Any, points: SurfacePoints, grid: LightGrid, seed: int) -> Transport:
-    """The matrices of surface points in a scene that blocks light (`surface_points.blocker`)."""
+def light_transport(
+    scene: Any, points: SurfacePoints, grid: LightGrid, seed: int, coverage: Float[np.ndarray, " n"] | None = None
+) -> Transport:
+    """The matrices of surface points in a scene that blocks light (`surface_points.blocker`).
+
+    Args:
+        coverage: of the pixels, where it is known better than from the points' own hits: a row is the mean over the
+            points that hit, times it.
+    """
     lobes = 3 + 2 * len(NODES)
     matrices = [np.zeros((len(points), grid.count), np.float32) for _ in range(lobes)]
     samples = points.hit.shape[1]
-    step = max(1, LANES // (samples * grid.count))
+    step = max(1, LANES // (min(samples, CELL_SAMPLES) * grid.count))
     for start in range(0, len(points), step):
         rows = slice(start, min(start + step, len(points)))
         surface = _Surface(scene, points, rows)
@@ -86,6 +95,9 @@ def light_transport(scene: Any, points: SurfacePoints, grid: LightGrid, seed: in
             own = derive_seed(seed, "lobes", start, node)
             for matrix, part in zip(matrices[3 + 2 * node :], _by_lobe(surface, grid, roughness, own), strict=False):
                 matrix[rows] += part
+    if coverage is not None:
+        for matrix in matrices:
+            matrix *= (coverage / points.coverage)[:, None]
     return Transport(grid, tuple(matrices[:3]), tuple(matrices[3::2]), tuple(matrices[4::2]))
 
 
@@ -141,10 +153,12 @@ def _by_cell(surface: _Surface, grid: LightGrid, seed: int) -> list[Matrix]:
     import drjit as dr
 
     mi = mitsuba()
-    samples, cells = surface.samples, grid.count
+    cells, samples = grid.count, min(surface.samples, CELL_SAMPLES)
+    share = samples / surface.samples  # of the points that a cell is seen from
     lane = dr.arange(mi.UInt32, surface.pixels * cells * samples)
     cell = (lane // samples) % cells
-    lanes = surface.lanes(lane // (samples * cells) * samples + lane % samples)
+    turn = (lane % samples) * (surface.samples // samples) + cell % (surface.samples // samples)
+    lanes = surface.lanes(lane // (samples * cells) * surface.samples + turn)
     random = mi.PCG32(size=dr.width(lane), initstate=dr.opaque(mi.UInt64, seed))
     towards = grid.direction(cell, random.next_float32(), random.next_float32())
     seen = lanes.unblocked(towards)
@@ -152,16 +166,16 @@ def _by_cell(surface: _Surface, grid: LightGrid, seed: int) -> list[Matrix]:
     facing, incident = lanes.frame.to_local(lanes.to_viewer).z, lanes.frame.to_local(towards).z
     half = dr.normalize(lanes.to_viewer + towards)
     normal, angle = lanes.frame.to_local(half).z, dr.dot(half, towards)
-    values = [lobe * area for lobe in _diffuse_lobes(facing, incident, angle)]
+    values = [lobe * area / share for lobe in _diffuse_lobes(facing, incident, angle)]
     schlick = (1 - angle) ** 5
     for roughness in NODES:
-        gloss = _ggx(roughness, normal, facing, incident) / (
-            dr.rcp(area) + BSDF_SAMPLES * _density(roughness, normal, facing)
-        )
+        density = share * dr.rcp(area) + BSDF_SAMPLES * _density(roughness, normal, facing)
+        gloss = _ggx(roughness, normal, facing, incident) / density
         values += [gloss, gloss * schlick]
     values = [dr.select(seen, value, 0) for value in values]
     dr.eval(values)
-    return [np.array(dr.block_sum(value, samples)).reshape(surface.pixels, cells) / samples for value in values]
+    sums = [np.array(dr.block_sum(value, samples)).reshape(surface.pixels, cells) for value in values]
+    return [total / surface.samples for total in sums]
 
 
 def _by_lobe(surface: _Surface, grid: LightGrid, roughness: float, seed: int) -> list[Matrix]:
@@ -182,7 +196,8 @@ def _by_lobe(surface: _Surface, grid: LightGrid, roughness: float, seed: int) ->
     cell = grid.cell_of(towards)
     area = dr.gather(mi.Float, mi.Float(grid.solid_angles.astype(np.float32)), cell // grid.columns)
     alpha = dr.opaque(mi.Float, roughness)
-    weight = dr.rcp(area) + BSDF_SAMPLES * _density(alpha, half.z, viewer.z)
+    share = min(surface.samples, CELL_SAMPLES) / surface.samples
+    weight = share * dr.rcp(area) + BSDF_SAMPLES * _density(alpha, half.z, viewer.z)
     gloss = dr.select(seen, _ggx(alpha, half.z, viewer.z, local.z) / weight, 0) / surface.samples
     entry = index // surface.samples * grid.count + cell
     parts = []

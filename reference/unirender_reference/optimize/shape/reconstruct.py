@@ -1,0 +1,61 @@
+"""A mesh from masks alone: visual hull, then Gauss-Newton steps towards the soft outlines, then charts."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from unirender_reference.optimize.shape.cameras import Cameras
+from unirender_reference.optimize.shape.charts import unwrap
+from unirender_reference.optimize.shape.config import ShapeConfig
+from unirender_reference.optimize.shape.fit import MeshFit
+from unirender_reference.optimize.shape.hull import extract, visual_hull
+from unirender_reference.optimize.shape.topology import vertex_normals
+from unirender_reference.optimize.views import Step, Views
+from unirender_reference.shapes import MeshObject
+from unirender_reference.shapes.mesh_object import RECONSTRUCTION
+
+GREY = 0.5
+
+
+def reconstruct(views: Views, config: ShapeConfig, on_step: Callable[[Step], bool] | None = None) -> MeshObject:
+    """The mesh of an object that fits its masks, grey, with charts, in the world of the views.
+
+    Its bounding sphere has a radius of 1 as far as that of the object has in the views' world.
+
+    Args:
+        views: posed pictures with masks; colours are not looked at.
+        config: grid and steps.
+        on_step: told about every step; False ends the fit.
+
+    Raises:
+        UnirenderError: no point lies inside all masks, or a camera stands inside the unit sphere.
+    """
+    began = time.perf_counter()
+    cameras = Cameras(views.seen)
+    masks = np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
+    vertices, faces = extract(visual_hull(masks, cameras, config.cells))
+    fit = MeshFit(vertices, faces, masks, cameras)
+    for index in range(config.mask_steps):
+        last = index >= config.mask_steps - config.mask_steps // 3
+        error = fit.step(config.final_smoothness if last else config.smoothness)
+        step = Step("shape", index + 1, time.perf_counter() - began, {"mask_rmse": error, "loss": error**2})
+        if on_step is not None and not on_step(step):
+            break
+    return charted_object(fit.vertices, faces)
+
+
+def charted_object(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> MeshObject:
+    """A grey object of a mesh without seams: smooth normals, charts."""
+    charts = unwrap(vertices, faces)
+    return MeshObject(
+        name="reconstruction",
+        family=RECONSTRUCTION,
+        vertices=vertices[charts.source].astype(np.float32),
+        faces=charts.faces,
+        normals=vertex_normals(vertices, faces)[charts.source].astype(np.float32),
+        uv=charts.uv,
+        albedo=np.full(3, GREY, np.float32),
+        provenance={"source": "masks"},
+    )

@@ -1,0 +1,63 @@
+"""Rays against a mesh, by Mitsuba: what a camera sees of it, sub-pixel coverage, normals, crossings."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from unirender_reference.backend import mitsuba
+from unirender_reference.optimize.shape.cameras import Cameras
+
+
+class MeshTracer:
+    """A mesh in a Mitsuba scene; its vertices may move.
+
+    Args:
+        vertices: world positions.
+        faces: counter-clockwise seen from outside.
+    """
+
+    def __init__(self, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> None:
+        mi = mitsuba()
+        mesh = mi.Mesh("object", vertex_count=len(vertices), face_count=len(faces))
+        own = mi.traverse(mesh)
+        own["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
+        own["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+        own.update()
+        self.scene = mi.load_dict({"type": "scene", "object": mesh})
+        self._parameters = mi.traverse(self.scene)
+        self._key = next(key for key in self._parameters.keys() if key.endswith("vertex_positions"))  # noqa: SIM118
+
+    def move(self, vertices: Float[np.ndarray, "n 3"]) -> None:
+        """Puts the vertices elsewhere; the faces stay."""
+        self._parameters[self._key] = np.ascontiguousarray(vertices, np.float32).ravel()
+        self._parameters.update()
+
+    def meets(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether each ray meets the mesh anywhere."""
+        return np.array(self.scene.ray_test(_rays(origins, directions)))
+
+    def first_hits(
+        self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+    ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
+        """Face (-1: none), distance and barycentric coordinates (of the second and third corner) of the first hits."""
+        hit = self.scene.ray_intersect_preliminary(_rays(origins, directions))
+        valid = np.array(hit.is_valid())
+        face = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1)
+        return face, np.where(valid, np.array(hit.t), np.inf), np.array(hit.prim_uv).T
+
+    def coverage(self, cameras: Cameras, side: int) -> Float[np.ndarray, "k h w"]:
+        """Box-filtered coverage of all views by `side`^2 rays on a regular grid in each pixel."""
+        height, width = cameras.height * side, cameras.width * side
+        y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
+        one = np.stack([x, y], axis=-1).reshape(-1, 2) / side
+        view = np.repeat(np.arange(len(cameras)), len(one))
+        rays = cameras.rays(np.tile(one, (len(cameras), 1)), view)
+        met = self.meets(cameras.center[view], rays).reshape(len(cameras), cameras.height, side, cameras.width, side)
+        return met.mean((2, 4))
+
+
+def _rays(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Any:
+    mi = mitsuba()
+    origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
+    return mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)))
