@@ -14,6 +14,7 @@ from unirender_reference.measure.noise_floor import NoiseFloor
 from unirender_reference.measure.overhead import Overhead
 from unirender_reference.measure.passes import Passes
 from unirender_reference.measure.shade_ceiling import ShadeCeiling
+from unirender_reference.measure.shape import ShapeMeasure
 from unirender_reference.measure.sweep import SweepMeasure
 
 
@@ -32,6 +33,7 @@ class Reference:
         | Annotated[Overhead, tyro.conf.subcommand("overhead")]
         | Annotated[Exposure, tyro.conf.subcommand("exposure")]
         | Annotated[Sheet, tyro.conf.subcommand("sheet")]
+        | Annotated[ShapeMeasure, tyro.conf.subcommand("shape")]
     ] = field()
 
     def run(self) -> int:

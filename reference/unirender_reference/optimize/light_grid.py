@@ -94,7 +94,7 @@ class LightGrid:
         return cells.reshape(self.rows, self.columns, 3).astype(np.float32)
 
     def averages(self, environment: Float[np.ndarray, "h w 3"], oversampling: int = 8) -> Float[np.ndarray, "j 3"]:
-        """Mean radiance of an environment map over each cell (midpoint rule, `oversampling`^2 points a cell)."""
+        """Mean radiance of an environment map over each cell (midpoint rule, `oversampling` points along each side)."""
         height, width = environment.shape[:2]
         upper, lower = self.cosines
         part = (np.arange(oversampling) + 0.5) / oversampling

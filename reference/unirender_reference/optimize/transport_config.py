@@ -24,5 +24,5 @@ class TransportConfig:
     """Weight of the light's smoothness in log space."""
     neutral_light: float = 1.0
     """Weight of the light's neutral colour in log space."""
-    smooth_albedo: float = 2.0
+    smooth_albedo: float = 15.0
     """Weight of differences between neighbouring texels of the base colour."""

@@ -47,7 +47,7 @@ class MeshTracer:
         return face, np.where(valid, np.array(hit.t), np.inf), np.array(hit.prim_uv).T
 
     def coverage(self, cameras: Cameras, side: int) -> Float[np.ndarray, "k h w"]:
-        """Box-filtered coverage of all views by `side`^2 rays on a regular grid in each pixel."""
+        """Box-filtered coverage of all views by `side` x `side` rays on a regular grid in each pixel."""
         height, width = cameras.height * side, cameras.width * side
         y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
         one = np.stack([x, y], axis=-1).reshape(-1, 2) / side
