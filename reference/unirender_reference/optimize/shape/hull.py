@@ -37,7 +37,7 @@ def mask_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def visual_hull(masks: Float[np.ndarray, "k h w"], cameras: Cameras, cells: int) -> Float[np.ndarray, "side side side"]:
-    """Least signed distance to the outlines, in world units, on a cubic grid of `cells` along each side of [-HALF, HALF].
+    """Least signed distance to the outlines, in world units, on a grid of `cells` along each side of [-HALF, HALF].
 
     Args:
         masks: coverage of each view.
