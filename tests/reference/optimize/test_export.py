@@ -43,7 +43,7 @@ def bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     a, b = (x - left)[:, None], (y - top)[:, None]
     texels = texels.reshape(height, width, -1)
-    corner = lambda i, j: texels[(top + i) % height, (left + j) % width]  # noqa: E731
+    corner = lambda i, j: texels[(top + i) % height, (left + j) % width]  # noqa: E731 - a name for a formula used four times
     return (corner(0, 0) * (1 - a) + corner(0, 1) * a) * (1 - b) + (corner(1, 0) * (1 - a) + corner(1, 1) * a) * b
 
 
@@ -51,7 +51,7 @@ def surface_points(obj: MeshObject, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     """A point of each face: position, uv and normal."""
     weights = np.random.default_rng(seed).dirichlet([1, 1, 1], len(obj.faces))[:, :, None]
     assert obj.uv is not None
-    return tuple((values[obj.faces] * weights).sum(1) for values in (obj.vertices, obj.uv, obj.normals))  # type: ignore[return-value]
+    return tuple((values[obj.faces] * weights).sum(1) for values in (obj.vertices, obj.uv, obj.normals))  # type: ignore[return-value] - three arrays
 
 
 def test_our_reader_sees_the_same_surface(solution: Solution, folder: Path):
@@ -143,7 +143,8 @@ def test_mitsuba_renders_the_folder_like_our_scene(solution: Solution, tmp_path:
     write_solution(Solution(obj, solution.environment), tmp_path)
     mi = mitsuba()
     loaded = mi.load_file(str(tmp_path / "mitsuba/scene.xml"))
-    assert obj.roughness is not None and obj.metallic is not None  # noqa: PT018
+    assert obj.roughness is not None
+    assert obj.metallic is not None
     shape = mesh_shape(obj, materials.principled_bsdf(obj.albedo, obj.roughness, obj.metallic))
     if obj.normal_map is not None:
         shape.set_bsdf(materials.with_normal_map(shape.bsdf(), materials.normal_texture_of(obj.normal_map)))

@@ -157,7 +157,7 @@ def test_the_outlines_derivative_agrees_with_mitsubas_projective_integrator() ->
     own.update()
     scene = mi.load_dict({"type": "scene", "ball": mesh})
     parameters = mi.traverse(scene)
-    key = next(name for name in parameters.keys() if name.endswith("vertex_positions"))  # noqa: SIM118
+    key = next(name for name in parameters.keys() if name.endswith("vertex_positions"))  # noqa: SIM118 - SceneParameters iterates over pairs
     dr.enable_grad(parameters[key])
     parameters.update()
     sensor = mi.load_dict(sensor_at(views[1].pose, views[1].camera, SIZE, SIZE))

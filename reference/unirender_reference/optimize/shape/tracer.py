@@ -26,7 +26,7 @@ class MeshTracer:
         own.update()
         self.scene = mi.load_dict({"type": "scene", "object": mesh})
         self._parameters = mi.traverse(self.scene)
-        self._key = next(key for key in self._parameters.keys() if key.endswith("vertex_positions"))  # noqa: SIM118
+        self._key = next(key for key in self._parameters.keys() if key.endswith("vertex_positions"))  # noqa: SIM118 - SceneParameters iterates over pairs
 
     def move(self, vertices: Float[np.ndarray, "n 3"]) -> None:
         """Puts the vertices elsewhere; the faces stay."""
