@@ -20,6 +20,7 @@ VOCABULARY = {
         "errors",
         "exposure",
         "exr",
+        "files",
         "intrinsics",
         "lighting",
         "paths",
