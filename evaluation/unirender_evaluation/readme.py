@@ -88,6 +88,20 @@ def selection(tables: Sequence[Table]) -> str:
     return "\n".join(to_markdown(table) for table in shown)
 
 
+def store(folder: Path, tables: Sequence[Table]) -> None:
+    """One Markdown file per table, numbered in order; those of an earlier run with other tables go."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [
+        f"{number:02d}-{table.name}-{table.protocol_key}-{table.variant.mask}-{table.subset}.md"
+        for number, table in enumerate(tables)
+    ]
+    for name, table in zip(names, tables, strict=True):
+        (folder / name).write_text(to_markdown(table))
+    for path in folder.glob("[0-9][0-9]-*.md"):
+        if path.name not in names:
+            path.unlink()
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; 0, or 1 with one line on standard error."""
     parser = argparse.ArgumentParser(
@@ -107,10 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             text = fill(arguments.readme.read_text(), "results", f"{head}\n\n{selection(tables)}")
             arguments.readme.write_text(fill(text, "checkpoint", checkpoint_text(arguments.checkpoint)))
         if arguments.stored:
-            arguments.stored.mkdir(parents=True, exist_ok=True)
-            for number, table in enumerate(tables):
-                name = f"{number:02d}-{table.name}-{table.protocol_key}-{table.variant.mask}-{table.subset}.md"
-                (arguments.stored / name).write_text(to_markdown(table))
+            store(arguments.stored, tables)
     except (UnirenderError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -43,6 +43,9 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     target = tmp_path / "README.md"
     target.write_text(README)
     checkpoint = write_checkpoint(tmp_path / "checkpoint")
+    for name in ("98-a-table-of-before.md", "notes.md"):
+        (tmp_path / "stored").mkdir(exist_ok=True)
+        (tmp_path / "stored" / name).write_text("of an earlier run")
 
     for _ in range(2):  # filling a filled README changes nothing
         options = ["--readme", str(target), "--stored", str(tmp_path / "stored"), "--checkpoint", str(checkpoint)]
@@ -58,6 +61,8 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     assert "Protocol:" in text
     stored = [path.read_text() for path in (tmp_path / "stored").glob("*.md")]
     assert any("21.50" in table for table in stored)
+    assert not (tmp_path / "stored" / "98-a-table-of-before.md").exists()
+    assert (tmp_path / "stored" / "notes.md").exists()
 
 
 def test_a_method_without_values_gets_no_row(tmp_path: Path) -> None:
