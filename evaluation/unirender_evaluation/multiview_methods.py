@@ -22,7 +22,7 @@ from unirender_reference.shapes import MeshObject
 CONSTANT_MATERIAL = 0.5
 LIGHT_SHAPE = (16, 32)
 TEXTURE = (2, 2)  # texels of a constant map
-PLAIN_ITERATIONS, PLAIN_TEXTURE = 200, 128
+PLAIN_ITERATIONS, PLAIN_TEXTURE = 100, 128
 OPTIMISED, PLAIN, CONSTANT = "NvDiffRec (Mitsuba), multi-view", "plain Mitsuba loop", "constant object"
 NAMES = (OPTIMISED, PLAIN, CONSTANT)
 

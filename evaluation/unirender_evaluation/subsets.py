@@ -20,7 +20,7 @@ class Subsets:
     shade: int | None = 12
     physics: int | None = 12
     optimise: int | None = 4
-    pictures: int | None = 3
+    pictures: int | None = 2
     views: int | None = 4
 
 

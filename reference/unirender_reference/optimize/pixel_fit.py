@@ -19,12 +19,12 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
+from unirender.color import display_slope
 from unirender_reference.optimize.roughness_nodes import node_weights
 from unirender_reference.optimize.transport import F0, Transport
 
 SIGMA = 0.01  # display values: rounding to 8 bits, and what the matrices leave out
 HUBER = 4.0
-SRGB_KNEE = 0.0031308
 SCALE_SPREAD = 0.5  # standard deviation of the patches' scales around their prior
 LEAST_ALBEDO = 0.002
 
@@ -71,7 +71,8 @@ def observe(
     """
     straight = radiance / np.maximum(coverage, 1e-3)[:, None]
     clipped = (straight >= 1 - 1e-3) if display else np.zeros(straight.shape, bool)
-    slope = np.where(straight <= SRGB_KNEE, 12.92, 1.055 / 2.4 * np.maximum(straight, SRGB_KNEE) ** (1 / 2.4 - 1))
+    beyond = np.maximum(straight, 1) ** (1 / 2.4 - 1)  # linear pictures: the curve goes on above what a display shows
+    slope = display_slope(np.minimum(straight, 1)) * beyond
     return Observations(
         radiance.astype(np.float32), (slope / SIGMA).astype(np.float32), clipped, coverage.astype(np.float32), patch
     )

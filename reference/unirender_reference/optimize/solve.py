@@ -70,7 +70,8 @@ def solve_appearance(
         views: the pictures; the object lies in the unit sphere of their world.
         obj: the mesh, with texture coordinates of its own for each point of the surface; its textures do not count.
         config: see there; not `enabled`: `start_solution`.
-        on_step: called with stage "transport" after every solve; False ends it with what there is.
+        on_step: called with stage "transport" after every solve; once there is a solution on the full light,
+            False ends it with what there is.
         texture_size: texels along each side.
         light_rows: even; the light has twice as many columns.
         seed: equal seeds draw equal samples.
@@ -110,12 +111,13 @@ class _Work:
     def run(self) -> Solution:
         """The solution of all steps."""
         solved = self._first()
-        if self.config.materials == "maps":
+        wanted = self._note(solved)
+        if wanted and self.config.materials == "maps":
             moved = search_materials(self.fit, solved.appearance, self.points.mean_position())
             solved = solve_light(self.fit, moved, self.prior, LATER_ITERATIONS)
-            self._note(solved)
+            wanted = self._note(solved)
         solution = self._solution(solved)
-        for index in range(self.config.rounds):
+        for index in range(self.config.rounds if wanted else 0):
             rendered = self._rendered(solution, index)
             base = self.texels @ solution.obj.albedo.reshape(-1, 3)
             explained = base * (solved.prediction.gain / self.fit.pattern) + solved.mixed.v @ solved.appearance.radiance
@@ -139,9 +141,7 @@ class _Work:
             self._note(found[-1])
         best = min(found, key=lambda solved: solved.cost).appearance
         full = replace(best, light=refined(best.light, coarse.transport.grid))
-        solved = solve_light(self.fit, full, self.prior, self.config.iterations)
-        self._note(solved)
-        return solved
+        return solve_light(self.fit, full, self.prior, self.config.iterations)
 
     def _solution(self, solved: Solved) -> Solution:
         """Textures and light of an estimate."""

@@ -53,7 +53,8 @@ def shade_points(
     """
     mi = mitsuba()
     obj = solution.obj
-    assert obj.roughness is not None and obj.metallic is not None  # noqa: PT018 - a Solution has both
+    assert obj.roughness is not None  # a Solution has both
+    assert obj.metallic is not None
     surface = materials.principled_bsdf(obj.albedo, obj.roughness, obj.metallic)
     light = mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))
     scene = mi.load_dict(
