@@ -19,7 +19,7 @@ from unirender_evaluation.rows import evenly
 from unirender_evaluation.suite_objects import bare_mesh, scene_object
 from unirender_evaluation.suites import Material, Scene, Suite
 from unirender_evaluation.truth_render import item_seed
-from unirender_reference.multiview import ViewRenderer, orbit
+from unirender_reference.multiview import orbit
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.passes import Estimate
 from unirender_reference.render import Renderer
@@ -81,8 +81,8 @@ class MultiviewScene:
         self.mesh = bare_mesh(obj)
 
     @cached_property
-    def _renderer(self) -> ViewRenderer:
-        return ViewRenderer(self.obj, self.camera, self.resolution)
+    def _renderer(self) -> Renderer:
+        return Renderer(self.obj, self.camera, self.resolution)
 
     @cached_property
     def views(self) -> Views:
@@ -130,7 +130,7 @@ class MultiviewScene:
 
     def pictures_of(self, obj: MeshObject, light: Environment, what: str) -> LitPictures:
         """An object with its own maps from the held-out cameras, with samples of their own."""
-        renderer = ViewRenderer(obj, self.camera, self.resolution)
+        renderer = Renderer(obj, self.camera, self.resolution)
         seed = item_seed(self.seed, "prediction", what)
         return LitPictures(tuple(renderer.images(self.held_out_poses, light, None, None, self.settings.spp, seed)))
 

@@ -32,6 +32,6 @@ MULTIVIEW_TABLE = TableSpec(
     ),
     (PROTOCOL,),
     "Pictures of an object under one light in; textures and light out. Maps: all cameras. Relit (under the object's "
-    "other light) and novel view: held-out cameras. Aligned: one least-squares factor, since albedo and light share an "
-    "unknown one.",
+    "other light) and novel view: held-out cameras. Aligned: one least-squares factor in linear light, for albedo of "
+    "the object, for relit of each picture (fitted before the clip), since albedo and light share an unknown one.",
 )

@@ -5,6 +5,7 @@ from typing import Any
 from unirender_evaluation.optimized_method import OPTIMISER, REFINED, OptimizedMethod
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.versions import MODEL, OPTIMIZER, REFERENCE
+from unirender_reference.optimize.single_config import COLD, fitted
 
 ASKED = frozenset(
     {
@@ -34,7 +35,7 @@ def optimized_rows(scenes: int | None, pictures: int | None = None, ours: Any = 
             scenes=scenes,
             pictures=pictures,
             uses=USES,
-            note="one picture, shape from its silhouette; optimised and rendered by Mitsuba",
+            note=f"one picture, shape from its silhouette; optimised and rendered by Mitsuba{_held(known_mesh=False)}",
         ),
         make_row(
             OptimizedMethod(f"{OPTIMISER}, true mesh"),
@@ -44,7 +45,7 @@ def optimized_rows(scenes: int | None, pictures: int | None = None, ours: Any = 
             pictures=pictures,
             uses=USES,
             told=frozenset({"geometry"}),
-            note="told the object's true mesh, which no other row sees",
+            note=f"told the object's true mesh, which no other row sees{_held(known_mesh=True)}",
         ),
     ]
     if ours is not None:
@@ -60,3 +61,14 @@ def optimized_rows(scenes: int | None, pictures: int | None = None, ours: Any = 
             )
         )
     return rows
+
+
+def _held(known_mesh: bool) -> str:
+    """What a reader of a cold row's figures must know of the materials that it does not look for."""
+    trust = fitted(known_mesh, warm=False)[1]
+    held = [name for name in ("metallic", "roughness") if getattr(trust, name) == 0]
+    return "".join(
+        f"; {name} is held at {COLD[name]:g}, since one picture does not decide it: the constant's score in the "
+        "inverse table, the true value where pictures are edited or relit"
+        for name in held
+    )

@@ -29,10 +29,11 @@ class Finding:
         d = self.comparison.difference
         sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = METRICS[c.metric].unit
+        remark = f"; {c.remark}" if c.remark else ""
         return (
             f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {METRICS[c.metric].label}: "
             f"{c.a} {self.comparison.verdict} {c.b}, "
-            f"difference {d.mean:+.4g} [{d.low:+.4g}, {d.high:+.4g}] {unit} (n {d.n}, {d.clusters} objects)"
+            f"difference {d.mean:+.4g} [{d.low:+.4g}, {d.high:+.4g}] {unit} (n {d.n}, {d.clusters} objects{remark})"
         )
 
 

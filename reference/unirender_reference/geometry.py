@@ -13,6 +13,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, next_spp, pass_count
+from unirender_reference.samplers import stratified_sampler
 from unirender_reference.scene import EditableScene
 
 Material = tuple[float | None, float | None]
@@ -65,9 +66,7 @@ def _trace(
     sensor = shown.sensors()[0]
     index = dr.arange(mi.UInt32, size * size * spp)
     pixel = index // spp
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(dr.opaque(mi.UInt32, seed), size * size * spp)  # a literal seed would recompile the kernel
+    sampler = stratified_sampler(spp, size * size * spp, seed)
     corner = mi.Point2f(mi.Float(pixel % size), mi.Float(pixel // size))
     position = (corner + sampler.next_2d()) / size
     ray, _ = sensor.sample_ray_differential(0.0, 0.5, position, mi.Point2f(0.5))

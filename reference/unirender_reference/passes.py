@@ -83,12 +83,15 @@ def integrator_passes(
         seed: equal seeds give equal passes.
         batches: least number of passes.
         counters: seconds, calls and repaired pixels are added here.
-        sensor: a loaded Mitsuba sensor; None: the scene's first.
+        sensor: a Mitsuba sensor, loaded or as a dict; None: the scene's first.
 
     Raises:
         UnirenderError: `spp` cannot be divided, or a pixel stays NaN.
     """
-    sensor = scene.sensors()[0] if sensor is None else sensor
+    if sensor is None:
+        sensor = scene.sensors()[0]
+    elif isinstance(sensor, dict):
+        sensor = mitsuba().load_dict(sensor)
     width, height = sensor.film().crop_size()
     pixels = int(width * height)
     count = pass_count(spp, batches, SAMPLES_PER_PASS // pixels)

@@ -8,7 +8,7 @@ variance: `passes`. What belongs to the surface (base colour, normal, ...): `geo
 """
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from unirender_reference.passes import (
     ratio_estimate,
     render_passes,
 )
-from unirender_reference.scene import EditableScene
+from unirender_reference.scene import EditableScene, sensor_at
 from unirender_reference.scene_spec import Sample, SceneSpec, object_hash, scene_hash, scene_hashes, shared_scene_hash
 from unirender_reference.shapes import MeshObject
 
@@ -104,11 +104,38 @@ class Renderer:
         seed: int = 0,
         depth: int = IMAGE_DEPTH,
         batches: int = TRUTH_BATCHES,
+        pose: Float[np.ndarray, "4 4"] | None = None,
     ) -> Estimate:
-        """The image: premultiplied linear RGBA. None: the object's own roughness or metallic map."""
+        """The image: premultiplied linear RGBA.
+
+        Args:
+            environment: linear radiance in world axes: the object's, and those of the contract's camera.
+            roughness, metallic: None: the object's own map.
+            spp: samples per pixel.
+            seed: equal seeds give equal images.
+            depth: 2 is direct light, 4 three bounces.
+            batches: passes that the variance is taken from.
+            pose: camera to world (`multiview`); None: the contract's camera.
+        """
         scene = self.scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
-        passes = render_passes(scene, depth, spp, derive_seed(seed, "image"), batches, self.counters)
-        return mean_estimate(*passes, batches)
+        sensor = None if pose is None else sensor_at(pose, self.camera, self.resolution, self.resolution)
+        own = derive_seed(seed, "image")
+        return mean_estimate(*render_passes(scene, depth, spp, own, batches, self.counters, sensor), batches)
+
+    def images(
+        self,
+        poses: Sequence[Float[np.ndarray, "4 4"]],
+        environment: Float[np.ndarray, "h w 3"],
+        roughness: float | None,
+        metallic: float | None,
+        spp: int,
+        seed: int = 0,
+    ) -> list[Estimate]:
+        """One image for each camera pose, each with its own seed; arguments as `image`."""
+        return [
+            self.image(environment, roughness, metallic, spp, derive_seed(seed, "view", index), pose=pose)
+            for index, pose in enumerate(poses)
+        ]
 
     def diffuse(
         self, environment: Float[np.ndarray, "h w 3"], spp: int, seed: int = 0, batches: int = TRUTH_BATCHES

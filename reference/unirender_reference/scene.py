@@ -47,11 +47,19 @@ def sensor_dict(camera: Camera, height: int, width: int) -> dict[str, Any]:
     }
 
 
-def mesh_shape(obj: MeshObject, bsdf: dict[str, Any]) -> Any:
-    """The object as a Mitsuba mesh with its shading normals and texture coordinates."""
+def sensor_at(pose: Float[np.ndarray, "4 4"], camera: Camera, height: int, width: int) -> dict[str, Any]:
+    """The contract's sensor, moved to a pose: (4, 4) camera to world."""
+    mi = mitsuba()
+    turned = np.array(pose, np.float64)
+    turned[:3, [0, 2]] *= -1  # Mitsuba's camera looks along its +z, with +x to the left
+    return {**sensor_dict(camera, height, width), "to_world": mi.ScalarTransform4f(turned)}
+
+
+def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
+    """The object as a Mitsuba mesh with its shading normals and texture coordinates; `bsdf` loaded, or its dict."""
     mi = mitsuba()
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
+    properties["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     mesh = mi.Mesh(
         OBJECT,
         vertex_count=len(obj.vertices),
@@ -87,21 +95,36 @@ def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
     return np.concatenate([environment[:, -1:], environment, environment[:, :1]], axis=1)
 
 
+def object_scene(
+    obj: MeshObject,
+    bsdf: Any = None,
+    environment: Float[np.ndarray, "h w 3"] | None = None,
+    sensor: dict[str, Any] | None = None,
+) -> Any:
+    """A scene of the object.
+
+    Args:
+        obj: the mesh.
+        bsdf: its surface, loaded or as a dict; None: any, for scenes that rays are only traced in.
+        environment: the light (world axes, +y up); None: none.
+        sensor: of renders that name no other; None: they all do.
+    """
+    mi = mitsuba()
+    scene: dict[str, Any] = {"type": "scene"}
+    if sensor is not None:
+        scene["sensor"] = sensor
+    if environment is not None:
+        envmap_data(environment)  # checks
+        scene[LIGHT] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(environment, np.float32))}
+    scene[OBJECT] = mesh_shape(obj, materials.white_bsdf() if bsdf is None else bsdf)
+    return mi.load_dict(scene)
+
+
 def load_scene(
     obj: MeshObject, bsdf: dict[str, Any], environment: Float[np.ndarray, "h w 3"], camera: Camera, resolution: int
 ) -> Any:
-    """A scene of the object with one surface, lit by `environment` (camera axes, +y up)."""
-    mi = mitsuba()
-    envmap_data(environment)  # checks
-    light = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(environment, np.float32))}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor_dict(camera, resolution, resolution),
-            LIGHT: light,
-            OBJECT: mesh_shape(obj, bsdf),
-        }
-    )
+    """A scene of the object with one surface before the contract's camera, lit by `environment` (camera axes)."""
+    return object_scene(obj, bsdf, environment, sensor_dict(camera, resolution, resolution))
 
 
 class EditableScene:
@@ -183,7 +206,7 @@ class EditableScene:
             found = self._surfaces[surface, mapped] = self._load(surface, mapped)
         for key, value in values.items():
             if value is not None:
-                found.parameters[_parameter(found.parameters, f"{materials.INNER}.{key}.value")] = value
+                found.parameters[parameter_name(found.parameters, f"{materials.INNER}.{key}.value")] = value
         found.parameters.update()
         return found
 
@@ -198,7 +221,7 @@ class EditableScene:
         fingerprint = _fingerprint(environment)
         if fingerprint != self._fingerprint:
             data = mitsuba().TensorXf(envmap_data(environment))
-            self._light[_parameter(self._light, f"{LIGHT}.data")] = data
+            self._light[parameter_name(self._light, f"{LIGHT}.data")] = data
             self._light.update()
             self._fingerprint = fingerprint
 
@@ -216,9 +239,9 @@ def _fingerprint(array: Float[np.ndarray, "..."]) -> bytes:
     return hashlib.sha256(repr(array.shape).encode() + array.tobytes()).digest()
 
 
-def _parameter(parameters: Any, suffix: str) -> str:
-    """The full name of the parameter that ends in `suffix`."""
-    for key in parameters.keys():  # noqa: SIM118  (SceneParameters iterates over pairs)
-        if key == suffix or key.endswith("." + suffix):
-            return key
-    raise UnirenderError(f"Mitsuba scene: no parameter ending in {suffix!r}; an untested Mitsuba version?")
+def parameter_name(parameters: Any, suffix: str) -> str:
+    """The full name of the one parameter of a scene that ends in `suffix`."""
+    names = [key for key in parameters.keys() if f".{key}".endswith(f".{suffix}")]  # noqa: SIM118  (iterates over pairs)
+    if len(names) != 1:
+        raise UnirenderError(f"Mitsuba scene: {len(names)} parameters end in {suffix!r}; an untested Mitsuba version?")
+    return names[0]

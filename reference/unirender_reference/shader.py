@@ -24,6 +24,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
+from unirender_reference.samplers import stratified_sampler
 from unirender_reference.scene import envmap_data, mesh_shape, sensor_dict
 from unirender_reference.shapes import MeshObject
 
@@ -139,11 +140,8 @@ class Shader:
 
     def radiance(self, maps: Mapping[str, Any], environment: Any, spp: int, seed: int) -> Any:
         """What each sample adds to its pixel's radiance: `spp` consecutive values for each pixel of the support."""
-        mi = mitsuba()
         self.set(maps, environment)
-        sampler = mi.load_dict({"type": "multijitter", "sample_count": spp})
-        sampler.set_samples_per_wavefront(spp)
-        sampler.seed(_opaque(seed), self.points * spp)
+        sampler = stratified_sampler(spp, self.points * spp, seed)
         lanes = self.lanes(maps["normal"], sampler, spp)
         return sum(self.reflected(lanes, drawn) for drawn in self.directions(lanes, sampler))
 
@@ -268,9 +266,3 @@ def gradient(tensor: Any) -> Float[np.ndarray, "..."]:
     import drjit as dr
 
     return np.array(dr.grad(tensor))
-
-
-def _opaque(seed: int) -> Any:
-    import drjit as dr
-
-    return dr.opaque(mitsuba().UInt32, seed)  # a literal would compile a kernel for every seed

@@ -109,7 +109,9 @@ def shipped_pipeline() -> "UniRenderPipeline":
     """The shipped model, loaded once."""
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
-    return UniRenderPipeline.from_pretrained()
+    pipeline = UniRenderPipeline.from_pretrained()
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
 
 
 def run(command: Any) -> int:

@@ -59,7 +59,7 @@ def test_buffers_are_those_of_the_cameras(scene: MultiviewScene) -> None:
     assert len(painted) == SMALL.seen + SMALL.held_out
     white = np.full((16, 32, 3), 1.0, np.float32)  # in white light a rough dielectric shows its albedo
     for index, pose in enumerate(scene.seen_poses):
-        shown = scene._renderer.image(pose, white, 1.0, 0.0, 64).mean
+        shown = scene._renderer.image(white, 1.0, 0.0, 64, pose=pose).mean
         straight = shown[..., :3] / np.maximum(shown[..., 3:], 1e-6)
         inside = masks[index] > 0.99
         right, wrong = (

@@ -10,7 +10,8 @@ from multiview_pieces import MATERIAL, ball_scene, true_solution
 
 from unirender_evaluation.multiview_methods import ConstantObject
 from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import camera_means, ceiling_values, score_solution
+from unirender_evaluation.multiview_scoring import camera_means, ceiling_values, score_solution, solution_looks
+from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
 from unirender_reference.optimize.solution import Solution
 
 RAW, ALIGNED = "psnr@masked-srgb-raw", "psnr@masked-srgb-aligned"
@@ -55,6 +56,24 @@ def test_a_common_factor_of_albedo_and_light_is_free(scene: MultiviewScene, trut
     assert scores[f"relit.{ALIGNED}"] > scores[f"relit.{RAW}"] + 5
     assert scores[f"novel.{RAW}"] > scores[f"relit.{RAW}"] + 5
     assert scores["environment.log_rmse_scaled"] < 1e-3
+
+
+def test_relit_pictures_are_aligned_each_and_albedo_as_a_whole(scene: MultiviewScene) -> None:
+    """As the table's description says: exposures that differ between cameras are free in relit pictures, with values
+    above 1 among them, not in the albedo."""
+    looks = solution_looks(scene, true_solution(scene))
+    exposures = [np.array([4.0 ** (i + 1)] * 3 + [1], np.float32) for i in range(len(looks.relit.pictures))]
+    rgba = [k * picture.mean for k, picture in zip(exposures, looks.relit.pictures, strict=True)]
+    pictures = tuple(replace(own, mean=mean) for own, mean in zip(looks.relit.pictures, rgba, strict=True))
+    albedo = looks.buffers.require("albedo")["albedo"]
+    dimmed = albedo * np.linspace(0.5, 1, len(albedo), dtype=np.float32)[:, None, None]
+    other = replace(looks, relit=replace(looks.relit, pictures=pictures), buffers=looks.buffers.replace(albedo=dimmed))
+    plain, scores = (score_solution(scene, true_solution(scene), looks=shown) for shown in (looks, other))
+    assert max(float(picture[..., :3].max()) for picture in rgba) > 1.5
+    assert scores[f"relit.{RAW}"] < 15
+    assert scores[f"relit.{ALIGNED}"] == pytest.approx(plain[f"relit.{ALIGNED}"], abs=0.01)
+    assert scores[f"albedo.{ALIGNED}"] < 30
+    assert "for albedo of the object, for relit of each picture (fitted before the clip)" in MULTIVIEW_TABLE.description
 
 
 def test_a_wrong_material_is_seen(scene: MultiviewScene, truth_scores: dict[str, float]) -> None:

@@ -15,8 +15,10 @@ from unirender_evaluation.engine import answer
 from unirender_evaluation.methods import quantise, seen_linear
 from unirender_evaluation.metrics import psnr
 from unirender_evaluation.optimized_method import OptimizedMethod
+from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suite_objects import GREY
+from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import tasks
 from unirender_reference.optimize.single_config import SingleConfig
@@ -100,6 +102,19 @@ def test_the_start_is_a_prediction(seen: dict[str, Any]) -> None:
     assert warm.config["start"] == {"guess": 1}
     assert "start" not in cold.config
     assert np.array_equal(found[0]["normal"], start["normal"])
+
+
+def test_a_row_that_does_not_look_for_a_material_says_so(method: OptimizedMethod, seen: dict[str, Any]) -> None:
+    """Without a prediction metallic is a constant, that of the pictures which the suite edits; roughness is found."""
+    maps = method.decompose(**seen).require("roughness", "metallic")
+    inside = seen["mask"][..., 0] > 0
+    base = read_spec("tiny").base
+    assert set(np.unique(maps["metallic"][inside])) == {base[0]}
+    assert abs(maps["roughness"][inside] - base[1]).min() > 1e-3
+    for row in optimized_rows(None, ours=Guess()):
+        held = "metallic is held at 0.5" in row.info.note
+        assert held == (row.method.base is None)
+        assert "roughness is held" not in row.info.note
 
 
 class Witness:

@@ -7,10 +7,11 @@ import numpy as np
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender_reference.lights import make_light
-from unirender_reference.multiview import ViewRenderer, orbit
+from unirender_reference.multiview import orbit
 from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.uv import charted
 from unirender_reference.optimize.views import View, Views
+from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
 
 SIZE = 24
@@ -46,11 +47,17 @@ def coarse_light(seed: int = 0, rows: int = 8) -> np.ndarray:
 
 
 def pictures(
-    obj: MeshObject, light: np.ndarray, roughness: float | None, metallic: float | None, count: int = 4, spp: int = 256
+    obj: MeshObject,
+    light: np.ndarray,
+    roughness: float | None,
+    metallic: float | None,
+    count: int = 4,
+    spp: int = 256,
+    size: int = SIZE,
 ) -> Views:
     """8-bit views of an object."""
     camera = Camera()
-    renderer, poses = ViewRenderer(obj, camera, SIZE), orbit(count, camera)
+    renderer, poses = Renderer(obj, camera, size), orbit(count, camera)
     seen = []
     for pose, estimate in zip(poses, renderer.images(poses, light, roughness, metallic, spp), strict=True):
         mask = np.clip(estimate.mean[..., 3:], 0, 1)

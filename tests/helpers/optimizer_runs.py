@@ -16,7 +16,7 @@ from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.run import optimize
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.strips import found_images
+from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import MeshObject
 
@@ -33,7 +33,7 @@ def rendered_views(solution: Solution, seen: int = 2, held_out: int = 1, side: i
     camera = Camera()
     poses = orbit(seen + held_out, camera)
     blank = np.zeros((side, side, 3), np.float32)
-    images = found_images(solution, [View(blank, blank[..., :1], camera, pose) for pose in poses], 64)
+    images = solution_images(solution, [View(blank, blank[..., :1], camera, pose) for pose in poses], 64)
     views = []
     for index, (image, pose) in enumerate(zip(images, poses, strict=True)):
         mask = np.clip(image[..., 3:], 0, 1)

@@ -121,11 +121,12 @@ def pictures(config: ShapeMeasure, obj: "MeshObject", seed: int) -> "tuple[Views
     from unirender.camera import Camera
     from unirender.color import image_srgb
     from unirender_reference.lights import make_light
-    from unirender_reference.multiview import ViewRenderer, orbit
+    from unirender_reference.multiview import orbit
     from unirender_reference.optimize.views import View, Views
+    from unirender_reference.render import Renderer
 
     camera = Camera()
-    renderer, light = ViewRenderer(obj, camera, config.resolution), make_light(seed, "test").environment
+    renderer, light = Renderer(obj, camera, config.resolution), make_light(seed, "test").environment
     poses = orbit(config.views, camera)
     rgba = [found.mean for found in renderer.images(poses, light, config.roughness, config.metallic, config.spp, seed)]
     filled = np.concatenate([image[image[..., 3] > 0.9][:, :3] for image in rgba])

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -17,13 +17,14 @@ if TYPE_CHECKING:
 
     from unirender.camera import Camera
     from unirender.intrinsics import Intrinsics
+    from unirender_reference.optimize.report import Progress
     from unirender_reference.optimize.solution import Solution
     from unirender_reference.optimize.views import Step, Views
     from unirender_reference.shapes import MeshObject, Sphere
 
 Predict = Callable[["np.ndarray", "np.ndarray", "Camera"], "Intrinsics"]  # display values, mask, camera -> maps
 
-OF_FOLDERS = ("up", "hold_out", "most_views", "threads")
+OF_FOLDERS = ("up", "hold_out", "most_views", "threads", "pictures")
 OF_PICTURES = ("mask", "fov", "normal", "overwrite")
 
 
@@ -65,7 +66,7 @@ class Optimize:
     overwrite: bool = False
     """Of one picture: replace an earlier result."""
     pictures: bool = True
-    """Render strips to look at: given beside found, a turntable, other lights."""
+    """Of a folder: render strips to look at: given beside found, a turntable, other lights."""
     progress: bool = True
     """Show progress."""
     config: Annotated[OptimizeConfig, tyro.conf.arg(name="")] = field(default_factory=OptimizeConfig)
@@ -87,11 +88,14 @@ class Optimize:
                 f"--hold-out {self.hold_out}, --threads {self.threads}: expected 0, or 2 and more held out in turn; 0 "
                 "or more threads"
             )
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise UsageError(f"--fov {self.fov:g}: expected degrees between 0 and 180")
         self.config.check()
         folder = self.input.is_dir()
         wrong, kind = (OF_PICTURES, "one picture") if folder else (OF_FOLDERS, "a folder of pictures")
         defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
-        given = [f"--{name.replace('_', '-')}" for name in wrong if getattr(self, name) != defaults[name]]
+        given = [_option(name) for name in wrong if getattr(self, name) != defaults[name]]
+        given += _changed(self.single, SingleConfig(), "single.") if folder else _changed(self.config, OptimizeConfig())
         if given:
             raise UsageError(f"{', '.join(given)}: of {kind}, but {self.input} is {'a folder' if folder else 'none'}")
 
@@ -101,9 +105,9 @@ class Optimize:
         Args:
             predict: the learned model, for `--init unirender`.
         """
-        self.check()
         if not self.input.exists():
             raise UnirenderError(f"{self.input}: no such file or folder, expected posed pictures or one picture")
+        self.check()
         if self.init == "unirender" and predict is None:
             raise UnirenderError("--init unirender: no model at hand, expected the command line to bring one")
         chosen = predict if self.init == "unirender" else None
@@ -111,6 +115,7 @@ class Optimize:
 
     def _run_folder(self, predict: Predict | None) -> int:
         import json
+        import time
 
         from rich.console import Console
 
@@ -120,7 +125,8 @@ class Optimize:
 
         views, obj, place = self.read()
         with live_report(Console(stderr=True, quiet=not self.progress)) as report:
-            start = None if predict is None else self._start(views, obj, predict)
+            began = time.perf_counter()
+            start = None if predict is None else self._start(views, obj, predict, report)
             optimize(
                 views,
                 obj if start is None else None,
@@ -131,12 +137,14 @@ class Optimize:
                 place,
                 pictures=self.pictures,
                 threads=self.threads,
+                began=began,
             )
         record = json.loads((self.out / SOLUTION_FILE).read_text(encoding="utf-8"))
         figures = ", ".join(f"{name.removesuffix('_psnr_db')} {db:.2f} dB" for name, db in record["figures"].items())
-        stages = record["stages"]
-        seconds = f", {stages[-1]['seconds']:.1f} s" if stages else ""
-        print(f"{self.out}: {len(views.seen)} views{seconds}; masked PSNR of the pictures: {figures}")
+        print(
+            f"{self.out}: {len(views.seen)} views, {record['seconds']:.1f} s; masked PSNR of the pictures: {figures}; "
+            f"IoU of the masks: {record['mask_iou']:.3f}"
+        )
         return 0
 
     def read(self) -> "tuple[Views, MeshObject | None, Sphere]":
@@ -156,15 +164,23 @@ class Optimize:
         check_alignment(views, obj)
         return views, obj, place
 
-    def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict) -> "Solution":
+    def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "Progress") -> "Solution":
         """What the model predicts for every view, on the mesh."""
+        import time
+
+        from unirender_reference.optimize.report import Report
+        from unirender_reference.optimize.views import Step
         from unirender_reference.optimize.warm import solution_from_predictions
 
         if obj is None:
             raise UsageError("--init unirender: expected --mesh beside it, to put the predicted maps on")
         if views.hdr:
             raise UsageError("--init unirender: the model sees display pictures, and these are linear (EXR)")
-        predictions = [predict(view.image, view.mask, view.camera) for view in views.seen]
+        predictions, began, count = [], time.perf_counter(), len(views.seen)
+        for done, view in enumerate(views.seen, 1):
+            predictions.append(predict(view.image, view.mask, view.camera))
+            seconds = time.perf_counter() - began
+            show(Report(Step("prediction", done, seconds, {}), 1, 1, count, seconds * (count - done) / done))
         return solution_from_predictions(views, obj, predictions, self.config.texture_size, self.config.light_rows)
 
     def _run_picture(self, predict: Predict | None) -> int:
@@ -210,3 +226,19 @@ class Optimize:
         seconds = f": {steps[-1].seconds:.1f} s" if steps else ""
         print(f"{self.out}{seconds}")
         return 0
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _changed(value: Any, default: Any, prefix: str = "") -> list[str]:
+    """The options of a group that are not as they are by default."""
+    found = []
+    for entry in dataclasses.fields(default):
+        own, usual = getattr(value, entry.name), getattr(default, entry.name)
+        if dataclasses.is_dataclass(usual):
+            found += _changed(own, usual, f"{prefix}{entry.name}.")
+        elif own != usual:
+            found.append(_option(prefix + entry.name))
+    return found

@@ -18,8 +18,8 @@ class OptimizeConfig:
     """Textures and light by Mitsuba's derivatives."""
     shape: ShapeConfig = field(default_factory=ShapeConfig)
     """The mesh, where none is given."""
-    shape_rounds: int = 1
-    """Without a mesh: how often the vertices are refined by the pictures, and then textures and light again."""
+    shape_rounds: int = 2
+    """Without a mesh: how often the vertices are refined by the pictures, and then textures and light found again."""
     texture_size: int = 128
     """Texels along each side of the textures."""
     light_rows: int = 16
@@ -46,3 +46,5 @@ class OptimizeConfig:
             raise UsageError(f"--light-rows {self.light_rows}: expected an even number")
         if not self.save_seconds >= 0:
             raise UsageError(f"--save-seconds {self.save_seconds:g}: expected 0 or more")
+        self.transport.check()
+        self.refine.check()

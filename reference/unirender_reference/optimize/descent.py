@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 FACTOR = 4  # between the sides of successive levels
-BETA_1, BETA_2, EPSILON = 0.9, 0.99, 1e-12
+BETA_1, EPSILON = 0.9, 1e-12
 
 Map = Float[np.ndarray, "h w c"]
 Moments = tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]
@@ -28,10 +28,18 @@ class PyramidAdam:
         circular: whether columns close to a circle.
         uniform: one second moment for all texels of a level: Adam's step then keeps the gradient's proportions, and
             texels that no picture shows well do not move as far as those that it does.
+        beta_2: what is kept of the second moment in a step.
     """
 
-    def __init__(self, shape: tuple[int, int, int], levels: int = 1, circular: bool = False, uniform: bool = False):
-        self.uniform, self.count = uniform, 0
+    def __init__(
+        self,
+        shape: tuple[int, int, int],
+        levels: int = 1,
+        circular: bool = False,
+        uniform: bool = False,
+        beta_2: float = 0.99,
+    ):
+        self.uniform, self.beta_2, self.count = uniform, beta_2, 0
         height, width, channels = shape
         self._up: list[tuple[np.ndarray, np.ndarray] | None] = [None]
         sizes = [(height, width)]
@@ -51,9 +59,9 @@ class PyramidAdam:
             own = gradient if up is None else np.einsum("hi,hwc,wj->ijc", up[0], gradient, up[1], optimize=True)
             first, second = self.moments[level]
             first = BETA_1 * first + (1 - BETA_1) * own
-            second = BETA_2 * second + (1 - BETA_2) * own**2
+            second = self.beta_2 * second + (1 - self.beta_2) * own**2
             self.moments[level] = first, second
-            scale = second / (1 - BETA_2**self.count)
+            scale = second / (1 - self.beta_2**self.count)
             if self.uniform:
                 scale = scale.mean(where=second > 0) if second.any() else 1.0
             move = -rate * first / (1 - BETA_1**self.count) / (np.sqrt(scale) + EPSILON)

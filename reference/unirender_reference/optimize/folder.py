@@ -6,7 +6,9 @@ of the rest, if asked for.
 """
 
 import dataclasses
+import hashlib
 import json
+import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,11 +24,15 @@ from unirender.files import new_folder, write_png
 from unirender.pictures import check_mask, read_mask, read_picture
 from unirender_reference.meshes.images import area_means
 from unirender_reference.optimize.transforms import Frame, read_transforms
-from unirender_reference.optimize.views import View, Views
+from unirender_reference.optimize.views import SATURATED, View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)  # from +z up
+LEAST_SHARE = 1e-6  # of a new pixel: less is rounding
+LEAST_VALUE = 0.5 / 255
+
+_log = logging.getLogger("unirender.optimize")
 
 Up = Literal["y", "z"]
 
@@ -77,11 +83,25 @@ def read_views(
     if len(hdr) > 1:
         raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
     linear = hdr.pop()
-    return Views(
+    views = Views(
         seen=tuple(_view(frame, folder, linear, up, longest_side) for frame in seen),
         held_out=tuple(_view(frame, folder, linear, up, longest_side) for frame in held_out),
         hdr=linear,
     )
+    _warn(views, folder)
+    return views
+
+
+def _warn(views: Views, folder: Path) -> None:
+    """Logs what is hardly meant: black pictures, and one picture twice."""
+    names: dict[bytes, str] = {}
+    for view in (*views.seen, *views.held_out):
+        if view.mask.any() and view.image[view.mask[..., 0] > 0].max() < LEAST_VALUE:
+            _log.warning("%s: %s is black wherever its mask covers it", folder, view.name)
+        digest = hashlib.sha256(view.image.tobytes() + view.mask.tobytes()).digest()
+        if digest in names:
+            _log.warning("%s: %s and %s are the same picture; expected each once", folder, names[digest], view.name)
+        names.setdefault(digest, view.name)
 
 
 def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
@@ -142,7 +162,8 @@ def _linear_picture(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.nd
 def reduced(view: View, longest_side: int, linear: bool) -> View:
     """A view with sides of at most `longest_side` pixels: means over areas, of light where it is covered.
 
-    Pixels stay square: of the longer side, less than one new pixel is cut off.
+    Pixels stay square: of the longer side, less than one new pixel is cut off. A display value that is clipped stays
+    a lower bound in the mean that it enters.
 
     Args:
         view: any size.
@@ -172,8 +193,11 @@ def reduced(view: View, longest_side: int, linear: bool) -> View:
         fov_deg=math.degrees(2 * math.atan(half)),
         principal=((x * width - left) / (width - 2 * left), (y * height - top) / (height - 2 * top)),
     )
-    shown = image if linear else np.clip(srgb_encode(image), 0, 1)
-    return View(shown, mask, camera, view.pose, view.name)
+    if linear:
+        return View(image, mask, camera, view.pose, view.name)
+    full = (view.image >= SATURATED) if view.clipped is None else view.clipped
+    clipped = means((full & (view.mask > 0)).astype(np.float32)) > LEAST_SHARE
+    return View(np.clip(srgb_encode(image), 0, 1), mask, camera, view.pose, view.name, clipped)
 
 
 def write_views(views: Views, folder: Path) -> None:

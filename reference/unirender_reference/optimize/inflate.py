@@ -1,9 +1,9 @@
 """Normals that a silhouette suggests: the mask, inflated like a balloon.
 
-The height solves Poisson's equation under an even pressure inside the mask, -laplace(h^2 / 2) = 1 with h = 0 on its
-border (Twarog, Tappen and Adelson, "Playing with Puffball", 2012, describe the family). A disc becomes a hemisphere:
-h^2 = R^2 - x^2 - y^2 has the Laplacian -4. Normals follow from h^2 alone, n ~ (-grad(h^2) / 2, h), so that they are
-perpendicular to the view axis along the silhouette.
+The square of the height h solves Poisson's equation under an even pressure inside the mask, -laplace(h^2) = 4 with
+h = 0 on its border (Twarog, Tappen and Adelson, "Playing with Puffball", 2012, describe the family). A disc becomes a
+hemisphere: the Laplacian of h^2 = R^2 - x^2 - y^2 is -4. Normals follow from h^2 alone, n ~ (-grad(h^2) / 2, h), so
+that they are perpendicular to the view axis along the silhouette.
 """
 
 import numpy as np

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender_reference.optimize.differences import difference_matrix, side_by_side
 
 LEAST_SINE = 0.15  # of theta, in the weights of differences: columns meet at the poles
 
@@ -76,18 +77,11 @@ class LightGrid:
     @cached_property
     def differences(self) -> sp.csr_matrix:
         """(k, J) differences of neighbouring cells, weighted so that their squares integrate |gradient|^2."""
-        index = np.arange(self.count).reshape(self.rows, self.columns)
-        sine = np.maximum(np.sin(np.pi * np.arange(self.rows) / (self.rows - 1)), LEAST_SINE)
-        along = np.broadcast_to(1 / np.sqrt(sine)[:, None], index.shape)
-        down = np.broadcast_to(np.sqrt(sine)[:-1, None], index[1:].shape)
-        first = np.concatenate([index.ravel(), index[:-1].ravel()])
-        second = np.concatenate([np.roll(index, -1, axis=1).ravel(), index[1:].ravel()])
-        weight = np.concatenate([along.ravel(), down.ravel()])
-        line = np.arange(len(weight))
-        values = np.concatenate([weight, -weight])
-        return sp.csr_matrix(
-            (values, (np.concatenate([line, line]), np.concatenate([first, second]))), shape=(len(line), self.count)
-        )
+        theta = np.pi * np.arange(self.rows) / (self.rows - 1)
+        sine, between = (np.maximum(np.sin(angle), LEAST_SINE) for angle in (theta, (theta[1:] + theta[:-1]) / 2))
+        along, down = np.repeat(1 / np.sqrt(sine), self.columns), np.repeat(np.sqrt(between), self.columns)
+        pairs = side_by_side(np.arange(self.count).reshape(self.rows, self.columns), around=True)
+        return difference_matrix(pairs, self.count, np.concatenate([along, down]))
 
     def environment(self, cells: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "rows columns 3"]:
         """The cells as an environment map on Mitsuba's grid (which interpolates between texels)."""

@@ -15,7 +15,8 @@ import scipy.linalg
 from jaxtyping import Float
 from scipy.linalg import get_blas_funcs
 
-from unirender_reference.optimize.pixel_fit import SCALE_SPREAD, Appearance, Mixed, PixelFit, Prediction
+from unirender_reference.optimize.material_mix import Mixed
+from unirender_reference.optimize.pixel_fit import SCALE_SPREAD, Appearance, PixelFit, Prediction
 from unirender_reference.optimize.roughness_nodes import NODES
 
 LOG_RANGE = (-12.0, 9.0)
@@ -79,11 +80,11 @@ def solve_light(
     for _ in range(iterations):
         hessian, gradient = _normal_equations(fit, present, prior)
         for _ in range(MOST_TRIALS):
-            trial = evaluate(
-                fit, _stepped(present.appearance, hessian, gradient, damping), prior, present.prediction.robust
-            )
-            if trial.cost < present.cost:
-                break
+            stepped = _stepped(present.appearance, hessian, gradient, damping)
+            if stepped is not None:
+                trial = evaluate(fit, stepped, prior, present.prediction.robust)
+                if trial.cost < present.cost:
+                    break
             damping = max(damping, 1e-3) * 6
         else:
             return present
@@ -105,7 +106,7 @@ def _normal_equations(fit: PixelFit, solved: Solved, prior: LightPrior) -> tuple
     cells, light, tie = fit.transport.grid.count, appearance.radiance, SCALE_SPREAD**-2
     slopes = fit.material_slopes(appearance, prediction.base)
     weights = seen.weight * np.sqrt(prediction.robust)
-    hessian, gradient = np.zeros((3 * cells + 2, 3 * cells + 2)), np.zeros(3 * cells + 2)
+    hessian, gradient = np.zeros((3 * cells + 2,) * 2, np.float32), np.zeros(3 * cells + 2)
     jacobian = np.empty((len(seen.patch), cells + 2), np.float32)
     (syrk,) = get_blas_funcs(("syrk",), dtype=np.float32)  # half a matrix product
     for c in range(3):
@@ -136,11 +137,16 @@ def _normal_equations(fit: PixelFit, solved: Solved, prior: LightPrior) -> tuple
     return hessian, gradient
 
 
-def _stepped(appearance: Appearance, hessian: np.ndarray, gradient: np.ndarray, damping: float) -> Appearance:
+def _stepped(appearance: Appearance, hessian: np.ndarray, gradient: np.ndarray, damping: float) -> Appearance | None:
+    """A step; None where the damping is too little for a factorisation in single precision."""
     damped = hessian.copy()
     diagonal = np.arange(len(damped))
     damped[diagonal, diagonal] += damping * damped[diagonal, diagonal] + 1e-6
-    step = -scipy.linalg.cho_solve(scipy.linalg.cho_factor(damped, overwrite_a=True, check_finite=False), gradient)
+    try:
+        factor = scipy.linalg.cho_factor(damped, overwrite_a=True, check_finite=False)
+    except scipy.linalg.LinAlgError:
+        return None
+    step = -scipy.linalg.cho_solve(factor, gradient.astype(np.float32), check_finite=False).astype(np.float64)
     light = step[:-2].reshape(3, -1).T.clip(-MOST_STEP["light"], MOST_STEP["light"])
     roughness, metallic = (
         float(np.clip(value, -MOST_STEP[name], MOST_STEP[name]))

@@ -25,7 +25,6 @@ from unirender_reference.optimize.views import View, Views
 
 LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
 EPSILON = 0.01  # of the relative loss
-SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
 
 Images = Float[np.ndarray, "n h w 3"]
 
@@ -47,11 +46,10 @@ class ImageLoss:
         self.kind: LossKind = kind
         self.target = np.stack([views.linear(view) for view in pictures])
         self.coverage = np.stack([view.mask for view in pictures])
-        self._straight = np.stack([view.image for view in pictures])
         self._count = float(self.coverage.sum() * 3)
         self.saturated: Bool[np.ndarray, "n h w 3"] = np.zeros(self.target.shape, bool)
-        if one_sided and not views.hdr:
-            self.saturated = (self._straight >= SATURATED) & (self.coverage > 0)
+        if one_sided:
+            self.saturated = np.stack([views.saturated(view) for view in pictures]) & (self.coverage > 0)
 
     def __call__(
         self,
@@ -76,11 +74,21 @@ class ImageLoss:
         value = float(error.sum(where=counted, dtype=np.float64)) / self._count
         return value, (np.where(counted, slope, 0) / self._count).astype(np.float32)
 
-    def psnr(self, images: Images) -> float:
-        """Of display values over covered pixels, in dB."""
-        shown = srgb_encode(np.clip(images / np.maximum(self.coverage, 1e-3), 0, 1))
-        given = srgb_encode(np.clip(self.target / np.maximum(self.coverage, 1e-3), 0, 1))
-        mse = float(((shown - given) ** 2 * self.coverage).sum(dtype=np.float64)) / self._count
+    def psnr(self, images: Images, other: Images | None = None) -> float:
+        """Of display values over covered pixels, in dB.
+
+        Args:
+            images: premultiplied linear radiance.
+            other: the same with other samples. The product of both errors is free of the samples' variance, which the
+                square of one contains; None: the square.
+        """
+
+        def shown(values: Images) -> Images:
+            return srgb_encode(np.clip(values / np.maximum(self.coverage, 1e-3), 0, 1))
+
+        given = shown(self.target)
+        product = (shown(images) - given) * (shown(images if other is None else other) - given)
+        mse = float((product * self.coverage).sum(dtype=np.float64)) / self._count
         return float(-10 * np.log10(max(mse, 1e-12)))
 
 

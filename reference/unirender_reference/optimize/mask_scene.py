@@ -13,11 +13,10 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.multiview import sensor_at
-from unirender_reference.optimize.textured_scene import moving_sensor, parameter_name
+from unirender_reference.optimize.textured_scene import moving_sensor
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
-from unirender_reference.scene import OBJECT
+from unirender_reference.scene import OBJECT, parameter_name, sensor_at
 from unirender_reference.shader import gradient
 from unirender_reference.shapes import MeshObject
 

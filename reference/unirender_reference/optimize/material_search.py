@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from unirender_reference.optimize.pixel_fit import HUBER, LEAST_ALBEDO, SCALE_SPREAD, Appearance, PixelFit
+from unirender_reference.optimize.bsdf_lobes import F0
+from unirender_reference.optimize.huber import huber_cost
+from unirender_reference.optimize.pixel_fit import LEAST_ALBEDO, SCALE_SPREAD, Appearance, PixelFit
 from unirender_reference.optimize.roughness_nodes import NODES
-from unirender_reference.optimize.transport import F0
 
 METALLIC = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 NEIGHBOURS = 6
@@ -70,8 +71,7 @@ def _costs(fit: PixelFit, appearance: Appearance) -> Float[np.ndarray, "p k"]:
             radiance = scale * gain + rest
             residual = np.abs(seen.weight * (radiance - seen.radiance))
             residual = np.where(seen.clipped & (radiance > seen.radiance), 0, residual)
-            robust = np.where(residual > HUBER, 2 * HUBER * residual - HUBER**2, residual**2)
-            columns.append(seen.sums @ robust.sum(axis=1).astype(np.float32))
+            columns.append(seen.sums @ huber_cost(residual).sum(axis=1).astype(np.float32))
     return np.stack(columns, axis=1)
 
 

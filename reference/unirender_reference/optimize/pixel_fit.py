@@ -1,9 +1,9 @@
 """The model that the transport matrices make of the pixels, and how far it is from what they show.
 
 Notation: N pixels, J light cells, E (J, 3) their radiance; b base colour, m metallic, r roughness of each pixel. With
-the matrices mixed for (r, m), a pixel's radiance is linear in b and in E:
+the matrices mixed for (r, m) (`material_mix`), a pixel's radiance is linear in b and in E:
 
-    I = b * (U E) + V E,     U = (1-m) D + m (G - W),     V = (1-m) (F0 G + (1-F0) W) + m W
+    I = b * (U E) + V E
 
 The surface is cut into patches of about a pixel's footprint. Base colour is `pattern` (of each pixel, known) times one
 scale for each patch and channel, which is eliminated: for any light and material the best scale has a closed form.
@@ -13,18 +13,17 @@ Residuals are differences of display values in units of `SIGMA`, to first order,
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from unirender.color import display_slope
-from unirender_reference.optimize.roughness_nodes import node_weights
-from unirender_reference.optimize.transport import F0, Transport
+from unirender_reference.optimize.huber import huber_cost, huber_weight
+from unirender_reference.optimize.losses import tone_slope
+from unirender_reference.optimize.material_mix import Mixed, lobes_at, material_slopes, mixed
+from unirender_reference.optimize.transport import Transport
 
 SIGMA = 0.01  # display values: rounding to 8 bits, and what the matrices leave out
-HUBER = 4.0
 SCALE_SPREAD = 0.5  # standard deviation of the patches' scales around their prior
 LEAST_ALBEDO = 0.002
 
@@ -62,17 +61,15 @@ class Observations:
 
 
 def observe(
-    radiance: Pixels, coverage: Float[np.ndarray, " n"], patch: Int[np.ndarray, " n"], display: bool
+    radiance: Pixels, coverage: Float[np.ndarray, " n"], patch: Int[np.ndarray, " n"], clipped: Bool[np.ndarray, "n 3"]
 ) -> Observations:
     """Observations of premultiplied radiance.
 
     Args:
-        display: it was decoded from display values, which end at 1; False: linear pictures.
+        radiance, coverage, patch, clipped: see `Observations`.
     """
     straight = radiance / np.maximum(coverage, 1e-3)[:, None]
-    clipped = (straight >= 1 - 1e-3) if display else np.zeros(straight.shape, bool)
-    beyond = np.maximum(straight, 1) ** (1 / 2.4 - 1)  # linear pictures: the curve goes on above what a display shows
-    slope = display_slope(np.minimum(straight, 1)) * beyond
+    slope = tone_slope(straight)  # linear pictures: the curve goes on above what a display shows
     return Observations(
         radiance.astype(np.float32), (slope / SIGMA).astype(np.float32), clipped, coverage.astype(np.float32), patch
     )
@@ -101,13 +98,6 @@ class Appearance:
     def radiance(self) -> Float[np.ndarray, "j 3"]:
         """E."""
         return np.exp(self.light).astype(np.float32)
-
-
-class Mixed(NamedTuple):
-    """The matrices of a material: I = b (U E) + V E."""
-
-    u: Float[np.ndarray, "n j"]
-    v: Float[np.ndarray, "n j"]
 
 
 @dataclass(frozen=True)
@@ -155,19 +145,7 @@ class PixelFit:
 
     def mixed(self, appearance: Appearance) -> Mixed:
         """U and V for the pixels' materials."""
-        t = self.transport
-        r, m = (a.astype(np.float32)[:, None] for a in (appearance.roughness, appearance.metallic))
-        weights = node_weights(appearance.roughness)[0].astype(np.float32)
-        gloss, schlick = _weighted(weights, t.gloss), _weighted(weights, t.schlick)
-        u = t.diffuse[1] * r
-        u += t.diffuse[2] * r**2
-        u += t.diffuse[0]
-        u *= 1 - m
-        u += m * (gloss - schlick)
-        gloss *= (1 - m) * F0
-        schlick *= (1 - m) * (1 - F0) + m
-        gloss += schlick
-        return Mixed(u, gloss)
+        return mixed(lobes_at(self.transport, appearance.roughness), appearance.metallic)
 
     def predict(self, mixed: Mixed, light: Float[np.ndarray, "j 3"], robust: Pixels | None = None) -> Prediction:
         """The model under a light (E), with the patches' best scales.
@@ -189,43 +167,24 @@ class PixelFit:
         above = seen.clipped & (radiance > seen.radiance)
         residual = np.where(above, 0, seen.weight * (radiance - seen.radiance))
         size = np.abs(residual)
-        huber = np.where(size > HUBER, 2 * HUBER * size - HUBER**2, size**2)
         return Prediction(
             base=(at_pixel * self.pattern).astype(np.float32),
             gain=gain,
             radiance=radiance,
             residual=residual,
-            robust=np.where(above, 0, HUBER / np.maximum(size, HUBER)),
+            robust=np.where(above, 0, huber_weight(size)),
             scale=scale,
             free=free,
-            cost=float(huber.sum() + tie * ((scale - self.scale_prior) ** 2).sum()),
+            cost=float(huber_cost(size).sum() + tie * ((scale - self.scale_prior) ** 2).sum()),
         )
 
     def material_slopes(
         self, appearance: Appearance, base: Pixels
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Derivatives of the radiance by roughness and by metallic."""
-        t, light = self.transport, appearance.radiance
-        r, m = appearance.roughness[:, None], appearance.metallic[:, None]
-        value, slope = node_weights(appearance.roughness)
-        lit = [np.stack([matrix @ light for matrix in part]) for part in (t.gloss, t.schlick, t.diffuse)]
-        gloss, schlick = (np.einsum("nk,knc->nc", value, part) for part in lit[:2])
-        d_gloss, d_schlick = (np.einsum("nk,knc->nc", slope, part) for part in lit[:2])
-        diffuse, d_diffuse = lit[2][0] + r * lit[2][1] + r**2 * lit[2][2], lit[2][1] + 2 * r * lit[2][2]
-        fresnel, d_fresnel = F0 * gloss + (1 - F0) * schlick, F0 * d_gloss + (1 - F0) * d_schlick
-        by_roughness = base * ((1 - m) * d_diffuse + m * (d_gloss - d_schlick)) + (1 - m) * d_fresnel + m * d_schlick
-        by_metallic = base * (gloss - schlick - diffuse) + schlick - fresnel
-        return by_roughness, by_metallic
+        return material_slopes(self.transport, appearance.roughness, appearance.metallic, base, appearance.radiance)
 
     def _largest_pattern(self) -> Float[np.ndarray, "p 3"]:
         largest = np.zeros((int(self.seen.patch.max()) + 1, 3), np.float32)
         np.maximum.at(largest, self.seen.patch, self.pattern)
         return largest
-
-
-def _weighted(weights: Float[np.ndarray, "n nodes"], matrices: tuple[Float[np.ndarray, "n j"], ...]) -> np.ndarray:
-    used = [k for k in range(len(matrices)) if weights[:, k].any()]
-    total = weights[:, used[0], None] * matrices[used[0]]
-    for k in used[1:]:
-        total += weights[:, k, None] * matrices[k]
-    return total

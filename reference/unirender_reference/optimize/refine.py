@@ -59,6 +59,26 @@ def refine(
     return state.solution(start, config)
 
 
+class HeldOut:
+    """The fit to views that are only watched.
+
+    Args:
+        views: `held_out` of them.
+        first: any solution of the right mesh and sizes.
+        config: of the refinement.
+    """
+
+    def __init__(self, views: Views, first: Solution, config: RefineConfig) -> None:
+        self.config = config
+        self.scene = TexturedScene(first, views.held_out, config.depth)
+        self.loss = ImageLoss(views, config.loss, config.one_sided, views.held_out)
+
+    def psnr(self, state: RefineState) -> float:
+        """Masked PSNR in dB."""
+        images = self.scene.image(state.maps(self.config), HELD_OUT_SPP, derive_seed(self.config.seed, "held out"))
+        return self.loss.psnr(images[..., :3])
+
+
 class Fit:
     """The objective of a refinement, and its steps.
 
@@ -72,10 +92,7 @@ class Fit:
         self.config = config
         self.scene = TexturedScene(first, views.seen, config.depth)
         self.loss = ImageLoss(views, config.loss, config.one_sided)
-        self._held_out: tuple[TexturedScene, ImageLoss] | None = None
-        if config.held_out_every and views.held_out:
-            loss = ImageLoss(views, config.loss, config.one_sided, views.held_out)
-            self._held_out = TexturedScene(first, views.held_out, config.depth), loss
+        self._held_out = HeldOut(views, first, config) if config.held_out_every and views.held_out else None
 
     def step(self, state: RefineState) -> dict[str, float]:
         """One step of Adam; returns the losses by name."""
@@ -94,9 +111,7 @@ class Fit:
                 state.parameters[name] = to_parameter(name, within, config.parametrisation)
         state.iteration += 1
         if self._held_out and state.iteration % config.held_out_every == 0:
-            scene, loss = self._held_out
-            images = scene.image(state.maps(config), HELD_OUT_SPP, derive_seed(config.seed, "held out"))
-            values["held_out_psnr"] = loss.psnr(images[..., :3])
+            values["held_out_psnr"] = self._held_out.psnr(state)
         return values
 
     def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Float[np.ndarray, "h w c"]]]:

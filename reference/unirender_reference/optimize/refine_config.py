@@ -3,6 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from unirender.errors import UsageError
+from unirender_reference.optimize.option_checks import require_least
+
+LEAST_LIGHT_ROWS = 4
+
 
 @dataclass(frozen=True)
 class RefineConfig:
@@ -46,6 +51,8 @@ class RefineConfig:
     """Levels of the light's pyramid."""
     uniform: bool = True
     """One step length for all texels of a level."""
+    beta_2: float = 0.99
+    """What Adam keeps of its second moment in a step; 0.999 in Mitsuba's and most others' default."""
     light_rows: int = 0
     """Rows of the light that is refined: the start is interpolated; 0: as many as the start has."""
     white_light: float = 0.0
@@ -73,9 +80,30 @@ class RefineConfig:
     seed: int = 0
     """Equal seeds draw equal samples."""
 
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        counts = {"iterations": 0, "spp": 1, "spp_gradient": 1, "depth": 2, "held_out_every": 0, "seed": 0}
+        levels = {"albedo_levels": 1, "material_levels": 1, "light_levels": 1}
+        rates = {"albedo_rate": 0, "roughness_rate": 0, "metallic_rate": 0, "light_rate": 0}
+        weights = (
+            *("white_light", "neutral_light", "light_smoothness", "albedo_smoothness", "material_smoothness"),
+            *("light_anchor", "material_anchor", "albedo_anchor", "demodulated"),
+        )
+        require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))
+        require_least(self, "refine", {"decay": 0}, above=True)
+        require_least(self, "refine", {"beta_2": 0})
+        if self.beta_2 >= 1:
+            raise UsageError(f"--refine.beta-2 {self.beta_2}: expected less than 1")
+        if self.light_rows:
+            require_least(self, "refine", {"light_rows": LEAST_LIGHT_ROWS})
+
     @classmethod
     def plain(cls, iterations: int = 800) -> "RefineConfig":
-        """The loop of Mitsuba's tutorials: Adam, 16 samples, squared error of display values, nothing else."""
+        """The loop of Mitsuba's tutorials: its Adam, 16 samples, squared error of display values, nothing else."""
         return cls(
             iterations=iterations,
             loss="srgb",
@@ -93,4 +121,5 @@ class RefineConfig:
             material_levels=1,
             light_levels=1,
             uniform=False,
+            beta_2=0.999,
         )

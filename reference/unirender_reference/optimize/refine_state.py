@@ -47,7 +47,7 @@ class RefineState:
         }
         levels = (config.albedo_levels, config.material_levels, config.material_levels, config.light_levels)
         moments: dict[Name, PyramidAdam] = {
-            name: PyramidAdam(first[name].shape, count, name == "environment", config.uniform)
+            name: PyramidAdam(first[name].shape, count, name == "environment", config.uniform, config.beta_2)
             for name, count in zip(NAMES, levels, strict=True)
         }
         return cls(0, {name: values.copy() for name, values in first.items()}, moments, first)

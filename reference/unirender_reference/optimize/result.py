@@ -1,20 +1,22 @@
 """The last act of a run: everything it found goes into its folder, `solution.json` last."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from unirender_reference.optimize.export import SOLUTION_FILE, write_record, write_solution
+from unirender_reference.optimize.placement import coverage_of, mask_iou
 from unirender_reference.optimize.plots import loss_curve
 from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.state import RunFolder
-from unirender_reference.optimize.strips import found_images, psnr_db, turntable, views_strip
+from unirender_reference.optimize.strips import psnr_db, turntable, views_strip
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes import Sphere
 
 PART = ".result.part"
-SPP = 64
+SPP = 64  # of each half of the samples; figures are of both, free of their variance
 
 
 def write_result(
@@ -25,7 +27,8 @@ def write_result(
     place: Sphere | None = None,
     *,
     pictures: bool = True,
-) -> dict[str, Any]:
+    clock: Callable[[], float] | None = None,
+) -> list[str]:
     """Writes all files of a result; each appears whole, and `solution.json` after all others.
 
     Args:
@@ -35,38 +38,42 @@ def write_result(
         header: what the run was given.
         place: where the object stands in its own units.
         pictures: whether to render a turntable and strips of the views.
+        clock: gives the seconds of the whole run, for the record.
 
     Returns:
-        The content of `solution.json`.
+        The names of the files.
     """
     temporary = folder.out / PART
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir()
     write_solution(solution, temporary, place)
     every = (*views.seen, *views.held_out)
-    found = found_images(solution, every, SPP)
+    halves = [solution_images(solution, every, SPP, seed) for seed in (0, 1)]
     if pictures:
-        views_strip(views, found).save(temporary / "views.png")
+        views_strip(views, (halves[0] + halves[1]) / 2).save(temporary / "views.png")
         turntable(solution).save(temporary / "turntable.png")
     history = folder.history()
     loss_curve(history, temporary / "loss.png")
     count = len(views.seen)
-    figures = {"seen_psnr_db": psnr_db(views, views.seen, found[:count])}
+    figures = {"seen_psnr_db": psnr_db(views, views.seen, *(half[:count] for half in halves))}
     if views.held_out:
-        figures["held_out_psnr_db"] = psnr_db(views, views.held_out, found[count:])
+        figures["held_out_psnr_db"] = psnr_db(views, views.held_out, *(half[count:] for half in halves))
     record = {
         "object": solution.obj.name,
         "figures": {name: round(value, 3) for name, value in figures.items()},
-        "figures_are": f"masked PSNR of display values, {SPP} spp",
+        "figures_are": f"masked PSNR of display values, 2 x {SPP} spp, without the samples' variance",
+        "mask_iou": round(mask_iou(every, coverage_of(every, solution.obj)), 4),
         "views": {"seen": count, "held_out": len(views.held_out), "hdr": views.hdr},
         "size": [views.height, views.width],
         "stages": stage_table(history),
+        "seconds": None if clock is None else round(clock(), 3),
         "place": None if place is None else {"center": place.center.tolist(), "radius": place.radius},
         **header,
     }
     write_record(temporary, record)
+    names = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file())
     _move_in(temporary, folder.out)
-    return record
+    return names
 
 
 def stage_table(history: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""An optimisation from several views, stage by stage: [shape] -> transport -> refinement [-> shape -> refinement].
+"""An optimisation from several views, stage by stage: [shape] -> transport [-> shape -> transport] -> refinement.
 
 With a folder it can be killed at any time and goes on where it was (`state`); what it finds is the same, bit for bit,
 as far as the renderer is: `docs/optimization.md` says how far.
@@ -7,14 +7,13 @@ as far as the renderer is: `docs/optimization.md` says how far.
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
 from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.export import SOLUTION_FILE
-from unirender_reference.optimize.refine import RefineConfig, RefineState, refine
+from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
 from unirender_reference.optimize.report import Progress, Report
 from unirender_reference.optimize.result import write_result
 from unirender_reference.optimize.solution import Solution
@@ -39,6 +38,7 @@ def optimize(
     place: Sphere | None = None,
     pictures: bool = True,
     threads: int = 0,
+    began: float | None = None,
 ) -> Solution:
     """Finds textures, light and, where it is not given, the shape of an object from pictures of it.
 
@@ -52,6 +52,7 @@ def optimize(
         progress: called after every step.
         place: where the object stands in its own units, for the mesh file.
         pictures: whether to render strips to look at, too.
+        began: clock (`time.perf_counter`) when the work on `init` began, which counts among the seconds; None: now.
         threads: of the renderer; 0: as many as it has. With one, equal runs give equal bytes; with more, sums of
             derivatives round in another order each time.
 
@@ -63,18 +64,30 @@ def optimize(
         raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")
     header = {
         "config": {name: value for name, value in dataclasses.asdict(config).items() if name != "save_seconds"},
-        "inputs": fingerprint(views, obj, init),
+        "inputs": fingerprint(views, obj, init) | {"place": _described(place)},
         "versions": versions(denoise=False),
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(renderer_threads(threads))
         folder = None if out is None else stack.enter_context(open_run(out, header))
-        run = _Run(views, config, folder, progress or (lambda report: None), _plan(obj, init, config))
+        show = progress or (lambda report: None)
+        run = _Run(views, config, folder, show, _plan(obj, init, config), began)
         solution = run.solution(obj, init)
-        if folder is not None and not (folder.progress.live.get("written") and (folder.out / SOLUTION_FILE).is_file()):
-            write_result(solution, views, folder, header, place, pictures=pictures)
-            folder.save(run.seconds, {"written": True})
+        if folder is not None and not _written(folder, pictures):
+            files = write_result(solution, views, folder, header, place, pictures=pictures, clock=lambda: run.seconds)
+            folder.save(run.seconds, {"written": files, "pictures": pictures})
     return solution
+
+
+def _described(place: Sphere | None) -> str:
+    return "unit sphere" if place is None else f"center {place.center.tolist()} radius {float(place.radius)!r}"
+
+
+def _written(folder: RunFolder, pictures: bool) -> bool:
+    """Whether the result is there with all its files, and with pictures where they are wanted."""
+    live = folder.progress.live
+    drawn = live.get("pictures", False) or not pictures
+    return bool(live.get("written")) and drawn and all((folder.out / name).is_file() for name in live["written"])
 
 
 @contextlib.contextmanager
@@ -96,24 +109,35 @@ def renderer_threads(count: int) -> Iterator[None]:
 
 
 def _plan(obj: MeshObject | None, init: Solution | None, config: OptimizeConfig) -> list[str]:
-    stages = [] if init is not None else [TRANSPORT]
-    if obj is None and init is None:
-        stages = [SHAPE, *stages]
-    stages.append(REFINE)
-    if SHAPE in stages:
-        stages += [name for k in range(1, config.shape_rounds + 1) for name in (f"{RESHAPE}-{k}", f"{REFINE}-{k}")]
-    return stages
+    """The names of the stages.
+
+    On a mesh that was moved all is solved for anew: materials found on the wrong one explain its errors, and descent
+    does not leave them. Without the transport stage only the refinement tells what shading a mesh should have.
+    """
+    if init is not None:
+        return [REFINE]
+    if obj is not None:
+        return [TRANSPORT, REFINE]
+    again = TRANSPORT if config.transport.enabled else REFINE
+    rounds = [name for k in range(1, config.shape_rounds + 1) for name in (f"{RESHAPE}-{k}", f"{again}-{k}")]
+    return [SHAPE, TRANSPORT, *rounds, REFINE] if again == TRANSPORT else [SHAPE, TRANSPORT, REFINE, *rounds]
 
 
 class _Run:
     """The stages of one process."""
 
     def __init__(
-        self, views: Views, config: OptimizeConfig, folder: RunFolder | None, show: Progress, plan: list[str]
+        self,
+        views: Views,
+        config: OptimizeConfig,
+        folder: RunFolder | None,
+        show: Progress,
+        plan: list[str],
+        began: float | None = None,
     ) -> None:
         self.views, self.config, self.folder, self.plan = views, config, folder, plan
         self._show = show
-        self._began = time.perf_counter()
+        self._began = time.perf_counter() if began is None else began
         self._before = 0.0 if folder is None else folder.progress.seconds
 
     @property
@@ -142,14 +166,17 @@ class _Run:
 
             return reconstruct(self.views, shape, self._on_step(name, shape.mask_steps))
         if kind == TRANSPORT:
-            from unirender_reference.optimize.solve import solve_appearance
+            from unirender_reference.optimize.solve import STARTS, solve_appearance
+            from unirender_reference.optimize.transport_progress import solve_shares
 
-            assert isinstance(found, MeshObject)
+            mesh = found.obj if isinstance(found, Solution) else found
+            assert mesh is not None  # given, or found by the stage before
+            shares = solve_shares(config.transport, len(STARTS))
             return solve_appearance(
                 self.views,
-                found,
+                mesh,
                 config.transport,
-                self._on_step(name, None),
+                self._on_step(name, len(shares), shares=shares),
                 config.texture_size,
                 config.light_rows,
                 config.seed,
@@ -161,13 +188,16 @@ class _Run:
             return refine_shape(self.views, found, shape, self._on_step(name, shape.image_steps))
         return self._refine(name, found)
 
-    def _on_step(self, name: str, total: int | None, first: int = 0) -> Callable[[Step], bool]:
+    def _on_step(
+        self, name: str, total: int, first: int = 0, shares: Sequence[float] | None = None
+    ) -> Callable[[Step], bool]:
         """Records and shows every step of a stage, under its name and with the clock of the run.
 
         Args:
             name: of the stage.
             total: its steps.
             first: its steps in earlier processes.
+            shares: of the stage's work that is done after each step; None: all take alike.
         """
         began = time.perf_counter()
 
@@ -175,8 +205,9 @@ class _Run:
             step = dataclasses.replace(step, stage=name, seconds=round(self.seconds, 3))
             if self.folder is not None:
                 self.folder.record(step)
-            pace = (time.perf_counter() - began) / max(step.iteration - first, 1)
-            remaining = None if total is None else pace * (total - step.iteration)
+            index = step.iteration - first
+            done = index / (total - first) if shares is None else shares[min(index, len(shares)) - 1]
+            remaining = (time.perf_counter() - began) * (1 - done) / done if done else None
             self._show(Report(step, self.plan.index(name) + 1, len(self.plan), total, remaining))
             return True
 
@@ -202,6 +233,8 @@ class _Run:
                 saved = time.perf_counter()
             return not watch.enough
 
+        if watch.best_db is None and not state.iteration and config.held_out_every and self.views.held_out:
+            on_step(Step(name, 0, 0.0, {FIGURE: HeldOut(self.views, start, config).psnr(state)}))  # of the start
         if not watch.enough:
             refine(self.views, start, config, on_step, state)
         return watch.best if watch.patience and watch.best is not None else state.solution(start, config)

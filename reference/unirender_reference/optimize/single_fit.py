@@ -3,9 +3,9 @@
 Unknown are u (n, 3), the change of log albedo at each pixel, and theta = (e, g, delta_m, delta_r): the coarse log light
 of each channel, the channels' gains, and what is added to metallic and roughness of all pixels. The picture is
 
-    I = b (1 - m) D E + b m (G - W) E + 0.04 (1 - m) (G - W) E + W E,    E = exp(log E_0 + P e)
+    I = b (U E) + V E,    E = exp(log E_0 + P e)
 
-(`picture_transport`), and the cost
+with the matrices of the material (`material_mix`), and the cost
 
     sum of Huber(w (I - I_seen))  +  u^T Q u  +  e^T K e  +  g^T K_g g  +  (delta_m / s_m)^2  +  (delta_r / s_r)^2
 
@@ -13,7 +13,7 @@ with w = d display / d linear over the expected misfit; light beyond a saturated
 eliminated from each step channel by channel: their block of the Hessian is sparse, Q plus a diagonal.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -21,8 +21,10 @@ from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from unirender.color import display_slope
-from unirender_reference.optimize.picture_transport import NODES
+from unirender_reference.optimize.huber import huber_cost, huber_weight
+from unirender_reference.optimize.losses import tone_slope
+from unirender_reference.optimize.material_mix import Lobes, Mixed, lobes_at, material_slopes, mixed
+from unirender_reference.optimize.roughness_nodes import NODES
 from unirender_reference.optimize.single_config import Priors
 from unirender_reference.optimize.single_picture import Picture
 from unirender_reference.optimize.single_priors import (
@@ -33,10 +35,8 @@ from unirender_reference.optimize.single_priors import (
     light_precision,
 )
 
-HUBER = 4.0  # expected misfits beyond which a residual counts linearly
 DARKEST = 0.02  # log albedo is log(albedo + DARKEST)
 TOP = 400.0  # precision that holds log albedo below that of 1
-DIELECTRIC = 0.04
 LOG_RADIANCE = (-8.0, 9.0)
 FINISHED = 2e-3  # relative gain of a step below which the search ends
 
@@ -62,30 +62,28 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Model:
-    """The picture's parts at a point: rows b x + z, with x (n, 3) and z (n, 3), and what their derivatives need."""
+    """The picture b (U E) + V E at a point, and what its derivatives need.
+
+    Attributes:
+        metallic, roughness: of each pixel.
+        lobes: matrices at that roughness.
+        mixed: U and V.
+        environment: E.
+        exponent: exp of log albedo, below that of 1.
+        albedo: b.
+        above: by how much log albedo is above that of 1.
+        image: premultiplied.
+    """
 
     metallic: Float[np.ndarray, "n 1"]
     roughness: Float[np.ndarray, "n 1"]
-    diffuse: Float[np.ndarray, "n j"]
-    lobe: Float[np.ndarray, "n j"]
-    grazing: Float[np.ndarray, "n j"]
+    lobes: Lobes
+    mixed: Mixed
     environment: Float[np.ndarray, "j 3"]
     exponent: Float[np.ndarray, "n 3"]
     albedo: Float[np.ndarray, "n 3"]
     above: Float[np.ndarray, "n 3"]
     image: Float[np.ndarray, "n 3"]
-
-    @property
-    def carried(self) -> Float[np.ndarray, "n j"]:
-        """Rows of the light that is multiplied by albedo."""
-        m = self.metallic.astype(np.float32)
-        return (1 - m) * self.diffuse + m * (self.lobe - self.grazing)
-
-    @property
-    def untinted(self) -> Float[np.ndarray, "n j"]:
-        """Rows of the light that is not."""
-        m = self.metallic.astype(np.float32)
-        return DIELECTRIC * (1 - m) * (self.lobe - self.grazing) + self.grazing
 
 
 class Fit:
@@ -102,13 +100,13 @@ class Fit:
         self.picture, self.priors = picture, priors
         self.log_albedo = np.log(picture.maps["albedo"] + DARKEST)
         self.log_light = log_light
-        self.interpolation = light_interpolation(picture.transport.shape)
+        self.interpolation = light_interpolation(picture.transport.grid)
         self.coarse = LIGHT_GRID[0] * LIGHT_GRID[1]
-        self.slope = display_slope(np.where(picture.coverage > 0, picture.radiance / picture.coverage, 0))
+        self.slope = tone_slope(picture.radiance / picture.coverage)
         self.noise = noise
         self.q = albedo_precision(picture.display, picture.coverage, picture.pairs, priors)
         self.k_light, self.k_gain = light_precision(priors), gain_precision(priors)
-        self._rows: tuple[float, tuple[np.ndarray, ...]] | None = None
+        self._lobes: tuple[float, Lobes] | None = None
 
     def start(self) -> Unknowns:
         return Unknowns(np.zeros_like(self.log_albedo), np.zeros(3 * self.coarse), np.zeros(3))
@@ -123,28 +121,11 @@ class Fit:
         metallic = np.clip(maps["metallic"] + at.metallic, 0, 1)
         return metallic, np.clip(maps["roughness"] + at.roughness, NODES[0], NODES[-1])
 
-    def _nodes(self, roughness: Float[np.ndarray, "n 1"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        nodes = np.array(NODES)
-        first = np.clip(np.searchsorted(nodes, roughness[:, 0]) - 1, 0, len(nodes) - 2)
-        width = nodes[first + 1] - nodes[first]
-        return first, width, (roughness[:, 0] - nodes[first]) / width
-
-    def _lobes(self, offset: float, roughness: Float[np.ndarray, "n 1"]) -> tuple[np.ndarray, ...]:
-        """Rows of the diffuse lobe, of G and of W at the pixels' roughness, premultiplied by coverage."""
-        if self._rows is not None and self._rows[0] == offset:
-            return self._rows[1]
-        transport, r = self.picture.transport, roughness.astype(np.float32)
-        first, _, share = self._nodes(roughness)
-        share, pixel = share[:, None].astype(np.float32), np.arange(len(first))
-        coverage = self.picture.coverage.astype(np.float32)
-        diffuse = transport.diffuse[0] + r * transport.diffuse[1] + r * r * transport.diffuse[2]
-        lobe, grazing = (
-            (1 - share) * table[first, pixel] + share * table[first + 1, pixel]
-            for table in (transport.lobe, transport.grazing)
-        )
-        rows = (diffuse * coverage, lobe * coverage, grazing * coverage)
-        self._rows = (offset, rows)
-        return rows
+    def _lobes_at(self, offset: float, roughness: Float[np.ndarray, "n 1"]) -> Lobes:
+        """Kept until the offset of roughness changes."""
+        if self._lobes is None or self._lobes[0] != offset:
+            self._lobes = offset, lobes_at(self.picture.transport, roughness[:, 0])
+        return self._lobes[1]
 
     def environment(self, at: Unknowns) -> Float[np.ndarray, "j 3"]:
         change = self.interpolation @ at.light.reshape(3, self.coarse).T
@@ -152,32 +133,22 @@ class Fit:
 
     def model(self, at: Unknowns) -> Model:
         metallic, roughness = self.materials(at)
-        diffuse, lobe, grazing = self._lobes(at.roughness, roughness)
-        light = self.environment(at)
+        lobes = self._lobes_at(at.roughness, roughness)
+        u, v = matrices = mixed(lobes, metallic[:, 0])
         log_albedo, top = self.log_albedo + at.gain + at.pixel, np.log(1 + DARKEST)
         exponent = np.exp(np.minimum(log_albedo, top))
-        albedo = np.maximum(exponent - DARKEST, 0)
-        made = Model(
-            metallic,
-            roughness,
-            diffuse,
-            lobe,
-            grazing,
-            light,
-            exponent,
-            albedo,
-            np.maximum(log_albedo - top, 0),
-            np.empty_like(albedo),
-        )
-        light32 = light.astype(np.float32)
-        return replace(made, image=albedo * (made.carried @ light32) + made.untinted @ light32)
+        albedo, above = np.maximum(exponent - DARKEST, 0), np.maximum(log_albedo - top, 0)
+        environment = self.environment(at)
+        light = environment.astype(np.float32)
+        image = albedo * (u @ light) + v @ light
+        return Model(metallic, roughness, lobes, matrices, environment, exponent, albedo, above, image)
 
     def residuals(self, model: Model) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """w (I - I_seen), and the weight of each under Huber's loss (0 beyond saturated values)."""
         residual = self.slope / self.noise * (model.image - self.picture.radiance)
         beyond = self.picture.saturated & (residual > 0)
         residual = np.where(beyond, 0, residual)
-        share = np.where(beyond, 0, np.minimum(1, HUBER / np.maximum(np.abs(residual), 1e-9)))
+        share = np.where(beyond, 0, huber_weight(np.abs(residual)))
         return residual, share
 
     def misfit(self, model: Model) -> float:
@@ -186,8 +157,7 @@ class Fit:
         return float(np.sqrt(np.square(residual).mean() / np.mean(self.picture.coverage)))
 
     def cost(self, at: Unknowns, model: Model) -> float:
-        size = np.abs(self.residuals(model)[0])
-        data = np.where(size > HUBER, 2 * HUBER * size - HUBER**2, size**2).sum()
+        data = huber_cost(np.abs(self.residuals(model)[0])).sum()
         pixels = np.sum(at.pixel * (self.q @ at.pixel)) + TOP * np.square(model.above).sum()
         light, gain = at.light @ self.k_light @ at.light, at.gain @ self.k_gain @ at.gain
         return float(data + pixels + light + gain + self._material_cost(at))
@@ -210,13 +180,15 @@ class Fit:
         ):
             hessian[place, place], gradient[place] = width**-2, offset * width**-2
         residual, share = self.residuals(model)
-        by_metallic, by_roughness = self._material_derivatives(model)
-        lit, plain, eliminated = model.carried @ light, (model.carried, model.untinted), []
+        materials = model.roughness[:, 0], model.metallic[:, 0]
+        by_roughness, by_metallic = material_slopes(self.picture.transport, *materials, model.albedo, light)
+        u, v = model.mixed
+        lit, eliminated = u @ light, []
         for k in range(3):
             root = np.sqrt(share[:, k])
             weight = self.slope[:, k] / self.noise * root
             jacobian = np.empty((len(weight), c + 3))
-            rows = model.albedo[:, k : k + 1].astype(np.float32) * plain[0] + plain[1]
+            rows = model.albedo[:, k : k + 1].astype(np.float32) * u + v
             jacobian[:, :c] = (rows * light[:, k] * weight[:, None].astype(np.float32)) @ self.interpolation
             free, held = model.above[:, k] == 0, TOP * (model.above[:, k] > 0)
             own = weight * lit[:, k] * model.exponent[:, k] * free
@@ -237,23 +209,6 @@ class Fit:
             gradient[3 * c + k] += TOP * model.above[:, k].sum()
             eliminated.append((index, solved[:, :-1], solved[:, -1]))
         return hessian, gradient, eliminated
-
-    def _material_derivatives(self, model: Model) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-        """Of the image with respect to metallic and roughness."""
-        transport, light = self.picture.transport, model.environment.astype(np.float32)
-        diffuse, lobe, grazing = model.diffuse @ light, model.lobe @ light, model.grazing @ light
-        m, coverage = model.metallic, self.picture.coverage
-        by_metallic = model.albedo * (lobe - grazing - diffuse) - DIELECTRIC * (lobe - grazing)
-        first, width, _ = self._nodes(model.roughness)
-        pixel, width = np.arange(len(first)), width[:, None]
-        d_lobe, d_grazing = (
-            coverage * ((table[first + 1, pixel] - table[first, pixel]) @ light) / width
-            for table in (transport.lobe, transport.grazing)
-        )
-        slope = transport.diffuse[1] + 2 * model.roughness.astype(np.float32) * transport.diffuse[2]
-        d_diffuse = coverage * (slope @ light)
-        tinted = (1 - m) * d_diffuse + m * (d_lobe - d_grazing)
-        return by_metallic, model.albedo * tinted + DIELECTRIC * (1 - m) * (d_lobe - d_grazing) + d_grazing
 
     def step(
         self, at: Unknowns, model: Model, cost: float, damping: float, fixed: tuple[str, ...]

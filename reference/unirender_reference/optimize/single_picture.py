@@ -8,10 +8,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from unirender.camera import Camera
-from unirender.color import image_srgb, unpremultiply
-from unirender_reference.optimize.picture_transport import Transport, build_transport, mapped_points, mesh_points
+from unirender.color import image_srgb, srgb_encode, unpremultiply
+from unirender_reference.optimize.differences import side_by_side
+from unirender_reference.optimize.light_grid import LightGrid
+from unirender_reference.optimize.surface_points import blocker, mapped_points, picture_points
+from unirender_reference.optimize.transport import Transport, light_transport
 from unirender_reference.shapes import MeshObject
 
+POINTS = 4  # of a pixel on a known mesh
 SATURATED = 0.999  # display value from which a channel may stand for more
 
 
@@ -20,19 +24,21 @@ class Picture:
     """The n pixels of a (shrunk) picture that show the object.
 
     Attributes:
-        transport: of its pixels.
+        transport: of its pixels, coverage included; the light is bilinear between texels.
+        pixel: (n,) flat indices of the pixels in the shrunk picture.
         size: rows and columns of the shrunk picture.
         block: pixels of the picture along a side of a shrunk pixel.
         normal: (n, 3) mean of the pixel's shading normals, unit.
         coverage: (n, 1).
         radiance: (n, 3) linear, premultiplied.
-        display: (n, 3) straight display values.
+        display: (n, 3) straight display values; above 1 where a linear picture is.
         saturated: (n, 3) whether the radiance is only a lower bound.
         maps: start values by name, (n, c).
         pairs: (2, k) neighbours.
     """
 
     transport: Transport
+    pixel: Int[np.ndarray, " n"]
     size: tuple[int, int]
     block: int
     normal: Float[np.ndarray, "n 3"]
@@ -46,7 +52,7 @@ class Picture:
     def frame(self, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
         """Values of the pixels on their places in the shrunk picture, 0 elsewhere."""
         out = np.zeros((self.size[0] * self.size[1], values.shape[1]), np.float64)
-        out[self.transport.pixel] = values
+        out[self.pixel] = values
         return out.reshape(*self.size, values.shape[1])
 
 
@@ -78,25 +84,28 @@ def make_picture(
     block = max(1, math.ceil(math.sqrt((mask > 0).sum() / pixels) - 0.05))
     coverage = shrink(mask, block)
     radiance = shrink(image_linear, block)
-    small = {name: _straight(shrink(values * mask, block), coverage) for name, values in maps.items()}
+    small = {name: unpremultiply(shrink(values * mask, block), coverage) for name, values in maps.items()}
     if geometry is not None:
-        points = mesh_points(coverage, geometry, camera, (height / block, width / block), seed)
+        scene = blocker(geometry)
+        points = picture_points(scene, coverage, camera, (height / block, width / block), POINTS, seed)
     else:
-        view = _unit(shrink(camera.view_directions(height, width) * (mask > 0), block))
+        scene, view = None, _unit(shrink(camera.view_directions(height, width) * (mask > 0), block))
         points = mapped_points(coverage, _unit(small["normal"]), view)
-    transport = build_transport(points, light_shape, seed)
-    size, pixel = coverage.shape[:2], transport.pixel
+    size, pixel = coverage.shape[:2], points.pixel
+    grid = LightGrid(*light_shape)
+    transport = light_transport(scene, points, grid, seed, coverage.reshape(-1)[pixel], bilinear=True)
 
     def chosen(values: np.ndarray) -> np.ndarray:
         return values.reshape(-1, values.shape[-1])[pixel].astype(np.float64)
 
-    display = image_srgb(unpremultiply(radiance, coverage)).astype(np.float64)
+    display = srgb_encode(unpremultiply(radiance, coverage)).astype(np.float64)
     saturated = np.zeros((len(pixel), 3), bool) if hdr else chosen(shrink(_clipped(image_linear, mask), block)) > 0
     return Picture(
         transport,
+        pixel,
         size,
         block,
-        _unit((points.normal * points.valid[:, None]).reshape(-1, points.count, 3).sum(axis=1)),
+        _unit(points.normal.sum(axis=1)),
         chosen(coverage),
         chosen(radiance),
         chosen(display),
@@ -119,21 +128,14 @@ def neighbours(pixel: Int[np.ndarray, " n"], size: tuple[int, int]) -> Int[np.nd
     """Pairs of indices of pixels that lie side by side."""
     index = np.full(size[0] * size[1], -1)
     index[pixel] = np.arange(len(pixel))
-    index = index.reshape(size)
-    first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
-    second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
-    both = (first >= 0) & (second >= 0)
-    return np.stack([first[both], second[both]])
+    pairs = side_by_side(index.reshape(size))
+    return pairs[:, (pairs >= 0).all(axis=0)]
 
 
 def _clipped(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
     """1 where a channel's display value is at its end."""
     full = image_srgb(unpremultiply(image_linear, mask)) >= SATURATED
     return (full & (mask > 0)).astype(np.float32)
-
-
-def _straight(values: Float[np.ndarray, "h w c"], coverage: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
-    return np.where(coverage > 0, values / np.maximum(coverage, 1e-6), 0).astype(np.float32)
 
 
 def _unit(values: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

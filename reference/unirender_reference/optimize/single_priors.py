@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from scipy import sparse
 
 from unirender.lighting import hat_weights
+from unirender_reference.optimize.differences import difference_matrix
+from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.single_config import Priors
 
 LIGHT_GRID = (8, 16)  # rows and columns on which the light's change is sought
@@ -31,13 +33,9 @@ def albedo_precision(
     chroma = np.square(ratio - ratio.mean(axis=1, keepdims=True)).sum(axis=1)
     tie = CROSSING + (1 - CROSSING) * np.exp(-chroma / CHROMA**2)
     tie *= np.minimum(coverage[first, 0], coverage[second, 0]) / priors.albedo_step**2
-    index, ones = np.arange(len(first)), np.ones(len(first))
-    steps = sparse.csr_array(
-        (np.concatenate([ones, -ones]), (np.concatenate([index, index]), np.concatenate([first, second]))),
-        shape=(len(first), len(display)),
-    )
+    steps = difference_matrix(pairs, len(display), np.sqrt(tie))
     own = sparse.diags_array(coverage[:, 0] / priors.albedo**2)
-    return sparse.csc_array(steps.T @ sparse.diags_array(tie) @ steps + own)
+    return sparse.csc_array(steps.T @ steps) + own.tocsc()
 
 
 def gain_precision(priors: Priors) -> Float[np.ndarray, "3 3"]:
@@ -52,15 +50,8 @@ def light_precision(priors: Priors) -> Float[np.ndarray, "c c"]:
     sine = np.sin(np.pi * np.arange(rows) / (rows - 1))
     area = np.repeat(np.maximum(sine, LEAST_SINE), columns)
     area /= area.mean()
-    index = np.arange(rows * columns).reshape(LIGHT_GRID)
-    across, down = np.repeat(np.maximum(sine, 0.15) ** -0.5, columns), np.maximum(sine[:-1], 0.15) ** 0.5
-    first = np.concatenate([index.ravel(), index[:-1].ravel()])
-    second = np.concatenate([np.roll(index, -1, axis=1).ravel(), index[1:].ravel()])
-    weight = np.concatenate([across, np.repeat(down, columns)])
-    steps = np.zeros((len(first), index.size))
-    steps[np.arange(len(first)), first] = weight
-    steps[np.arange(len(first)), second] = -weight
-    ties = steps.T @ steps / priors.light_step**2
+    steps = LightGrid(rows, columns).differences
+    ties = (steps.T @ steps).toarray() / priors.light_step**2
     grey = level_freed(np.diag(area / priors.light**2) + ties, priors.light_level)
     finer = 0.5 * priors.light / priors.light_chroma  # chroma varies as slowly, by less
     tint = level_freed(np.diag(area / priors.light_chroma**2) + ties * finer**2, priors.light_tint)
@@ -75,9 +66,9 @@ def level_freed(precision: Float[np.ndarray, "c c"], level: float) -> Float[np.n
     return precision - np.outer(ones, ones) / total * (1 - 1 / (1 + level**2 * total))
 
 
-def light_interpolation(shape: tuple[int, int]) -> sparse.csr_array:
+def light_interpolation(grid: LightGrid) -> sparse.csr_array:
     """P (texels, LIGHT_GRID's texels): bilinear."""
-    (rows, columns), (height, width) = LIGHT_GRID, shape
-    vertical = hat_weights(np.arange(height) * (rows - 1) / (height - 1), rows)
-    horizontal = hat_weights((np.arange(width) + 0.5) * columns / width - 0.5, columns, wrap=True)
+    rows, columns = LIGHT_GRID
+    vertical = hat_weights(np.arange(grid.rows) * (rows - 1) / (grid.rows - 1), rows)
+    horizontal = hat_weights((np.arange(grid.columns) + 0.5) * columns / grid.columns - 0.5, columns, wrap=True)
     return sparse.csr_array(sparse.kron(vertical, horizontal))

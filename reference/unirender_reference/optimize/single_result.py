@@ -3,7 +3,7 @@
 What was found on blocks of pixels is interpolated; a grey start, which has no detail, takes that of the picture. s and
 d are those of the light that was found: with shadows on a known mesh. A predicted s and d move towards them; without a
 mesh they change by the ratio of the two lights on the normals, since the prediction knows something of shadows. A
-predicted albedo keeps its mean in each channel, and the light makes up for it.
+predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it.
 """
 
 import numpy as np
@@ -48,6 +48,7 @@ def result(
         trust: what part of the changes of albedo and of a predicted light is kept.
     """
     picture, covered, size = fit.picture, mask > 0, mask.shape[:2]
+    grid = picture.transport.grid
 
     def wide(values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
         return enlarge(picture, values, size)
@@ -55,15 +56,15 @@ def result(
     change = np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo
     albedo = np.exp(np.log(maps["albedo"] + DARKEST) + trust.albedo * wide(change)) - DARKEST
     albedo = np.clip(albedo, 0, 1)
-    gauge = np.ones(3)
-    if init is not None:
-        gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
-        albedo = albedo / np.maximum(gauge, DARK)
-    elif picture.block > 1:
+    if init is None and picture.block > 1:
         albedo = albedo * _ratio(unpremultiply(image_linear, mask), _blurred(picture, image_linear, mask))
+    gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
+    if init is None:
+        gauge = np.full(3, gauge.mean())
+    albedo = albedo / np.maximum(gauge, DARK)
     light = fit.environment(at) * gauge
     if init is not None and init.environment is not None:
-        predicted = resample_environment(init.environment, picture.transport.shape).reshape(light.shape)
+        predicted = resample_environment(init.environment, (grid.rows, grid.columns)).reshape(light.shape)
         light = np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
     specular, diffuse = (wide(values) for values in light_buffers(fit, at, fit.environment(at) * gauge))
     if init is not None and init.specular is not None and init.diffuse is not None:
@@ -88,7 +89,7 @@ def result(
         "diffuse": diffuse,
     }
     found = {name: np.where(covered, values, 0).astype(np.float32) for name, values in found.items()}
-    environment = light.reshape(*picture.transport.shape, 3).astype(np.float32)
+    environment = grid.environment(light)
     return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
 
 
@@ -96,8 +97,8 @@ def light_buffers(
     fit: Fit, at: Unknowns, light: Float[np.ndarray, "j 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """s and d of the picture's pixels under a light, with the roughness of a point; not premultiplied."""
-    light = light.astype(np.float32)
-    return (fit.model(at).lobe @ light) / fit.picture.coverage, fit.picture.transport.white @ light
+    light, coverage = light.astype(np.float32), fit.picture.coverage
+    return (fit.model(at).lobes.gloss @ light) / coverage, (fit.picture.transport.white @ light) / coverage
 
 
 def enlarge(picture: Picture, values: Float[np.ndarray, "n c"], size: tuple[int, int]) -> Float[np.ndarray, "h w c"]:
@@ -105,7 +106,7 @@ def enlarge(picture: Picture, values: Float[np.ndarray, "n c"], size: tuple[int,
     import scipy.ndimage as ndimage
 
     known = np.zeros(picture.size[0] * picture.size[1], bool)
-    known[picture.transport.pixel] = True
+    known[picture.pixel] = True
     filled = picture.frame(values)[nearest(known.reshape(picture.size))]
     if picture.block == 1:
         return filled
@@ -125,7 +126,7 @@ def _blurred(
     """The picture as its blocks show it, straight."""
     coverage = shrink(mask, picture.block)
     blocks = unpremultiply(shrink(image_linear, picture.block), coverage)
-    return enlarge(picture, blocks.reshape(-1, 3)[picture.transport.pixel], mask.shape[:2])
+    return enlarge(picture, blocks.reshape(-1, 3)[picture.pixel], mask.shape[:2])
 
 
 def _ratio(new: Float[np.ndarray, "h w 3"], old: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -17,7 +17,9 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender_reference.optimize.inflate import silhouette_normals
-from unirender_reference.optimize.single_config import SingleConfig, fitted
+from unirender_reference.optimize.placement import check_in_picture
+from unirender_reference.optimize.single_config import COLD, SingleConfig, fitted
+from unirender_reference.optimize.single_exposure import exposed, exposure_of
 from unirender_reference.optimize.single_fit import Fit, Unknowns
 from unirender_reference.optimize.single_picture import Picture, make_picture
 from unirender_reference.optimize.single_result import result
@@ -25,7 +27,6 @@ from unirender_reference.optimize.single_search import anneal, descend
 from unirender_reference.optimize.views import Step
 from unirender_reference.shapes import MeshObject
 
-COLD = {"albedo": 0.3, "roughness": 0.5, "metallic": 0.5}
 LEAST_RADIANCE = 0.02  # of a predicted light: its logarithm is what changes
 
 OnStep = Callable[[Step], None]
@@ -46,24 +47,29 @@ def optimize_image(
     """Finds the maps and the light whose rendering is the picture.
 
     Args:
-        image: straight display values in [0, 1], as in a PNG with alpha; linear radiance in display units if `hdr`.
+        image: straight display values in [0, 1], as in a PNG with alpha; linear radiance of any scale if `hdr`.
         mask: coverage, [0, 1].
         camera: of the picture.
         config: priors, steps, sizes.
         normal: camera axes, unit; None: those of the mesh, of `init`, or of the inflated silhouette, in this order.
-        geometry: the object itself before the contract's camera: normals and shadows are taken from it.
+        geometry: the object itself before the contract's camera, under the mask: normals and shadows are taken from it.
         init: a prediction with albedo, roughness, metallic and environment, centre of the priors; None: grey, half
             metallic and half rough, under even light.
-        hdr: the picture is linear and no value is clipped.
+        hdr: the picture is linear and no value is clipped; the light that is found has its scale, as that of `init`.
         on_step: hears of every step.
 
     Returns:
         All maps, at the picture's size; the environment has `config.light_rows` rows.
 
     Raises:
-        UnirenderError: sizes differ, the mask is empty, values are out of range, or `init` lacks a map.
+        UnirenderError: sizes differ, the mask is empty, values are out of range, `init` lacks a map, or the mesh does
+            not lie under the mask.
     """
     linear = _checked(image, mask, hdr)
+    if geometry is not None:
+        check_in_picture(mask, camera, geometry)
+    exposure = exposure_of(linear, mask) if hdr else 1.0
+    linear, init = linear / np.float32(exposure), None if init is None else exposed(init, 1 / exposure)
     began, count = time.monotonic(), 0
 
     def report(values: dict[str, float]) -> None:
@@ -90,7 +96,7 @@ def optimize_image(
     material = at.metallic * trust.metallic, at.roughness * trust.roughness
     at = Unknowns(last.start().pixel, at.light, at.gain, *material)
     at = descend(last, at, config.fine_steps, ("metallic", "roughness"), report)
-    return result(last, at, linear, mask, camera, maps, init, geometry is not None, trust)
+    return exposed(result(last, at, linear, mask, camera, maps, init, geometry is not None, trust), exposure)
 
 
 def _checked(

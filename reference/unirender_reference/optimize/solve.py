@@ -2,7 +2,8 @@
 
     1. transport matrices of the pixels that the views show                                (`transport`)
     2. from several materials, on a coarse light: light and one material                   (`light_solve`)
-    3. the best of them on the full light; then, if asked for, materials of every patch    (`material_search`)
+    3. the best of them on the full light, and, where lobes are narrower than its cells, on a finer one; then, if asked
+       for, materials of every patch                                                       (`material_search`)
     4. the base-colour texture, by sparse least squares                                    (`textures`)
     5. a path-traced image of the estimate: what it has and the matrices lack (interreflection, fine light) is taken
        from the pictures, and light, materials and texture are solved for again
@@ -18,28 +19,27 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from unirender_reference.backend import mitsuba
-from unirender_reference.materials import principled_bsdf
-from unirender_reference.multiview import sensor_at
 from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.light_solve import LightPrior, Solved, solve_light
 from unirender_reference.optimize.material_search import search_materials
 from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe, patches
+from unirender_reference.optimize.refine_state import interpolated_light
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.surface_points import blocker, trace_points
-from unirender_reference.optimize.textures import fit_texels, footprint, spread
+from unirender_reference.optimize.solution_scene import solution_images
+from unirender_reference.optimize.surface_points import SurfacePoints, blocker, trace_points
+from unirender_reference.optimize.textures import best_smoothness, fit_texels, footprint, spread
 from unirender_reference.optimize.transport import light_transport, refined
 from unirender_reference.optimize.transport_config import TransportConfig
 from unirender_reference.optimize.views import Step, Views
-from unirender_reference.passes import Counters, derive_seed, mean_estimate, render_passes
-from unirender_reference.render import IMAGE_DEPTH
-from unirender_reference.scene import mesh_shape
+from unirender_reference.passes import derive_seed
 from unirender_reference.shapes import MeshObject
 
 GREY = 0.4
 STARTS = tuple(itertools.product((0.25, 0.7), (0.15, 0.85)))  # (roughness, metallic)
 POINTS = 16  # in a pixel
 LATER_ITERATIONS = 3  # after a correction
+FINE = LightGrid(32, 64)  # what mirrors need
+LEAST_SHARE = 1.5  # pixels for each of its texels
 
 OnStep = Callable[[Step], bool]
 
@@ -98,15 +98,21 @@ class _Work:
         self.views, self.obj, self.config, self.size, self.seed = views, obj, config, texture_size, seed
         self._on_step, self._began, self._steps = on_step, time.perf_counter(), 0
         self.prior = LightPrior(config.smooth_light, config.neutral_light)
-        scene = blocker(obj)
-        self.points = trace_points(scene, views.seen, POINTS, seed, config.pixels)
-        self.shown = self.points.of([views.linear(view) for view in views.seen])
-        coverage = self.points.of([view.mask for view in views.seen])[:, 0]
-        position = self.points.mean_position()
-        seen = observe(self.shown, coverage, patches(position, _footprint_edge(views)), display=not views.hdr)
-        transport = light_transport(scene, self.points, LightGrid(light_rows, 2 * light_rows), seed, coverage)
+        self.scene = blocker(obj)
+        self.grid = LightGrid(light_rows, 2 * light_rows)
+        self._look(trace_points(self.scene, views.seen, POINTS, seed, config.pixels))
+
+    def _look(self, points: SurfacePoints, fine: bool = False) -> None:
+        """What is known of some pixels: matrices and what they show."""
+        views = self.views
+        self.points, self.texels = points, footprint(points, self.size)
+        self.shown = points.of([views.linear(view) for view in views.seen])
+        coverage = points.of([view.mask for view in views.seen])[:, 0]
+        clipped = points.of([views.saturated(view) for view in views.seen])
+        seen = observe(self.shown, coverage, patches(points.mean_position(), _footprint_edge(views)), clipped)
+        samples = {"bilinear": True, "cell_samples": 1} if fine else {}
+        transport = light_transport(self.scene, points, self.grid, self.seed, coverage, **samples)
         self.fit = PixelFit(transport, seen, np.ones_like(self.shown), GREY)
-        self.texels = footprint(self.points, texture_size)
 
     def run(self) -> Solution:
         """The solution of all steps."""
@@ -141,7 +147,21 @@ class _Work:
             self._note(found[-1])
         best = min(found, key=lambda solved: solved.cost).appearance
         full = replace(best, light=refined(best.light, coarse.transport.grid))
-        return solve_light(self.fit, full, self.prior, self.config.iterations)
+        solved = solve_light(self.fit, full, self.prior, self.config.iterations)
+        narrow = solved.appearance.roughness[0] < self.config.fine_below and self.grid.rows < FINE.rows
+        enough = min(len(self.points), self.config.fine_pixels) >= LEAST_SHARE * FINE.count
+        return self._finer(solved.appearance) if narrow and enough else solved
+
+    def _finer(self, found: Appearance) -> Solved:
+        """A solution of one material, solved on for a finer light."""
+        light = interpolated_light(self.grid.environment(found.radiance), FINE.rows)
+        self.grid = FINE
+        self._look(self.points.some(self.config.fine_pixels, self.seed), fine=True)
+        start = Appearance(
+            np.log(light.reshape(-1, 3)),
+            *(np.full(len(self.points), values[0]) for values in (found.roughness, found.metallic)),
+        )
+        return solve_light(self.fit, start, self.prior, self.config.iterations)
 
     def _solution(self, solved: Solved) -> Solution:
         """Textures and light of an estimate."""
@@ -150,7 +170,9 @@ class _Work:
         start = spread(prediction.base, seen.coverage, self.texels)
         gain = prediction.gain / self.fit.pattern
         rest = prediction.radiance - prediction.base * gain
-        albedo = fit_texels(self.texels, gain, seen.radiance - rest, weight, start, self.config.smooth_albedo)
+        known = self.texels, gain, seen.radiance - rest, weight, start
+        smooth = self.config.smooth_albedo
+        albedo = fit_texels(*known, best_smoothness(*known, self.seed) if smooth is None else smooth)
         ones = np.ones((len(seen.patch), 1), np.float32)
         scalars = {}
         for name in ("roughness", "metallic"):
@@ -169,7 +191,7 @@ class _Work:
     def _rendered(self, solution: Solution, index: int) -> Float[np.ndarray, "n 3"]:
         """The pixels of a path-traced image of a solution."""
         spp, seed = self.config.correction_spp, derive_seed(self.seed, "correction", index)
-        return self.points.of(render_solution(solution, self.views, spp, seed))
+        return self.points.of(solution_images(solution, self.views.seen, spp, seed)[..., :3])
 
     def _note(self, solved: Solved) -> bool:
         self._steps += 1
@@ -180,23 +202,6 @@ class _Work:
             "metallic": float(appearance.metallic.mean()),
         }
         return self._on_step(Step("transport", self._steps, time.perf_counter() - self._began, values))
-
-
-def render_solution(solution: Solution, views: Views, spp: int, seed: int) -> list[Float[np.ndarray, "h w 3"]]:
-    """A solution as the seen views would show it: premultiplied linear radiance, path traced."""
-    mi = mitsuba()
-    obj = solution.obj
-    assert obj.roughness is not None  # every solution has both
-    assert obj.metallic is not None
-    bsdf = principled_bsdf(obj.albedo, obj.roughness, obj.metallic)
-    light = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))}
-    scene = mi.load_dict({"type": "scene", "light": light, "object": mesh_shape(obj, bsdf)})
-    images = []
-    for index, view in enumerate(views.seen):
-        sensor = mi.load_dict(sensor_at(view.pose, view.camera, views.height, views.width))
-        passes = render_passes(scene, IMAGE_DEPTH, spp, derive_seed(seed, index), 1, Counters(), sensor)
-        images.append(mean_estimate(*passes, 1).mean[..., :3])
-    return images
 
 
 def _brightness(views: Views) -> float:

@@ -134,7 +134,7 @@ def fingerprint(views: Views, *others: Solution | MeshObject | None) -> dict[str
     """Hashes of what a run is given: pictures with their cameras, mesh, start."""
     pictures = hashlib.sha256(repr((len(views.seen), views.hdr)).encode())
     for view in (*views.seen, *views.held_out):
-        _update(pictures, view.image, view.mask, view.pose)
+        _update(pictures, view.image, view.mask, view.pose, view.clipped)
         pictures.update(_camera(view).encode())
     found = {"pictures": pictures.hexdigest()}
     for label, other in zip(("mesh", "start"), others, strict=False):

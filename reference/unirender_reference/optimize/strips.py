@@ -8,33 +8,19 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
-from unirender.color import image_srgb, luminance, srgb_encode
+from unirender.color import image_srgb, luminance, srgb_decode
 from unirender.lighting import mean_radiance, resample_environment
 from unirender_reference.lights import bundled_light
 from unirender_reference.multiview import pose_towards
+from unirender_reference.optimize.losses import ImageLoss
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import View, Views
-from unirender_reference.passes import derive_seed
 from unirender_reference.sheets import LIGHT, environment_preview, table_sheet
 
 RELIT = ("blender-studio", "blender-sunset", "pmndrs-forest", "blender-night")
 TURNS, ELEVATION_DEG = 8, 15.0
 SHOWN_VIEWS, LEAST_SIDE = 8, 96
-LANES = 1 << 23  # samples of a launch
-
-
-def found_images(solution: Solution, views: Sequence[View], spp: int, seed: int = 0) -> Float[np.ndarray, "n h w 4"]:
-    """The solution from the cameras of some views: premultiplied linear RGBA, in launches of bounded size."""
-    pixels = views[0].mask.shape[0] * views[0].mask.shape[1]
-    passes = -(-pixels * spp // LANES)
-    together = max(1, LANES * passes // (pixels * spp))
-    maps, images = maps_of(solution), []
-    for start in range(0, len(views), together):
-        scene = TexturedScene(solution, views[start : start + together])
-        part = [scene.image(maps, -(-spp // passes), derive_seed(seed, start, k)) for k in range(passes)]
-        images.append(np.mean(part, axis=0, dtype=np.float32))
-    return np.concatenate(images)
 
 
 def views_strip(views: Views, found: Float[np.ndarray, "n h w 4"]) -> Image.Image:
@@ -72,7 +58,7 @@ def turntable(solution: Solution, side: int = 96, spp: int = 36) -> Image.Image:
     rows = []
     for light in lights.values():
         lit = dataclasses.replace(solution, environment=light.astype(np.float32))
-        images = found_images(lit, views, spp)
+        images = solution_images(lit, views, spp)
         preview = environment_preview(resample_environment(light, (side // 2, side)))
         rows.append([preview, *(_over(image[..., :3], image[..., 3:]) for image in images)])
     turns = [f"{360 * k // TURNS}°" for k in range(TURNS)]
@@ -96,17 +82,22 @@ def _enlarged(tile: Float[np.ndarray, "h w 3"], times: int) -> Float[np.ndarray,
 
 def _over(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
     """A premultiplied picture over the page: display values."""
-    page = float(LIGHT.background)
-    linear_page = ((page + 0.055) / 1.055) ** 2.4
-    return image_srgb(image_linear + (1 - mask) * linear_page)
+    page = srgb_decode(np.full((1, 1, 1), LIGHT.background, np.float32))
+    return image_srgb(image_linear + (1 - mask) * page)
 
 
-def psnr_db(views: Views, chosen: Sequence[View], found: Float[np.ndarray, "n h w 4"]) -> float:
-    """Of display values over covered pixels; of linear views, of what a display would show."""
-    total, weight = 0.0, 0.0
-    for view, image in zip(chosen, found, strict=True):
-        cover = np.maximum(view.mask, 1e-3)
-        given, shown = (srgb_encode(np.clip(x / cover, 0, 1)) for x in (views.linear(view), image[..., :3]))
-        total += float((((shown - given) ** 2) * view.mask).sum(dtype=np.float64))
-        weight += 3 * float(view.mask.sum())
-    return float(-10 * np.log10(max(total / max(weight, 1e-9), 1e-12)))
+def psnr_db(
+    views: Views,
+    chosen: Sequence[View],
+    found: Float[np.ndarray, "n h w 4"],
+    other: Float[np.ndarray, "n h w 4"] | None = None,
+) -> float:
+    """Of display values over covered pixels; of linear views, of what a display would show.
+
+    Args:
+        views: what the pictures belong to.
+        chosen: some of the views.
+        found: a picture for each of them.
+        other: the same with other samples: without the noise of both (`ImageLoss.psnr`).
+    """
+    return ImageLoss(views, chosen=tuple(chosen)).psnr(found[..., :3], None if other is None else other[..., :3])

@@ -1,18 +1,20 @@
-"""The surface points that the pixels of some views show: several in each pixel, with what shading needs."""
+"""The surface points that pixels show: several in each pixel, with what shading needs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
-from unirender_reference import materials
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.multiview import sensor_at
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
-from unirender_reference.scene import mesh_shape
+from unirender_reference.samplers import stratified_sampler
+from unirender_reference.scene import object_scene, sensor_at, sensor_dict
+from unirender_reference.shader import facing
 from unirender_reference.shapes import MeshObject
 
 
@@ -43,6 +45,13 @@ class SurfacePoints:
     def __len__(self) -> int:
         return len(self.view)
 
+    def some(self, most: int, seed: int) -> "SurfacePoints":
+        """At most so many of the pixels, drawn at random, in their order."""
+        if len(self) <= most:
+            return self
+        kept = np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False))
+        return SurfacePoints(*(getattr(self, field.name)[kept] for field in fields(self)))
+
     @property
     def coverage(self) -> Float[np.ndarray, " n"]:
         """Share of the points that hit."""
@@ -53,14 +62,16 @@ class SurfacePoints:
         total = np.where(self.hit[..., None], self.position, 0).sum(axis=1)
         return total / np.maximum(self.hit.sum(axis=1), 1)[:, None]
 
-    def of(self, pictures: Sequence[Float[np.ndarray, "h w c"]]) -> Float[np.ndarray, "n c"]:
+    def of(
+        self, pictures: Sequence[Shaped[np.ndarray, "h w c"]] | Shaped[np.ndarray, "v h w c"]
+    ) -> Shaped[np.ndarray, "n c"]:
         """The pixels' values in pictures of the views."""
         return np.stack([picture.reshape(-1, picture.shape[-1]) for picture in pictures])[self.view, self.pixel]
 
 
 def blocker(obj: MeshObject) -> Any:
     """A Mitsuba scene of the mesh alone, to trace rays in."""
-    return mitsuba().load_dict({"type": "scene", "object": mesh_shape(obj, materials.white_bsdf())})
+    return object_scene(obj)
 
 
 def trace_points(scene: Any, views: Sequence[View], samples: int, seed: int, most: int | None = None) -> SurfacePoints:
@@ -72,46 +83,102 @@ def trace_points(scene: Any, views: Sequence[View], samples: int, seed: int, mos
         samples: S, points per pixel, stratified; a number that makes a grid (4, 9, 16, ...).
         seed: of their positions in the pixels.
         most: keep a random choice of so many pixels; None: all.
+
+    Raises:
+        UnirenderError: no covered pixel shows the mesh.
     """
-    found = [
-        _trace(scene, view, index, samples, derive_seed(seed, "points", index)) for index, view in enumerate(views)
-    ]
+    found = []
+    for index, view in enumerate(views):
+        size = view.mask.shape[:2]
+        sensor = sensor_at(view.pose, view.camera, *size)
+        own = derive_seed(seed, "points", index)
+        pixel, *points = _trace(scene, sensor, view.mask, size, samples, own)
+        found.append((np.full(len(pixel), index), pixel, *points))
     columns = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+    if not len(columns[0]):
+        raise UnirenderError("geometry: the mesh is in no covered pixel; expected the object that the pictures show")
     if most is not None and len(columns[0]) > most:
         kept = np.sort(np.random.default_rng(seed).choice(len(columns[0]), most, replace=False))
         columns = [column[kept] for column in columns]
     return SurfacePoints(*columns)
 
 
-def _trace(scene: Any, view: View, index: int, samples: int, seed: int) -> tuple[np.ndarray, ...]:
-    """The fields of `SurfacePoints`, of one view."""
+def picture_points(
+    scene: Any,
+    mask: Float[np.ndarray, "h w 1"],
+    camera: Camera,
+    size: tuple[float, float],
+    samples: int,
+    seed: int = 0,
+) -> SurfacePoints:
+    """Points of the covered pixels of one picture from the contract's camera.
+
+    Args:
+        scene: of `blocker`, the object in the contract's place before the camera.
+        mask: coverage; a pixel of it may be a block of pixels of the picture.
+        camera: of the picture.
+        size: height and width of the picture in pixels of the mask; no integers where the last blocks stick out.
+        samples: S, as in `trace_points`.
+        seed: of the points' places within their pixels.
+
+    Raises:
+        UnirenderError: no covered pixel shows the mesh.
+    """
+    sensor = sensor_dict(camera, round(size[0] * 64), round(size[1] * 64))  # only their ratio counts
+    pixel, *points = _trace(scene, sensor, mask, size, samples, seed)
+    if not len(pixel):
+        raise UnirenderError("geometry: the mesh is in no covered pixel; expected the object that the picture shows")
+    return SurfacePoints(np.zeros_like(pixel), pixel, *points)
+
+
+def mapped_points(
+    mask: Float[np.ndarray, "h w 1"], normal: Float[np.ndarray, "h w 3"], view: Float[np.ndarray, "h w 3"]
+) -> SurfacePoints:
+    """One point for each covered pixel, with the pixel's normal and direction to the viewer, and no place.
+
+    Raises:
+        UnirenderError: no covered pixel has a normal.
+    """
+    mi = mitsuba()
+    inside = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
+    if not inside.any():
+        raise UnirenderError("normals: they are 0 wherever the mask covers a pixel; expected a normal for each of them")
+    columns = (mi.Vector3f(np.ascontiguousarray(x[inside].T, np.float32)) for x in (normal, view))
+    bent = np.array(facing(*columns)).T[:, None]
+    pixel, nowhere = np.flatnonzero(inside), np.zeros((len(bent), 1, 2), np.float32)
+    position, to_viewer = np.zeros_like(bent), view[inside][:, None].astype(np.float32)
+    hit = np.ones((len(bent), 1), bool)
+    return SurfacePoints(np.zeros_like(pixel), pixel, position, bent, bent, to_viewer, nowhere, hit)
+
+
+def _trace(
+    scene: Any,
+    sensor: dict[str, Any],
+    mask: Float[np.ndarray, "h w 1"],
+    size: tuple[float, float],
+    samples: int,
+    seed: int,
+) -> tuple[np.ndarray, ...]:
+    """The covered pixels that meet the object, and of their points the fields of `SurfacePoints` from `position` on."""
     import drjit as dr
 
     mi = mitsuba()
-    height, width = view.image.shape[:2]
-    sensor = mi.load_dict(sensor_at(view.pose, view.camera, height, width))
-    count = height * width * samples
-    pixel = dr.arange(mi.UInt32, count) // samples
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
-    sampler.set_samples_per_wavefront(samples)
-    sampler.seed(dr.opaque(mi.UInt32, seed), count)
+    width, covered = mask.shape[1], np.flatnonzero(mask[..., 0] > 0)
+    count = len(covered) * samples
+    pixel = dr.gather(mi.UInt32, mi.UInt32(covered.astype(np.uint32)), dr.arange(mi.UInt32, count) // samples)
+    sampler = stratified_sampler(samples, count, seed)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-    position = (corner + sampler.next_2d()) / mi.ScalarVector2f(width, height)
-    ray, _ = sensor.sample_ray_differential(0.0, 0.5, position, mi.Point2f(0.5))
+    position = (corner + sampler.next_2d()) / mi.Point2f(size[1], size[0])
+    ray, _ = mi.load_dict(sensor).sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
     point = scene.ray_intersect(ray)
     to_viewer = -ray.d
     normal = dr.select(dr.dot(point.sh_frame.n, to_viewer) < 0, -point.sh_frame.n, point.sh_frame.n)
     side = dr.select(dr.dot(point.n, to_viewer) < 0, -point.n, point.n)
     hit = np.array(point.is_valid()).reshape(-1, samples)
-    chosen = np.flatnonzero(hit.any(axis=1) & (view.mask.ravel() > 0))
+    chosen = hit.any(axis=1)
 
     def rows(vectors: Any) -> np.ndarray:
-        values = np.array(vectors).T.reshape(height * width, samples, -1)[chosen]
+        values = np.array(vectors).T.reshape(len(covered), samples, -1)[chosen]
         return np.where(hit[chosen][..., None], values, 0).astype(np.float32)
 
-    return (
-        np.full(len(chosen), index),
-        chosen,
-        *(rows(vectors) for vectors in (point.p, normal, side, to_viewer, point.uv)),
-        hit[chosen],
-    )
+    return (covered[chosen], *(rows(vectors) for vectors in (point.p, normal, side, to_viewer, point.uv)), hit[chosen])

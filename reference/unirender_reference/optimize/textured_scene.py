@@ -20,13 +20,12 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender_reference import materials
 from unirender_reference.backend import mitsuba
-from unirender_reference.multiview import sensor_at
 from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.solution_scene import solution_scene
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import NAN_ATTEMPTS, Counters, derive_seed, finite_pass
-from unirender_reference.scene import LIGHT, OBJECT, mesh_shape
+from unirender_reference.scene import LIGHT, parameter_name, sensor_at
 from unirender_reference.shader import MOST_METALLIC, gradient, tensors, wrapped
 
 Parameter = Literal["albedo", "roughness", "metallic", "environment", "vertices"]
@@ -63,15 +62,8 @@ class TexturedScene:
 
     def __init__(self, solution: Solution, views: Sequence[View], depth: int = 4) -> None:
         mi = mitsuba()
-        obj = solution.obj
         self.count, (self.height, self.width) = len(views), views[0].image.shape[:2]
-        first = maps_of(solution)
-        surface = materials.principled_bsdf(first["albedo"], first["roughness"], first["metallic"])
-        mesh = mesh_shape(obj, surface)
-        if obj.normal_map is not None:
-            mesh.set_bsdf(materials.with_normal_map(mesh.bsdf(), materials.normal_texture_of(obj.normal_map)))
-        light = mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))
-        self._scene = mi.load_dict({"type": "scene", LIGHT: {"type": "envmap", "bitmap": light}, OBJECT: mesh})
+        self._scene = solution_scene(solution)
         self._sensors = [sensor_at(view.pose, view.camera, self.height, self.width) for view in views]
         self._batch = mi.load_dict(batch_dict(self._sensors))
         self._hidden = {"max_depth": depth, "hide_emitters": True}
@@ -186,14 +178,6 @@ def batch_dict(sensors: Sequence[dict[str, Any]]) -> dict[str, Any]:
     film = {**sensors[0]["film"], "width": sensors[0]["film"]["width"] * len(sensors)}
     named = {f"view{index:05d}": sensor for index, sensor in enumerate(sensors)}
     return {"type": "batch", "film": film, "sampler": {"type": "multijitter"}, **named}
-
-
-def parameter_name(parameters: Any, suffix: str) -> str:
-    """The one parameter of a scene whose name ends in `suffix`."""
-    found = [key for key in parameters.keys() if key.endswith(suffix)]  # noqa: SIM118  (iterates over pairs)
-    if len(found) != 1:
-        raise UnirenderError(f"Mitsuba scene: {len(found)} parameters end in {suffix!r}; an untested Mitsuba version?")
-    return found[0]
 
 
 def pass_seed(seed: int, attempt: int) -> int:

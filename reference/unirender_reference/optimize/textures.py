@@ -9,9 +9,14 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
+from unirender_reference.optimize.differences import difference_matrix, side_by_side
+from unirender_reference.optimize.huber import huber_cost
 from unirender_reference.optimize.surface_points import SurfacePoints
+from unirender_reference.optimize.texels import texel_weights
 
 ITERATIONS = 60
+SMOOTHNESS = (8.0, 15.0, 30.0, 60.0, 120.0, 240.0)
+HELD_OUT = 0.15  # of the pixels
 TIE = 1e-2  # weight of the texels' start values: decides where nothing else does
 
 
@@ -21,28 +26,8 @@ def footprint(points: SurfacePoints, size: int) -> sp.csr_matrix:
     hit = points.hit.ravel()
     pixel = np.repeat(np.arange(count), samples)[hit]
     share = 1 / np.maximum(points.hit.sum(axis=1), 1)[pixel]
-    x, y = (points.uv.reshape(-1, 2)[hit] * size - 0.5).T
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    right, down = x - left, y - top
-    parts = [
-        (((top + dy) % size) * size + (left + dx) % size, wx * wy * share)
-        for dx, wx in ((0, 1 - right), (1, right))
-        for dy, wy in ((0, 1 - down), (1, down))
-    ]
-    texels, weights = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return sp.csr_matrix((weights.astype(np.float32), (np.tile(pixel, 4), texels)), shape=(count, size**2))
-
-
-def differences(size: int) -> sp.csr_matrix:
-    """G: of texels beside and below each other."""
-    index = np.arange(size**2).reshape(size, size)
-    first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
-    second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
-    line, ones = np.arange(len(first)), np.ones(len(first), np.float32)
-    return sp.csr_matrix(
-        (np.concatenate([ones, -ones]), (np.concatenate([line, line]), np.concatenate([first, second]))),
-        shape=(len(first), size**2),
-    )
+    entries = sp.csr_matrix((share, (pixel, np.arange(len(pixel)))), shape=(count, len(pixel)))
+    return sp.csr_matrix(entries @ texel_weights(points.uv.reshape(-1, 2)[hit], size), dtype=np.float32)
 
 
 def spread(
@@ -53,6 +38,31 @@ def spread(
     total = np.asarray(seen.T @ (values * weight[:, None]))
     middle = (values * weight[:, None]).sum(axis=0) / max(float(weight.sum()), 1e-12)
     return np.where(amount[:, None] > 0, total / np.maximum(amount, 1e-12)[:, None], middle)
+
+
+def best_smoothness(
+    seen: sp.csr_matrix,
+    gain: Float[np.ndarray, "n c"],
+    target: Float[np.ndarray, "n c"],
+    weight: Float[np.ndarray, "n c"],
+    start: Float[np.ndarray, "t c"],
+    seed: int = 0,
+) -> float:
+    """Of `SMOOTHNESS`, the first under which pixels that are held out are explained better than under the next one.
+
+    The error of a texel that several views show has two parts, its own (wrong light, noise) and blur; how they compare
+    depends on the object. Arguments as those of `fit_texels`.
+    """
+    held = np.random.default_rng(seed).random(len(target)) < HELD_OUT
+    best, least = SMOOTHNESS[0], np.inf
+    for smooth in SMOOTHNESS:
+        texels = fit_texels(seen[~held], gain[~held], target[~held], weight[~held], start, smooth)
+        residual = weight[held] * (gain[held] * (seen[held] @ texels) - target[held])
+        cost = float(huber_cost(np.abs(residual)).sum())
+        if cost >= least:
+            break
+        best, least = smooth, cost
+    return best
 
 
 def fit_texels(
@@ -71,7 +81,9 @@ def fit_texels(
         start: decides by `TIE` what the pixels leave open.
     """
     count = len(start)
-    smoothness, tie = smooth * differences(round(count**0.5)), TIE * sp.identity(count)
+    side = round(count**0.5)
+    smoothness = smooth * difference_matrix(side_by_side(np.arange(count).reshape(side, side)), count)
+    tie = TIE * sp.identity(count)
     texels = np.empty(start.shape, np.float32)
     for c in range(start.shape[1]):
         system = sp.vstack([sp.diags(weight[:, c] * gain[:, c]) @ seen, smoothness, tie]).tocsr()

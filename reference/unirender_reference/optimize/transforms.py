@@ -23,7 +23,8 @@ from unirender.errors import UnirenderError
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp")  # tried where a path of a picture has none
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-ASPECT_TOLERANCE = 0.01
+ASPECT_TOLERANCE = 0.01  # of the proportions: whole pixels
+FOCAL_TOLERANCE = 0.002  # of fl_x and fl_y: less than a pixel at the edge of 800
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Frame:
         if "fl_x" in self.values or "fl_y" in self.values:
             focal_y = self._number("fl_y", self._number("fl_x", 0.0))
             focal_x = self._number("fl_x", focal_y)
-            if focal_y <= 0 or abs(focal_x / focal_y - 1) > ASPECT_TOLERANCE:
+            if focal_y <= 0 or abs(focal_x / focal_y - 1) > FOCAL_TOLERANCE:
                 raise UnirenderError(
                     f"{self.name}: fl_x {focal_x:g} and fl_y {focal_y:g}, expected one positive focal length (square "
                     "pixels); resample the picture"

@@ -3,6 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference.optimize.option_checks import require_least
+
+LEAST_PIXELS = 16
+
 
 @dataclass(frozen=True)
 class TransportConfig:
@@ -14,6 +19,10 @@ class TransportConfig:
     """One roughness and metallic for the object, or maps of them, where the pictures speak for more than one."""
     pixels: int = 9000
     """At most so many pixels of all views, drawn at random; memory and time grow with it."""
+    fine_below: float = 0.25
+    """Below this roughness the light is solved for on 32 x 64 texels, if the views have pixels enough for it."""
+    fine_pixels: int = 6000
+    """At most so many of the pixels then."""
     iterations: int = 6
     """Steps of Levenberg-Marquardt, at most: of each start on a coarse light, and of the best one on the full light."""
     rounds: int = 2
@@ -24,5 +33,21 @@ class TransportConfig:
     """Weight of the light's smoothness in log space."""
     neutral_light: float = 1.0
     """Weight of the light's neutral colour in log space."""
-    smooth_albedo: float = 15.0
-    """Weight of differences between neighbouring texels of the base colour."""
+    smooth_albedo: float | None = None
+    """Weight of differences between neighbouring texels of the base colour; None: by pixels that are held out."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
+
+        counts = {"pixels": LEAST_PIXELS, "fine_pixels": LEAST_PIXELS, "iterations": 0, "rounds": 0}
+        weights = {"fine_below": 0, "smooth_light": 0, "neutral_light": 0, "smooth_albedo": 0}
+        require_least(self, "transport", counts | weights)
+        try:
+            pass_count(self.correction_spp, 1, SAMPLES_PER_PASS)
+        except UnirenderError as error:
+            raise UsageError(f"--transport.correction-spp {self.correction_spp}: {error}") from error

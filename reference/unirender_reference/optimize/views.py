@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
@@ -11,6 +11,7 @@ from unirender.errors import UnirenderError
 
 ROTATION_TOLERANCE = 1e-3
 RANGE_TOLERANCE = 1e-3
+SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class View:
         camera: vertical field of view and principal point.
         pose: (4, 4) camera to world: columns are the camera's right, up, towards the viewer, and its position.
         name: for messages and files.
+        clipped: (h, w, 3) where a display value is only a lower bound; None: where it is 1. (Of a picture that was
+            reduced: where any of the values was that a pixel is the mean of.)
     """
 
     image: Float[np.ndarray, "h w 3"]
@@ -31,6 +34,7 @@ class View:
     camera: Camera
     pose: Float[np.ndarray, "4 4"]
     name: str = "view"
+    clipped: Bool[np.ndarray, "h w 3"] | None = None
 
     def __post_init__(self) -> None:
         for label in ("image", "mask", "pose"):
@@ -40,6 +44,8 @@ class View:
             raise UnirenderError(
                 f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
             )
+        if self.clipped is not None and self.clipped.shape != self.image.shape:
+            raise UnirenderError(f"{self.name}: got clipped {self.clipped.shape}, expected {self.image.shape}")
         if not np.isfinite(self.image).all() or self.image.min() < 0:
             raise UnirenderError(f"{self.name}: the image has negative, infinite or NaN values; expected values >= 0")
         if not (self.mask.min() >= 0 and self.mask.max() <= 1):
@@ -90,6 +96,12 @@ class Views:
     @property
     def width(self) -> int:
         return self.seen[0].image.shape[1]
+
+    def saturated(self, view: View) -> Bool[np.ndarray, "h w 3"]:
+        """Where the radiance may be more than the picture shows."""
+        if self.hdr:
+            return np.zeros(view.image.shape, bool)
+        return view.image >= SATURATED if view.clipped is None else view.clipped
 
     def linear(self, view: View) -> Float[np.ndarray, "h w 3"]:
         """The picture as premultiplied linear radiance; display values of 1 may stand for more."""

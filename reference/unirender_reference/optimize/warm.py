@@ -10,19 +10,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import ndimage
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment, rotate_environment
 from unirender_reference.backend import mitsuba
-from unirender_reference.materials import white_bsdf
-from unirender_reference.multiview import sensor_at
 from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.texels import texel_weights
 from unirender_reference.optimize.uv import charted
 from unirender_reference.optimize.views import View, Views
-from unirender_reference.scene import mesh_shape
+from unirender_reference.scene import object_scene, sensor_at
 from unirender_reference.shapes import MeshObject
 
 LEAST_RADIANCE = 1e-4  # of the start's light: logarithms of it are refined
@@ -49,13 +48,16 @@ def solution_from_predictions(
     total = np.zeros((texture_size * texture_size, 5))
     weight = np.zeros(texture_size * texture_size)
     light = np.zeros((light_rows, 2 * light_rows, 3))
-    scene = mitsuba().load_dict({"type": "scene", "object": mesh_shape(obj, white_bsdf())})
+    scene = object_scene(obj)
     for view, prediction in zip(views.seen, predictions, strict=True):
         maps = prediction.require("albedo", "roughness", "metallic", "environment")
         uv, cosine = _seen(scene, view)
         values = np.concatenate([maps[name] for name in ("albedo", "roughness", "metallic")], axis=-1)
         keep = cosine > 0
-        _splat(total, weight, uv[keep], values[keep], (cosine * view.mask[..., 0])[keep], texture_size)
+        importance = (cosine * view.mask[..., 0])[keep]
+        texels = texel_weights(uv[keep], texture_size).T
+        weight += texels @ importance
+        total += texels @ (importance[:, None] * values[keep])
         turned = rotate_environment(maps["environment"], view.pose[:3, :3])
         light += resample_environment(turned, (light_rows, 2 * light_rows)) / len(views.seen)
     if not weight.any():
@@ -86,23 +88,3 @@ def _seen(scene: Any, view: View) -> tuple[Float[np.ndarray, "h w 2"], Float[np.
     uv = np.stack([np.array(hit.uv.x), np.array(hit.uv.y)], axis=-1).reshape(height, width, 2)
     cosine = np.where(np.array(hit.is_valid()), np.abs(np.array(hit.wi.z)), 0).reshape(height, width)
     return uv, cosine
-
-
-def _splat(
-    total: Float[np.ndarray, "t 5"],
-    weight: Float[np.ndarray, " t"],
-    uv: Float[np.ndarray, "n 2"],
-    values: Float[np.ndarray, "n 5"],
-    importance: Float[np.ndarray, " n"],
-    size: int,
-) -> None:
-    """Adds values to the four texels around each place, by the transpose of a bilinear lookup."""
-    place = uv * size - 0.5
-    low = np.floor(place).astype(int)
-    share = place - low
-    for down in (0, 1):
-        for right in (0, 1):
-            part = np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1]) * importance
-            texel: Int[np.ndarray, " n"] = (low[:, 1] + down) % size * size + (low[:, 0] + right) % size
-            np.add.at(weight, texel, part)
-            np.add.at(total, texel, part[:, None] * values)

@@ -3,19 +3,22 @@
 import numpy as np
 import pytest
 
-from unirender_reference.optimize.descent import BETA_1, BETA_2, PyramidAdam, interpolation
+from unirender_reference.optimize.descent import BETA_1, PyramidAdam, interpolation
 
 
-def test_one_level_is_adam() -> None:
+@pytest.mark.parametrize("beta_2", [0.99, 0.999])
+def test_one_level_is_adam(beta_2: float) -> None:
     rng, rate = np.random.default_rng(0), 0.1
     gradients = rng.normal(size=(5, 3, 4, 2))
-    adam = PyramidAdam((3, 4, 2))
+    adam = PyramidAdam((3, 4, 2), beta_2=beta_2)
     first = second = expected = np.zeros((3, 4, 2))
     for count, gradient in enumerate(gradients, start=1):
         first = BETA_1 * first + (1 - BETA_1) * gradient
-        second = BETA_2 * second + (1 - BETA_2) * gradient**2
-        expected = -rate * (first / (1 - BETA_1**count)) / np.sqrt(second / (1 - BETA_2**count))
+        second = beta_2 * second + (1 - beta_2) * gradient**2
+        expected = -rate * (first / (1 - BETA_1**count)) / np.sqrt(second / (1 - beta_2**count))
         np.testing.assert_allclose(adam.step(gradient, rate), expected, rtol=1e-5)
+    other = PyramidAdam((3, 4, 2), beta_2=1.989 - beta_2)
+    assert not np.allclose([other.step(gradient, rate) for gradient in gradients][-1], expected, rtol=1e-3)
     assert not np.allclose(PyramidAdam((3, 4, 2), uniform=True).step(gradients[0], rate), expected, rtol=0.1)
 
 

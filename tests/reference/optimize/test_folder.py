@@ -1,6 +1,8 @@
 """Folders of posed pictures: round trips, the dialects of transforms.json, and one sentence for each bad folder."""
 
+import dataclasses
 import json
+import logging
 import math
 import shutil
 from collections.abc import Callable
@@ -11,11 +13,14 @@ import pytest
 from PIL import Image
 from posed_views import painted_view, painted_views
 
+from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender_reference.optimize.folder import read_views, reduced, write_views
-from unirender_reference.optimize.views import Views
+from unirender_reference.optimize.losses import ImageLoss
+from unirender_reference.optimize.state import fingerprint
+from unirender_reference.optimize.views import View, Views
 
 
 def same_views(a: Views, b: Views, tolerance: float) -> None:
@@ -147,6 +152,42 @@ def test_reduced_pictures_keep_light_and_rays():
     assert abs((srgb_decode(twin.image) * twin.mask).mean() / light - 1) > 0.05
 
 
+def test_a_mean_with_a_clipped_value_is_a_lower_bound():
+    """The reduced picture is far below 1 there, and says that it may be more."""
+    image, mask = np.full((8, 8, 3), 0.5, np.float32), np.ones((8, 8, 1), np.float32)
+    image[2, 2], image[4:6, 4:6], image[0, 7] = (1, 0.5, 0.5), 1, 1
+    mask[0, 7] = 0
+    small = reduced(View(image, mask, Camera(), np.eye(4), "one"), 4, linear=False)
+    expected = np.zeros((4, 4, 3), bool)
+    expected[1, 1, 0], expected[2, 2] = True, True
+    assert small.image[1, 1, 0] < 0.75
+    views = Views((small,))
+    np.testing.assert_array_equal(views.saturated(small), expected)
+    loss = ImageLoss(views)
+    brighter = loss.target.copy()
+    brighter[0, 1, 1, 0] += 0.2
+    assert loss(brighter)[0] == 0
+    brighter[0, 1, 1, 1] += 0.2
+    assert loss(brighter)[0] > 0
+    again = reduced(small, 2, linear=False)
+    np.testing.assert_array_equal(Views((again,)).saturated(again), expected.reshape(2, 2, 2, 2, 3).any((1, 3)))
+    assert fingerprint(views) != fingerprint(Views((dataclasses.replace(small, clipped=None),)))
+
+
+def test_black_pictures_and_one_picture_twice_are_noticed(folder: Path, caplog: pytest.LogCaptureFixture):
+    with caplog.at_level(logging.WARNING, "unirender"):
+        read_views(folder)
+        assert not caplog.text
+        pixels = np.asarray(Image.open(folder / "images/0001.png")).copy()
+        pixels[..., :3] = 0
+        Image.fromarray(pixels).save(folder / "images/0001.png")
+        shutil.copy(folder / "images/0000.png", folder / "images/0002.png")
+        read_views(edited(folder, lambda content: content["frames"].append(content["frames"][3])))
+    assert "images/0001.png is black wherever its mask covers it" in caplog.text
+    assert "images/0000.png and images/0002.png are the same picture" in caplog.text
+    assert "images/0003.png and images/0003.png are the same picture" in caplog.text
+
+
 def broken(change: Callable[[dict], object]) -> Callable[[Path], object]:
     return lambda folder: edited(folder, change)
 
@@ -225,6 +266,7 @@ BAD = {
     "focal 0": (first(fl_x=0, fl_y=0), "expected one positive focal length"),
     "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
     "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
+    "slightly oblong pixels": (first(fl_x=40.0, fl_y=39.8), "square pixels"),
     "distortion": (first(k1=0.1), r"distorted \(k1 not 0\)"),
     "fisheye": (first(camera_model="OPENCV_FISHEYE"), "expected a pinhole"),
     "proportions": (broken(lambda content: content.update(w=100, h=100)), "expected the same proportions"),

@@ -71,3 +71,15 @@ def test_differences_vanish_for_a_constant_light_only() -> None:
 def test_too_small_grids_are_refused() -> None:
     with pytest.raises(UnirenderError, match="at least 4 x 4"):
         LightGrid(3, 8)
+
+
+def test_smoothness_does_not_know_up_from_down() -> None:
+    """Bright rows at the nadir cost what they cost at the zenith."""
+    light = np.zeros((GRID.rows, GRID.columns))
+    light[:3] = 1
+
+    def cost(cells: np.ndarray) -> float:
+        return float(((GRID.differences @ cells.ravel()) ** 2).sum())
+
+    assert cost(light) == pytest.approx(cost(light[::-1]), rel=1e-9)
+    assert cost(light) != pytest.approx(cost(np.roll(light, 2, axis=0)), rel=1e-2)

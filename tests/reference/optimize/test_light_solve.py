@@ -24,7 +24,7 @@ def made(points: SurfacePoints, fit: PixelFit, base: np.ndarray, truth: Appearan
     mixed = fit.mixed(truth)
     radiance = base * (mixed.u @ truth.radiance) + mixed.v @ truth.radiance
     radiance = np.minimum(radiance, 1)
-    seen = observe(radiance, np.ones(len(points)), fit.seen.patch, display=True)
+    seen = observe(radiance, np.ones(len(points)), fit.seen.patch, radiance >= 1 - 1e-3)
     return replace(fit, seen=seen)
 
 
@@ -45,7 +45,9 @@ def problem():
     position = points.mean_position()
     patch = patches(position, 0.12)
     blank = np.zeros((len(points), 3), np.float32)
-    fit = PixelFit(transport, observe(blank, np.ones(len(points)), patch, True), np.ones_like(blank), 0.4)
+    fit = PixelFit(
+        transport, observe(blank, np.ones(len(points)), patch, np.zeros(blank.shape, bool)), np.ones_like(blank), 0.4
+    )
     middle = fit.seen.sums @ position[:, 1] / (fit.seen.sums @ np.ones(len(points), np.float32))
     base = np.where(middle[patch][:, None] > 0, [[0.6, 0.2, 0.1]], [[0.1, 0.3, 0.5]]).astype(np.float32)
     count = len(points)

@@ -3,10 +3,12 @@
 import dataclasses
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import tyro
 from optimizer_runs import rendered_views, truth
 from PIL import Image
@@ -69,6 +71,7 @@ def test_a_folder_with_its_mesh(data: Path, solution: Solution, tmp_path: Path, 
     }
     record = json.loads((out / "solution.json").read_text())
     assert record["views"] == {"seen": 6, "held_out": 1, "hdr": False}
+    assert f"IoU of the masks: {record['mask_iou']:.3f}" in said
     assert record["config"]["refine"]["iterations"] == 2
     assert [row["stage"] for row in record["stages"]] == ["refine"]
     obj, place = load_mesh_placed(out / "mesh.glb")
@@ -87,7 +90,7 @@ def test_a_folder_without_a_mesh(data: Path, solution: Solution, tmp_path: Path)
     """The reconstruction stands where the object stood, in the units of the poses."""
     out = tmp_path / "out"
     quick = [*QUICK, "--shape.cells", "24", "--shape.mask-steps", "2", "--shape.image-steps", "1", "--no-pictures"]
-    assert command(data / "views", "--out", out, *quick).run() == 0
+    assert command(data / "views", "--out", out, "--shape-rounds", "1", *quick).run() == 0
     record = json.loads((out / "solution.json").read_text())
     assert [row["stage"] for row in record["stages"]] == ["shape", "refine", "reshape-1", "refine-1"]
     obj, place = load_mesh_placed(out / "mesh.glb")
@@ -125,8 +128,35 @@ def test_a_warm_start_takes_the_place_of_the_transport(data: Path, tmp_path: Pat
 
 def test_a_mesh_in_other_units_is_refused(data: Path, solution: Solution, tmp_path: Path):
     write_solution(solution, tmp_path, Sphere(np.zeros(3), 1.0))
-    with pytest.raises(UnirenderError, match="are its units and axes those of the poses"):
+    with pytest.raises(UnirenderError, match=r"IoU .* do its units and axes, and the masks, belong to the poses"):
         command(data / "views", "--mesh", tmp_path / "mesh.glb", "--out", tmp_path / "out", *QUICK).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_that_the_picture_does_not_show_is_refused(solution: Solution, tmp_path: Path):
+    view = rendered_views(solution, 1, 0, 24).seen[0]
+    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+    write_png(tmp_path / "open.png", view.image)
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.obj")
+    write_solution(solution, tmp_path)
+    for picture, mesh in (("one.png", "cube.obj"), ("open.png", "mesh.glb")):
+        with pytest.raises(UnirenderError, match=r"IoU .* do --fov and --mask .* belong to the picture"):
+            command(tmp_path / picture, "--mesh", tmp_path / mesh, "--out", tmp_path / "out").run()
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("mesh", [True, False])
+def test_poses_in_other_axes_leave_nothing_behind(data: Path, tmp_path: Path, mesh: bool):
+    """As OpenCV and COLMAP write them."""
+    shutil.copytree(data / "views", tmp_path / "views")
+    path = tmp_path / "views/transforms.json"
+    content = json.loads(path.read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
+    path.write_text(json.dumps(content))
+    given = ["--mesh", data / "mesh.glb"] if mesh else []
+    with pytest.raises(UnirenderError, match="negate columns 2 and 3"):
+        command(tmp_path / "views", *given, "--out", tmp_path / "out", *QUICK).run()
     assert not (tmp_path / "out").exists()
 
 
@@ -151,6 +181,25 @@ def test_linear_pictures_are_not_for_the_model(solution: Solution, data: Path, t
         (["--threads", "-1"], "--threads -1"),
         (["--texture-size", "2"], "--texture-size 2: expected 4 or more"),
         (["--light-rows", "9"], "--light-rows 9: expected an even number"),
+        (["--single.seed", "3", "--single.light-rows", "8"], "--single.light-rows, --single.seed: of one picture"),
+        *((["--fov", degrees], f"--fov {degrees}: expected degrees between 0 and 180") for degrees in ("0", "200")),
+        *(
+            ([f"--{name}", value], f"--{name} {value}: expected {expected}")
+            for name, value, expected in (
+                ("refine.iterations", "-3", "0 or more"),
+                ("refine.spp", "0", "1 or more"),
+                ("refine.depth", "0", "2 or more"),
+                ("refine.albedo-levels", "0", "1 or more"),
+                ("refine.held-out-every", "-1", "0 or more"),
+                ("refine.decay", "-1", "more than 0"),
+                ("refine.light-rate", "nan", "0 or more"),
+                ("refine.light-rows", "2", "4 or more"),
+                ("transport.pixels", "0", "16 or more"),
+                ("transport.smooth-light", "-1", "0 or more"),
+            )
+        ),
+        (["--transport.correction-spp", "0"], "--transport.correction-spp 0: spp: got 0 in 1 batches"),
+        (["--transport.correction-spp", "257"], "--transport.correction-spp 257: .* use 256"),
     ],
 )
 def test_wrong_command_lines_of_a_folder(data: Path, tmp_path: Path, arguments: list[str], message: str):
@@ -161,11 +210,16 @@ def test_wrong_command_lines_of_a_folder(data: Path, tmp_path: Path, arguments: 
 
 def test_wrong_command_lines_of_a_picture(tmp_path: Path):
     write_png(tmp_path / "one.png", np.ones((12, 12, 4)))
-    for arguments, message in ((["--up", "z"], "--up: of a folder"), (["--hold-out", "3"], "--hold-out: of a folder")):
+    for arguments, message in (
+        (["--up", "z"], "--up: of a folder"),
+        (["--hold-out", "3"], "--hold-out: of a folder"),
+        (["--seed", "7", "--refine.iterations", "9"], "--refine.iterations, --seed: of a folder"),
+        (["--shape.cells", "9", "--no-pictures"], "--pictures, --shape.cells: of a folder"),
+    ):
         with pytest.raises(UsageError, match=message):
             command(tmp_path / "one.png", "--out", tmp_path / "out", *arguments).run()
     with pytest.raises(UnirenderError, match="no such file or folder"):
-        command(tmp_path / "two.png", "--out", tmp_path / "out").run()
+        command(tmp_path / "two", "--up", "z", "--out", tmp_path / "out").run()
 
 
 def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):

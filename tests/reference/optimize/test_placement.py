@@ -1,7 +1,7 @@
 """Where the object stands: by mesh, by masks; its texture coordinates; predictions laid on it."""
 
 import dataclasses
-import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,7 +13,9 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender_reference.multiview import orbit, pose_towards
-from unirender_reference.optimize.placement import check_alignment, placed, project, sphere_of_masks
+from unirender_reference.optimize.placement import check_alignment, check_in_picture, placed, sphere_of_masks
+from unirender_reference.optimize.shape.cameras import Cameras
+from unirender_reference.optimize.shape.hull import visual_hull
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.uv import charted, has_own_texels
 from unirender_reference.optimize.views import View, Views
@@ -60,31 +62,110 @@ def test_cameras_on_one_side_do_not_tell_the_size(views: Views):
         sphere_of_masks(alone)
 
 
-def test_projection_is_that_of_the_rays():
-    camera = Camera(40.0, (0.45, 0.6))
-    view = View(np.zeros((20, 30, 3)), np.zeros((20, 30, 1)), camera, pose_towards(40, 20, camera))
-    rays = camera.rays(20, 30) @ view.pose[:3, :3].T
-    points = (view.pose[:3, 3] + 2.5 * rays).reshape(-1, 3)
-    row, column = np.indices((20, 30)).reshape(2, -1) + 0.5
-    found = project(view, points)
-    np.testing.assert_allclose(found[:, 0], column, atol=1e-3)
-    np.testing.assert_allclose(found[:, 1], row, atol=1e-3)
-    assert (found[:, 2] > 0).all()
+def turned(obj: MeshObject, axis: int, quarters: int) -> MeshObject:
+    """The mesh, turned about a coordinate axis."""
+    turn = np.eye(3)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    cosine, sine = [(0, 1), (-1, 0), (0, -1)][quarters - 1]
+    turn[[first, first, second, second], [first, second, first, second]] = cosine, -sine, sine, cosine
+    return dataclasses.replace(
+        obj,
+        vertices=(obj.vertices @ turn.T).astype(np.float32),
+        normals=(obj.normals @ turn.T).astype(np.float32),
+    )
+
+
+def with_masks(views: Views, change: Callable[[np.ndarray], np.ndarray]) -> Views:
+    seen = tuple(dataclasses.replace(view, mask=change(view.mask)) for view in views.seen)
+    return dataclasses.replace(views, seen=seen)
+
+
+def from_opencv(views: Views) -> Views:
+    """The poses as OpenCV writes them: +y down, +z forward."""
+    flip = np.diag([1, -1, -1, 1]).astype(np.float32)
+    return dataclasses.replace(
+        views, seen=tuple(dataclasses.replace(view, pose=view.pose @ flip) for view in views.seen)
+    )
 
 
 def test_a_mesh_that_lies_elsewhere_is_refused(views: Views, solution: Solution):
     check_alignment(views, solution.obj)
     for place in (Sphere(np.array([1.5, 0, 0]), 1.0), Sphere(np.zeros(3), 0.4), Sphere(np.zeros(3), 2.0)):
-        with pytest.raises(UnirenderError, match="of its vertices lie inside the masks"):
+        with pytest.raises(UnirenderError, match="IoU"):
             check_alignment(placed(views, place), solution.obj)
 
 
-def test_a_close_up_that_cuts_the_object_off_is_no_reason(views: Views, solution: Solution):
-    def close_up(view: View) -> View:
-        half = math.degrees(2 * math.atan(math.tan(math.radians(view.camera.fov_deg / 2)) / 2))
-        return View(view.image[8:24, 8:24], view.mask[8:24, 8:24], Camera(half), view.pose, view.name)
+@pytest.mark.parametrize("side", [24, 64])
+def test_a_mesh_in_other_axes_is_refused(side: int):
+    """Turned by quarters about each axis, at any size (an object that is nearly round about an axis is not)."""
+    solution = truth(5)
+    views = rendered_views(solution, seen=6, held_out=0, side=side)
+    check_alignment(views, solution.obj)
+    for axis in (0, 1, 2):
+        for quarters in (1, 2, 3):
+            with pytest.raises(UnirenderError, match=r"IoU .* 0\.\d\d, expected at least 0\.\d\d; try --up z"):
+                check_alignment(views, turned(solution.obj, axis, quarters))
 
-    check_alignment(Views(tuple(map(close_up, views.seen))), solution.obj)
+
+@pytest.mark.parametrize("change", ["rounded", "grown", "shrunk", "shifted"])
+def test_a_mesh_passes_with_masks_that_are_slightly_wrong(solution: Solution, change: str):
+    """By half a pixel, in pictures of 24 pixels; by two pixels it does not."""
+    views = rendered_views(solution, seen=6, held_out=0, side=24)
+    wrong = {
+        "rounded": lambda mask: np.round(mask),
+        "grown": lambda mask: np.ceil(mask),
+        "shrunk": lambda mask: np.floor(mask + 1e-3),
+        "shifted": lambda mask: (mask + np.roll(mask, 1, axis=1)) / 2,
+    }
+    check_alignment(with_masks(views, wrong[change]), solution.obj)
+    with pytest.raises(UnirenderError, match="IoU"):
+        check_alignment(with_masks(views, lambda mask: np.roll(mask, 2, axis=1)), solution.obj)
+
+
+def test_poses_in_the_axes_of_opencv_are_named(views: Views, solution: Solution):
+    with pytest.raises(UnirenderError, match=r"6 of 6 cameras look away from it: .*negate columns 2 and 3"):
+        check_alignment(from_opencv(views), solution.obj)
+    with pytest.raises(UnirenderError, match=r"behind 6 of 6 cameras .*negate columns 2 and 3"):
+        sphere_of_masks(from_opencv(views))
+    with pytest.raises(UnirenderError, match="no point of the unit sphere lies inside all 6 masks"):
+        visual_hull(np.stack([view.mask[..., 0] for view in views.seen]), Cameras(from_opencv(views).seen), 16)
+
+
+def test_a_view_without_the_object_does_not_move_its_place(views: Views):
+    """Neither an empty mask nor a faint one; the other views say the same as without it."""
+    rest = dataclasses.replace(views, seen=views.seen[1:])
+    for share in (0.0, 0.4):
+        blank = dataclasses.replace(views.seen[0], mask=views.seen[0].mask * share)
+        found = sphere_of_masks(dataclasses.replace(views, seen=(blank, *rest.seen)))
+        np.testing.assert_allclose(found.center, sphere_of_masks(rest).center, atol=1e-9)
+        assert found.radius == pytest.approx(sphere_of_masks(rest).radius)
+
+
+def test_masks_without_an_outline_are_refused(views: Views, solution: Solution):
+    opaque = with_masks(views, np.ones_like)
+    for look in (sphere_of_masks, lambda given: check_alignment(given, solution.obj)):
+        with pytest.raises(UnirenderError, match=r"covers the whole frame in 6 pictures .*view 0.*, .*mask_path"):
+            look(opaque)
+
+
+def test_a_close_up_that_cuts_the_object_off_needs_its_mesh(views: Views, solution: Solution):
+    def cut(view: View) -> View:
+        camera = dataclasses.replace(view.camera, principal=(16 / 20, 0.5))
+        return View(view.image[:, :20], view.mask[:, :20], camera, view.pose, view.name)
+
+    near = Views(tuple(map(cut, views.seen)))
+    check_alignment(near, solution.obj)
+    with pytest.raises(UnirenderError, match=r"cuts the object off in 6 of 6 pictures .*view 0.* pass --mesh"):
+        sphere_of_masks(near)
+
+
+def test_a_mesh_before_one_picture(views: Views, solution: Solution):
+    """The first view is the contract's."""
+    mask = views.seen[0].mask
+    check_in_picture(mask, Camera(), solution.obj)
+    for mesh, fov in ((turned(solution.obj, 0, 1), 36.0), (sphere(), 36.0)):
+        with pytest.raises(UnirenderError, match=r"IoU .* does it face the camera"):
+            check_in_picture(mask, Camera(fov), mesh)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 5])

@@ -8,7 +8,8 @@ import pytest
 import refine_problems as problems
 
 from unirender.color import srgb_encode
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference import backend
 from unirender_reference.optimize.parameters import Name
 from unirender_reference.optimize.refine import Fit, RefineConfig, RefineState, refine
 from unirender_reference.optimize.refine_state import interpolated_light
@@ -196,3 +197,25 @@ def test_the_plain_loop_has_no_ingredient() -> None:
     assert (plain.one_sided, plain.uniform, plain.decay, plain.light_rows) == (False, False, 1, 0)
     assert plain.parametrisation == "linear"
     assert plain.albedo_levels == plain.material_levels == plain.light_levels == 1
+
+
+def test_the_plain_loop_descends_as_mitsubas_adam(truth: Solution) -> None:
+    """The same steps for the same gradients; not with our refinement's second moment."""
+    mi = backend.mitsuba()
+    import drjit as dr
+
+    shape, rate = truth.obj.albedo.shape, 0.02
+    gradients = np.random.default_rng(0).normal(size=(4, *shape)).astype(np.float32)
+    adam = mi.ad.Adam(lr=rate, params={"albedo": mi.Float(np.zeros(truth.obj.albedo.size, np.float32))})
+    for gradient in gradients:
+        dr.set_grad(adam["albedo"], mi.Float(gradient.ravel()))
+        adam.step()
+    expected = np.array(adam["albedo"]).reshape(shape)
+    for beta_2, same in ((RefineConfig.plain().beta_2, True), (RefineConfig().beta_2, False)):
+        config = dataclasses.replace(RefineConfig.plain(), beta_2=beta_2)
+        moments = RefineState.begin(truth, config).moments["albedo"]
+        moved = np.sum([moments.step(gradient, rate) for gradient in gradients], axis=0)
+        assert np.allclose(moved, expected, rtol=1e-4, atol=1e-6) == same
+    for beta_2 in (-0.1, 1.0):
+        with pytest.raises(UsageError, match="beta-2"):
+            RefineConfig(beta_2=beta_2).check()

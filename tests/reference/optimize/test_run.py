@@ -16,13 +16,17 @@ import pytest
 from optimizer_runs import CONFIG, REFINE, flat_start, rendered_views, run, truth
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.report import Report
-from unirender_reference.optimize.run import optimize
+from unirender_reference.optimize.run import _plan, _Run, optimize
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
 from unirender_reference.optimize.state import HISTORY, PROGRESS, open_run
+from unirender_reference.optimize.transport_config import TransportConfig
 from unirender_reference.optimize.views import Step
 from unirender_reference.optimize.watch import Watch
+from unirender_reference.shapes import Sphere
 
 FILES = ("mesh.glb", "environment.exr", "mitsuba/roughness.png", "mitsuba/mesh.ply")
 
@@ -70,7 +74,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path):
     assert values(out) == values(whole)
     records = [json.loads((folder / "solution.json").read_text()) for folder in (out, whole)]
     for record in records:
-        del record["stages"]  # seconds
+        del record["stages"], record["seconds"]
     assert records[0] == records[1]
     assert [line["seconds"] for line in lines(out)] == sorted(line["seconds"] for line in lines(out))
 
@@ -114,7 +118,7 @@ def test_a_result_that_was_not_finished_is_written_again(whole: Path, tmp_path: 
     (out / ".result.part/mesh.glb").write_bytes(b"half")
     run(out)
     for path in whole.rglob("*.*"):
-        if path.is_file() and path.parent.name != "state":
+        if path.is_file() and path.parent.name != "state" and path.name != "solution.json":  # which tells seconds
             assert (out / path.relative_to(whole)).read_bytes() == path.read_bytes(), path.name
     assert not (out / ".result.part").exists()
 
@@ -130,6 +134,40 @@ def test_a_result_that_was_not_finished_is_written_again(whole: Path, tmp_path: 
 def test_another_run_is_refused(whole: Path, change: dict, named: str):
     with pytest.raises(UnirenderError, match=f"holds a run with other {named}"):
         run(whole, **change)
+
+
+def test_a_run_that_stood_elsewhere_is_refused(whole: Path, tmp_path: Path):
+    """Pictures and mesh of four times the size are the same in the unit sphere, and not in the mesh file."""
+    with pytest.raises(UnirenderError, match=r"holds a run with other inputs\.place"):
+        run(whole, place=Sphere(np.zeros(3), 4.0))
+
+
+@pytest.mark.parametrize("lost", ["mesh.glb", "mitsuba/mesh.ply", "loss.png"])
+def test_a_file_that_was_deleted_comes_back(whole: Path, tmp_path: Path, lost: str):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    (out / lost).unlink()
+    run(out)
+    assert (out / lost).read_bytes() == (whole / lost).read_bytes()
+
+
+@pytest.mark.slow
+def test_pictures_may_be_drawn_later(whole: Path, tmp_path: Path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    assert not (out / "views.png").exists()
+    run(out, pictures=True)
+    assert (out / "turntable.png").exists()
+    drawn = (out / "views.png").stat().st_mtime_ns
+    run(out)
+    run(out, pictures=True)
+    assert (out / "views.png").stat().st_mtime_ns == drawn
+
+
+def test_the_record_tells_the_masks_and_the_whole_time(whole: Path):
+    record = json.loads((whole / "solution.json").read_text())
+    assert 0.95 < record["mask_iou"] <= 1
+    assert record["seconds"] > record["stages"][-1]["seconds"]
 
 
 def test_how_often_states_are_saved_is_no_other_run(whole: Path):
@@ -214,13 +252,45 @@ def test_a_run_that_gets_worse_is_stopped_and_its_best_state_kept():
     assert np.abs(np.log(found.environment) - np.log(last.environment)).max() > 0.1  # not the last state
 
 
+def test_a_start_that_only_gets_worse_is_returned():
+    """From the truth, with a light that moves far: the first look is at the start, and it stays the best."""
+    config = dataclasses.replace(CONFIG, patience=2, refine=dataclasses.replace(REFINE, light_rate=1.0))
+    looks, true = [], truth()
+
+    def note(report: Report) -> None:
+        looks.extend([report.step.values["held_out_psnr"]] if "held_out_psnr" in report.step.values else [])
+
+    found = run(None, config=config, init=true, progress=note)
+    assert max(looks[1:]) < looks[0] - 5
+    assert len(looks) == 3
+    np.testing.assert_allclose(found.environment, true.environment, rtol=1e-3, atol=1e-3)
+
+
 def test_reports_count_down():
     reports: list[Report] = []
     run(None, progress=reports.append)
-    assert [report.step.iteration for report in reports] == list(range(1, 9))
+    assert [report.step.iteration for report in reports] == list(range(9))  # the first look is at the start
     assert {(report.stage, report.stages, report.total) for report in reports} == {(1, 1, 8)}
     assert reports[-1].remaining == 0
-    assert all(report.remaining is not None and report.remaining >= 0 for report in reports)
+    assert reports[0].remaining is None
+    assert all(report.remaining is not None and report.remaining >= 0 for report in reports[1:])
+
+
+@pytest.mark.parametrize(
+    ("given", "transport", "rounds", "stages"),
+    [
+        ("nothing", True, 0, ["shape", "transport", "refine"]),
+        ("nothing", True, 2, ["shape", "transport", "reshape-1", "transport-1", "reshape-2", "transport-2", "refine"]),
+        ("nothing", False, 1, ["shape", "transport", "refine", "reshape-1", "refine-1"]),
+        ("mesh", True, 1, ["transport", "refine"]),
+        ("start", True, 1, ["refine"]),
+    ],
+)
+def test_the_stages_follow_what_is_given(given: str, transport: bool, rounds: int, stages: list[str]):
+    config = OptimizeConfig(transport=TransportConfig(enabled=transport), shape_rounds=rounds)
+    solution = truth()
+    obj, init = (solution.obj if given == "mesh" else None), (solution if given == "start" else None)
+    assert _plan(obj, init, config) == stages
 
 
 def test_refinement_off_returns_the_start():
@@ -236,3 +306,25 @@ def test_values_out_of_range():
     start = flat_start(truth().obj)
     with pytest.raises(UnirenderError, match="expected one of them"):
         optimize(rendered_views(truth()), start.obj, CONFIG, init=start)
+
+
+def test_a_mesh_in_no_covered_pixel_is_one_sentence():
+    away = placed(rendered_views(truth(), side=8), Sphere(np.array([50.0, 0, 0]), 1.0))
+    with pytest.raises(UnirenderError, match="the mesh is in no covered pixel"):
+        optimize(away, truth().obj, CONFIG)
+
+
+def test_what_remains_goes_by_the_work_that_is_done():
+    """A stage says what its steps take; half of the work takes as long as the other half."""
+    reports = []
+    views = rendered_views(truth(), side=8)
+    on_step = _Run(views, CONFIG, None, reports.append, ["transport"])._on_step("transport", 3, shares=[0.5, 0.9, 1])
+    began = time.perf_counter()
+    time.sleep(0.2)
+    for iteration in (1, 2, 3):
+        on_step(Step("transport", iteration, 0.0, {}))
+    passed = time.perf_counter() - began
+    assert [report.total for report in reports] == [3, 3, 3]
+    assert reports[0].remaining == pytest.approx(passed, abs=0.1)
+    assert reports[1].remaining == pytest.approx(passed / 9, abs=0.05)
+    assert reports[2].remaining == 0

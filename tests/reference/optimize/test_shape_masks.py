@@ -9,7 +9,7 @@ from posed_spheres import blank_views, mask_views
 from reference_scenes import environment, sphere
 
 from unirender.errors import UnirenderError
-from unirender_reference.multiview import ViewRenderer
+from unirender_reference.optimize.shape import tracer
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -21,6 +21,7 @@ from unirender_reference.optimize.shape.silhouette import outline
 from unirender_reference.optimize.shape.topology import mesh_edges, neighbours, vertex_normals
 from unirender_reference.optimize.shape.tracer import MeshTracer
 from unirender_reference.optimize.views import Views
+from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, signed_volume
 
 SIZE = 32
@@ -57,12 +58,43 @@ def test_the_derivative_of_the_projection_is_its_finite_difference() -> None:
 
 def test_coverage_is_the_alpha_that_the_path_tracer_renders() -> None:
     obj, views = sphere(), blank_views(3, SIZE)
-    alpha = ViewRenderer(obj, resolution=SIZE).image(views[1].pose, environment(), 0.5, 0.5, 64).mean[..., 3]
+    alpha = Renderer(obj, resolution=SIZE).image(environment(), 0.5, 0.5, 64, pose=views[1].pose).mean[..., 3]
     coverage = MeshTracer(obj.vertices, obj.faces).coverage(Cameras(views), 8)
     assert np.abs(coverage[1] - alpha).max() < 0.15  # 64 random samples: 4 standard deviations are 0.25
     assert np.abs(coverage[1] - alpha).mean() < 0.005
     turned = coverage[1][:, ::-1].T  # twin: another frame
     assert np.abs(np.roll(turned, 1, axis=1) - alpha).mean() > 0.005
+
+
+def test_coverage_takes_few_rays_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory does not grow with the views; rows taken apart are the same rows."""
+    obj, cameras = sphere(), Cameras(blank_views(3, SIZE))
+    traced = MeshTracer(obj.vertices, obj.faces)
+    whole, most = traced.coverage(cameras, 2), 5 * SIZE * 4
+    meets, rays = MeshTracer.meets, []
+
+    def counted(self: MeshTracer, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        rays.append(len(origins))
+        return meets(self, origins, directions)
+
+    monkeypatch.setattr(MeshTracer, "meets", counted)
+    monkeypatch.setattr(tracer, "MOST_RAYS", most)
+    np.testing.assert_array_equal(traced.coverage(cameras, 2), whole)
+    assert max(rays) <= most
+    assert sum(rays) == 3 * SIZE**2 * 4
+
+
+def test_rays_that_meet_nothing_have_no_coordinates() -> None:
+    """Mitsuba leaves there what memory held. One NaN among a pixel's rays took its normal away."""
+    obj, cameras = sphere(), Cameras(blank_views(2, SIZE))
+    y, x = np.mgrid[:SIZE, :SIZE].reshape(2, -1) + 0.5
+    view = np.repeat([0, 1], SIZE**2)
+    rays = cameras.rays(np.tile(np.stack([x, y], axis=1), (2, 1)), view)
+    face, distance, at = MeshTracer(obj.vertices, obj.faces).first_hits(cameras.center[view], rays)
+    assert 0.2 < (face < 0).mean() < 0.8
+    assert (distance[face < 0] == np.inf).all()
+    assert (at[face < 0] == 0).all()
+    assert (at[face >= 0] > 0).any(axis=1).mean() > 0.99
 
 
 @pytest.mark.parametrize("offset", [0.2, 0.35, 0.8])
@@ -101,7 +133,7 @@ def test_a_camera_inside_the_unit_sphere_is_refused() -> None:
     pose = view.pose.copy()
     pose[:3, 3] *= 0.1
     with pytest.raises(UnirenderError, match="inside the object's unit sphere"):
-        Cameras([dataclasses.replace(view, pose=pose)])
+        visual_hull(np.ones((1, SIZE, SIZE)), Cameras([dataclasses.replace(view, pose=pose)]), 16)
 
 
 def test_topology_of_a_tetrahedron() -> None:
@@ -146,7 +178,7 @@ def test_the_outlines_derivative_agrees_with_mitsubas_projective_integrator() ->
     mi = mitsuba()
     import drjit as dr
 
-    from unirender_reference.multiview import sensor_at
+    from unirender_reference.scene import sensor_at
 
     obj, views = _rotated(sphere(subdivisions=3)), blank_views(2, SIZE)
     vertices = obj.vertices.astype(np.float64) * 0.9

@@ -10,7 +10,6 @@ from reference_scenes import environment, sphere
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference.measure.shape import ShapeMeasure
-from unirender_reference.multiview import ViewRenderer
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap, welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -21,6 +20,7 @@ from unirender_reference.optimize.shape.shading import shade_points
 from unirender_reference.optimize.shape.topology import vertex_normals
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View, Views
+from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject
 
 SIZE = 32
@@ -37,10 +37,10 @@ def _solution(obj: MeshObject, light: np.ndarray) -> Solution:
 
 
 def _pictures(obj: MeshObject, light: np.ndarray, count: int, spp: int) -> Views:
-    renderer = ViewRenderer(dataclasses.replace(obj, uv=None, albedo=np.full(3, ALBEDO, np.float32)), resolution=SIZE)
+    renderer = Renderer(dataclasses.replace(obj, uv=None, albedo=np.full(3, ALBEDO, np.float32)), resolution=SIZE)
 
     def picture(index: int, blank: View) -> View:
-        rgba = renderer.image(blank.pose, light, ROUGHNESS, METALLIC, spp, seed=index).mean
+        rgba = renderer.image(light, ROUGHNESS, METALLIC, spp, seed=index, pose=blank.pose).mean
         mask = np.clip(rgba[..., 3:], 0, 1)
         straight = np.where(mask > 0, rgba[..., :3] / np.maximum(mask, 1e-6), 0)
         return dataclasses.replace(blank, image=np.round(image_srgb(straight) * 255) / 255, mask=mask)
@@ -69,8 +69,8 @@ def test_the_derivative_of_the_vertex_normals_is_their_finite_difference() -> No
 
 def test_the_shading_of_the_points_is_direct_light() -> None:
     obj, light, views = sphere(), _soft_light(), blank_views(2, SIZE)
-    renderer = ViewRenderer(dataclasses.replace(obj, albedo=np.full(3, ALBEDO, np.float32)), resolution=SIZE)
-    image = renderer.image(views[1].pose, light, ROUGHNESS, METALLIC, 256, depth=2).mean
+    renderer = Renderer(dataclasses.replace(obj, albedo=np.full(3, ALBEDO, np.float32)), resolution=SIZE)
+    image = renderer.image(light, ROUGHNESS, METALLIC, 256, depth=2, pose=views[1].pose).mean
     inner = np.flatnonzero(image[..., 3].ravel() > 0.999) + SIZE**2
     shaded = shade_points(_solution(obj, light), Cameras(views), inner, 128, seed=0)
     truth = image[..., :3].reshape(-1, 3)[shaded.pixel - SIZE**2]

@@ -7,11 +7,11 @@ import pytest
 import reference_scenes as scenes
 
 from unirender.camera import Camera
-from unirender.color import image_srgb, unpremultiply
+from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.lighting import resample_environment
-from unirender_reference.optimize.single_config import Priors, SingleConfig, Trust
+from unirender_reference.optimize.single_config import COLD, Priors, SingleConfig, Trust
 from unirender_reference.optimize.single_fit import Fit, Unknowns
 from unirender_reference.optimize.single_picture import make_picture
 from unirender_reference.optimize.single_view import optimize_image
@@ -121,6 +121,36 @@ def test_a_known_mesh_gives_normals_and_needs_no_start(truth: Intrinsics, pictur
     assert object_value(flat, "roughness") == 0.5
 
 
+def test_a_start_without_a_prediction_keeps_its_level_and_metallic_and_finds_the_rest(
+    truth: Intrinsics, picture: np.ndarray
+) -> None:
+    """The mean albedo is the start's whatever the exposure, the tint is found, and roughness moves towards the truth;
+    metallic, which the fit prefers to be 1, stays."""
+    mask = truth.require("mask")["mask"]
+
+    def mean(maps: Intrinsics) -> np.ndarray:
+        return (maps.require("albedo")["albedo"] * mask).sum(axis=(0, 1)) / mask.sum()
+
+    dark = image_srgb(0.3 * srgb_decode(picture))
+    for image in (picture, dark):
+        found = optimize_image(image, mask, CAMERA, QUICK)
+        assert mean(found).mean() == pytest.approx(COLD["albedo"], rel=0.02)
+        assert mean(found)[0] > 1.1 * mean(found)[2], "the truth is reddish"
+        assert object_value(found, "metallic") == COLD["metallic"]
+        assert ROUGHNESS < object_value(found, "roughness") < COLD["roughness"] - 0.005
+    trusting = optimize_image(picture, mask, CAMERA, replace(QUICK, trust=Trust()))
+    assert object_value(trusting, "metallic") > COLD["metallic"] + 0.2
+
+
+def test_a_mesh_that_is_not_under_the_mask_is_refused(truth: Intrinsics, picture: np.ndarray) -> None:
+    mask, ball = truth.require("mask")["mask"], scenes.sphere()
+    flat = replace(ball, vertices=ball.vertices * np.array([1, 0.7, 1], np.float32))
+    half = replace(ball, faces=ball.faces[ball.vertices[ball.faces].mean(axis=1)[:, 0] > 0])
+    for mesh in (flat, half):
+        with pytest.raises(UnirenderError, match="IoU"):
+            optimize_image(picture, mask, CAMERA, QUICK, geometry=mesh)
+
+
 def test_a_silhouette_is_enough_for_a_picture_of_any_size(picture: np.ndarray, truth: Intrinsics) -> None:
     mask = truth.require("mask")["mask"]
     image, cover = (np.kron(x, np.ones((2, 2, 1), np.float32))[:61] for x in (picture, mask))
@@ -128,8 +158,31 @@ def test_a_silhouette_is_enough_for_a_picture_of_any_size(picture: np.ndarray, t
     found = optimize_image(image, cover, CAMERA, config)
     assert found.present == tuple(MAPS)
     assert found.require("albedo")["albedo"].shape == image.shape
-    linear = optimize_image(image * 3, cover, CAMERA, config, hdr=True)
-    assert linear.present == tuple(MAPS)
+
+
+def test_the_scale_of_a_linear_picture_is_the_lights_alone(truth: Intrinsics, prediction: Intrinsics) -> None:
+    """A picture eight times as bright (a power of two: no rounding), most of it above a display's 1, has the same maps
+    under eight times the light, and renders to itself; the same values as a display shows them, clipped, do not."""
+    mask = truth.require("mask")["mask"]
+    linear = unpremultiply(shade(truth, spp=400), mask)
+
+    def found(factor: float) -> Intrinsics:
+        light = prediction.require("environment")["environment"] * np.float32(factor)
+        start, config = prediction.replace(environment=light), replace(QUICK, trust=Trust())
+        return optimize_image(linear * np.float32(factor), mask, CAMERA, config, init=start, hdr=True)
+
+    def error(maps: Intrinsics) -> float:
+        shown = image_srgb(unpremultiply(shade(maps, spp=256), mask) / 8)
+        return float(np.sqrt((np.square(shown - image_srgb(linear)) * mask).sum() / mask.sum() / 3))
+
+    one, eight = found(1), found(8)
+    assert (8 * linear > 1).sum() > 1.5 * mask.sum(), "half of the values"
+    for name, values in one.maps.items():
+        factor = 8 if name in ("specular", "diffuse", "environment") else 1
+        np.testing.assert_allclose(eight.maps[name], factor * values, rtol=1e-5, atol=1e-6, err_msg=name)
+    assert error(eight) < 0.03
+    clipped = optimize_image(image_srgb(8 * linear), mask, CAMERA, QUICK)
+    assert error(clipped) > 0.06
 
 
 def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, prediction: Intrinsics) -> None:

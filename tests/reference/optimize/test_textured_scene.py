@@ -11,9 +11,9 @@ import refine_problems as problems
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.multiview import ViewRenderer
 from unirender_reference.optimize.parameters import LIMITS, NAMES, Name, Space, parameter_gradient, to_map, to_parameter
 from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.render import Renderer
 from unirender_reference.statistics import z_test
 
 COUNT = 3
@@ -29,9 +29,9 @@ def test_every_view_is_the_reference_picture(scene: TexturedScene) -> None:
     maps = maps_of(truth)
     batches = np.stack([scene.image(maps, 256, seed) for seed in range(8)]).astype(np.float64)
     mean, variance = batches.mean(0), batches.var(0, ddof=1) / len(batches)
-    renderer = ViewRenderer(truth.obj, Camera(), problems.SIDE)
+    renderer = Renderer(truth.obj, Camera(), problems.SIDE)
     for index, view in enumerate(problems.blank_views(COUNT)):
-        expected = renderer.image(view.pose, truth.environment, None, None, 2048, seed=50 + index)
+        expected = renderer.image(truth.environment, None, None, 2048, seed=50 + index, pose=view.pose)
         assert expected.variance is not None
         inside = (expected.mean[..., 3:] > 0.99).astype(np.float32)
         shown = (mean[index, ..., :3], variance[index, ..., :3])
@@ -104,8 +104,8 @@ def test_an_objects_normal_map_is_shown() -> None:
     bumped = dataclasses.replace(truth, obj=dataclasses.replace(truth.obj, normal_map=tilted))
     views = problems.blank_views(1)
     plain, seen = (TexturedScene(s, views).image(maps_of(s), 64, 0) for s in (truth, bumped))
-    expected = ViewRenderer(bumped.obj, Camera(), problems.SIDE).image(
-        views[0].pose, truth.environment, None, None, 512
+    expected = Renderer(bumped.obj, Camera(), problems.SIDE).image(
+        truth.environment, None, None, 512, pose=views[0].pose
     )
     assert np.abs(seen[0] - expected.mean).mean() < 0.5 * np.abs(plain[0] - expected.mean).mean()
 

@@ -2,11 +2,12 @@
 
 import appearance_cases as cases
 import numpy as np
+import pytest
 
 from unirender.camera import Camera
 from unirender_reference.multiview import orbit
 from unirender_reference.optimize.surface_points import blocker, trace_points
-from unirender_reference.optimize.textures import fit_texels, footprint, spread
+from unirender_reference.optimize.textures import best_smoothness, fit_texels, footprint, spread
 from unirender_reference.optimize.views import View
 
 SIZE = 32
@@ -68,3 +69,20 @@ def test_unseen_texels_are_the_mean_of_the_seen_ones() -> None:
     unseen = np.asarray(seen.sum(axis=0)).ravel() == 0
     assert unseen.any()
     np.testing.assert_allclose(texels[unseen], np.broadcast_to(values.mean(axis=0), texels[unseen].shape), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("texture", "noise", "smooth"), [("plain", 0.3, 60), ("checks", 0.01, 15)])
+def test_held_out_pixels_tell_how_smooth_a_texture_is(texture: str, noise: float, smooth: float) -> None:
+    """Noise on one colour asks for more smoothness than a clean pattern does, and gets it."""
+    obj, camera = cases.bare(texture_size=SIZE), Camera()
+    mask = np.ones((64, 64, 1), np.float32)
+    views = [View(np.zeros((64, 64, 3), np.float32), mask, camera, pose) for pose in orbit(8, camera)]
+    points = trace_points(blocker(obj), views, 4, 0)
+    seen, rng = footprint(points, SIZE), np.random.default_rng(1)
+    checks = np.indices((SIZE, SIZE)).sum(axis=0) // 2 % 2
+    texels = 0.2 + 0.5 * np.repeat((checks * (texture == "checks")).reshape(-1, 1), 3, axis=1)
+    gain, weight = np.ones((len(points), 3)), np.full((len(points), 3), 1 / noise)
+    target = seen @ texels + noise * rng.standard_normal(gain.shape)
+    start = spread(target, np.ones(len(points), np.float32), seen)
+    found = best_smoothness(seen, gain, target, weight, start)
+    assert found >= smooth if texture == "plain" else found <= smooth

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from unirender.camera import Camera
-from unirender_reference.multiview import ViewRenderer, orbit
+from unirender_reference.multiview import orbit
 from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe
 from unirender_reference.optimize.surface_points import blocker, trace_points
 from unirender_reference.optimize.transport import light_transport, refined
 from unirender_reference.optimize.views import View
+from unirender_reference.render import Renderer
 
 GRID = LightGrid(8, 16)
 COLOUR = np.array([0.5, 0.3, 0.2], np.float32)
@@ -38,7 +39,7 @@ def modelled(problem, roughness: float, metallic: float) -> np.ndarray:
     _obj, points, transport, light, _ = problem
     count = len(points)
     blank = np.zeros((count, 3), np.float32)
-    seen = observe(blank, np.ones(count), np.arange(count), display=True)
+    seen = observe(blank, np.ones(count), np.arange(count), np.zeros(blank.shape, bool))
     fit = PixelFit(transport, seen, np.ones_like(blank), 0.5)
     cells = GRID.averages(light)
     mixed = fit.mixed(Appearance(np.log(cells), np.full(count, float(roughness)), np.full(count, float(metallic))))
@@ -49,8 +50,8 @@ def modelled(problem, roughness: float, metallic: float) -> np.ndarray:
 def test_matrices_times_light_are_the_direct_image(problem, roughness: float, metallic: float) -> None:
     """Visibility, all lobes, interpolation between nodes; the twin is another material."""
     obj, points, _, light, poses = problem
-    renderer = ViewRenderer(obj, Camera(), cases.SIZE)
-    images = [renderer.image(pose, light, roughness, metallic, 256, depth=2).mean[..., :3] for pose in poses]
+    renderer = Renderer(obj, Camera(), cases.SIZE)
+    images = [renderer.image(light, roughness, metallic, 256, depth=2, pose=pose).mean[..., :3] for pose in poses]
     truth = points.of(images)
     error = modelled(problem, roughness, metallic) - truth
     assert abs(error.mean()) < 0.03 * truth.mean()

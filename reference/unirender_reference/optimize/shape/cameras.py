@@ -29,6 +29,16 @@ class Cameras:
         self.rotation, self.center = poses[:, :3, :3], poses[:, :3, 3]
         self.focal = np.array([self.height / 2 / math.tan(math.radians(view.camera.fov_deg) / 2) for view in views])
         self._principal = np.array([view.camera.principal for view in views]) * [self.width, self.height]
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def require_outside(self) -> None:
+        """Looks whether the unit sphere, where the object may be, lies before each camera.
+
+        Raises:
+            UnirenderError: a camera stands in it.
+        """
         nearest = float(np.linalg.norm(self.center, axis=1).min())
         if nearest <= 1:
             raise UnirenderError(
@@ -36,8 +46,9 @@ class Cameras:
                 "cameras outside: scale the poses so that the object lies within radius 1 about the origin"
             )
 
-    def __len__(self) -> int:
-        return len(self.center)
+    def depth(self, points: Float[np.ndarray, "n 3"], view: int) -> Float[np.ndarray, " n"]:
+        """How far world points lie before a camera, along its axis; below 0 behind it."""
+        return -(points - self.center[view]) @ self.rotation[view][:, 2]
 
     def project(self, points: Float[np.ndarray, "n 3"], view: Int[np.ndarray, " n"] | int) -> Float[np.ndarray, "n 2"]:
         """Pixel coordinates of world points, each in the view named beside it."""

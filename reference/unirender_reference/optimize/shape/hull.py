@@ -45,8 +45,10 @@ def visual_hull(masks: Float[np.ndarray, "k h w"], cameras: Cameras, cells: int)
         cells: along each side; the grid has one point more.
 
     Raises:
-        UnirenderError: no point lies inside all masks (masks and poses do not belong together).
+        UnirenderError: no point lies inside all masks (masks and poses do not belong together), or a camera stands
+            inside the unit sphere.
     """
+    cameras.require_outside()
     axis = np.linspace(-HALF, HALF, cells + 1)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     least = np.full(len(points), np.inf)
@@ -57,6 +59,7 @@ def visual_hull(masks: Float[np.ndarray, "k h w"], cameras: Cameras, cells: int)
         beyond = np.maximum(np.maximum(-pixels, pixels - [cameras.width, cameras.height]).max(1), 0)
         pixel_size = np.linalg.norm(points - cameras.center[view], axis=1) / cameras.focal[view]
         value = np.where(beyond > 0, np.minimum(-beyond, distance), distance) * pixel_size
+        value = np.where(cameras.depth(points, view) > 0, value, -HALF)  # a camera sees nothing behind it
         least = np.minimum(least, value)
     if not (least > 0).any():
         raise UnirenderError(

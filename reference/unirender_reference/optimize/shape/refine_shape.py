@@ -45,6 +45,7 @@ def refine_shape(
     """
     began = time.perf_counter()
     cameras = Cameras(views.seen)
+    cameras.require_outside()
     masks = np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
     targets = np.stack([image_srgb(view.image) if views.hdr else view.image for view in views.seen]).reshape(-1, 3)
     points, faces, index = welded(solution.obj.vertices, solution.obj.faces)

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.scene import mesh_shape
+from unirender_reference.optimize.solution_scene import solution_scene
 
 MOST_LANES = 1 << 19  # samples of all points in one launch
 LEAST_FACING = 0.05  # cosine of normal and view below which a point does not count
@@ -52,14 +51,7 @@ def shade_points(
         seed: equal seeds draw equal directions.
     """
     mi = mitsuba()
-    obj = solution.obj
-    assert obj.roughness is not None  # a Solution has both
-    assert obj.metallic is not None
-    surface = materials.principled_bsdf(obj.albedo, obj.roughness, obj.metallic)
-    light = mi.Bitmap(np.ascontiguousarray(solution.environment, np.float32))
-    scene = mi.load_dict(
-        {"type": "scene", "light": {"type": "envmap", "bitmap": light}, "object": mesh_shape(obj, surface)}
-    )
+    scene = solution_scene(solution)
     view, place = np.divmod(pixel, cameras.height * cameras.width)
     row, column = np.divmod(place, cameras.width)
     direction = cameras.rays(np.stack([column, row], axis=1) + 0.5, view)

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float, Int
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 
+MOST_RAYS = 1 << 21  # at once: a ray takes about 200 bytes
+
 
 class MeshTracer:
     """A mesh in a Mitsuba scene; its vertices may move.
@@ -40,21 +42,30 @@ class MeshTracer:
     def first_hits(
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
-        """Face (-1: none), distance and barycentric coordinates (of the second and third corner) of the first hits."""
+        """Face (-1: none), distance, and barycentric coordinates of the second and third corner (0), of first hits."""
         hit = self.scene.ray_intersect_preliminary(_rays(origins, directions))
         valid = np.array(hit.is_valid())
         face = np.where(valid, np.array(hit.prim_index).astype(np.int64), -1)
-        return face, np.where(valid, np.array(hit.t), np.inf), np.array(hit.prim_uv).T
+        at = np.where(valid, np.array(hit.prim_uv), 0)  # of rays that meet nothing it is whatever memory held, NaN too
+        return face, np.where(valid, np.array(hit.t), np.inf), at.T
 
     def coverage(self, cameras: Cameras, side: int) -> Float[np.ndarray, "k h w"]:
         """Box-filtered coverage of all views by `side` x `side` rays on a regular grid in each pixel."""
-        height, width = cameras.height * side, cameras.width * side
-        y, x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
-        one = np.stack([x, y], axis=-1).reshape(-1, 2) / side
-        view = np.repeat(np.arange(len(cameras)), len(one))
-        rays = cameras.rays(np.tile(one, (len(cameras), 1)), view)
-        met = self.meets(cameras.center[view], rays).reshape(len(cameras), cameras.height, side, cameras.width, side)
-        return met.mean((2, 4))
+        rows = max(1, MOST_RAYS // (cameras.width * side**2))
+        found = np.empty((len(cameras), cameras.height, cameras.width))
+        for index in range(len(cameras)):
+            for top in range(0, cameras.height, rows):
+                bottom = min(top + rows, cameras.height)
+                found[index, top:bottom] = self._covered(cameras, index, top, bottom, side)
+        return found
+
+    def _covered(self, cameras: Cameras, index: int, top: int, bottom: int, side: int) -> Float[np.ndarray, "rows w"]:
+        """Coverage of some rows of a view."""
+        y, x = np.arange(top * side, bottom * side) + 0.5, np.arange(cameras.width * side) + 0.5
+        pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) / side
+        view = np.full(len(pixels), index)
+        met = self.meets(cameras.center[view], cameras.rays(pixels, view))
+        return met.reshape(bottom - top, side, cameras.width, side).mean((1, 3))
 
 
 def _rays(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Any:

@@ -1,0 +1,28 @@
+"""Ranges of options, with one sentence for a value outside. Light to import."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from unirender.errors import UsageError
+
+
+def require_least(options: Any, group: str, least: Mapping[str, float], above: bool = False) -> None:
+    """Looks at some fields of a group of options; None is in every range.
+
+    Args:
+        options: a dataclass.
+        group: its name on the command line.
+        least: by field, the smallest value that serves.
+        above: the values have to be larger than that.
+
+    Raises:
+        UsageError: one is smaller, infinite or NaN.
+    """
+    for name, bound in least.items():
+        value = getattr(options, name)
+        if value is None:
+            continue
+        if not math.isfinite(value) or value < bound or (above and value == bound):
+            wanted = f"more than {bound:g}" if above else f"{bound:g} or more"
+            raise UsageError(f"--{group}.{name.replace('_', '-')} {value:g}: expected {wanted}")
