@@ -11,7 +11,10 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device
+from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
+from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
+from unirender_evaluation.warm_start_command import BenchWarmStart
 
 
 @dataclass(frozen=True)
@@ -227,7 +230,7 @@ class BenchExport:
 
 @dataclass(frozen=True)
 class Bench:
-    """The benchmark: score methods, write the report again, check the truth, export inputs."""
+    """The benchmark: score methods, write the report again, check the truth, export inputs; study the optimiser."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[BenchRun, tyro.conf.subcommand("run")]
@@ -235,6 +238,10 @@ class Bench:
         | Annotated[BenchExport, tyro.conf.subcommand("export")]
         | Annotated[BenchReport, tyro.conf.subcommand("report")]
         | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
+        | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
+        | Annotated[BenchRace, tyro.conf.subcommand("race")]
+        | Annotated[BenchUnknownMesh, tyro.conf.subcommand("unknown-mesh")]
+        | Annotated[BenchWarmStart, tyro.conf.subcommand("warm-start")]
     ] = field()
 
     def run(self) -> int:

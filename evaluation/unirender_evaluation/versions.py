@@ -62,6 +62,8 @@ PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
 VIEWS = ("light_metrics", "multiview_*")
+# Commands of their own, whose records hold `modules_version` of what measures.
+STUDIES = ("optimiser_study*", "unknown_mesh*", "warm_start*")
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
     "adaptive*",
@@ -104,7 +106,7 @@ PARTS: Mapping[str, Part] = {
             *(f"unirender/{name}.py" for name in ("cli", "commands", "options")),
             *(
                 f"unirender_evaluation/{name}.py"
-                for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, *OPTIMIZED, *VIEWS, "versions")
+                for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, *OPTIMIZED, *VIEWS, *STUDIES, "versions")
             ),
         ),
     ),
@@ -182,6 +184,13 @@ def part_version(part: Part, folders: Mapping[str, Path]) -> str:
     for variable in part.variables:
         digest.update(f"{variable} {os.environ.get(variable, '')}".encode())
     return digest.hexdigest()
+
+
+def modules_version(*names: str) -> str:
+    """sha256 over modules of this package (patterns of their names): what a study's figures depend on besides parts."""
+    package = "unirender_evaluation"
+    part = Part({package: tuple(f"{name}.py" for name in names)}, ())
+    return part_version(part, {package: package_folder(package)})
 
 
 def lpips_version(backbones: Sequence[str]) -> str:

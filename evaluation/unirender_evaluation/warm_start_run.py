@@ -1,0 +1,77 @@
+"""A run of `unirender bench warm-start`: measures with progress, prints, writes."""
+
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from unirender_evaluation import warm_start_tables
+from unirender_evaluation.records import Record
+from unirender_evaluation.suites import Scene
+from unirender_evaluation.versions import installed_version
+from unirender_evaluation.warm_start import WarmStart, measure
+
+NAME = "warm_start"
+
+
+def our_method(checkpoint: Path | None) -> Any:
+    """Our model as the benchmark's row asks it: one step, the mean.
+
+    Args:
+        checkpoint: its folder; None: the shipped one.
+    """
+    from unirender_evaluation.benchmark import BenchConfig, build_rows
+    from unirender_evaluation.claims import OURS
+
+    rows = build_rows(BenchConfig(methods=("ours",), checkpoint=checkpoint))
+    return next(row.method for row in rows if row.info.key == OURS)
+
+
+def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Record]:
+    """Measures what is missing and writes `warm_start.md` and `warm_start.json`.
+
+    Args:
+        what: the measurement.
+        scenes: at least one.
+        console: for progress and tables.
+    """
+    records, computed = [], 0
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+        bar = progress.add_task("warm start", total=len(scenes) * len(list(what.questions())))
+        for record, new in measure(what, scenes):
+            records.append(record)
+            computed += new
+            progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
+    made = warm_start_tables.tables(records, what.geometries)
+    about = description(what)
+    lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+    _write(what.out / f"{NAME}.md", "\n".join(lines))
+    _write(what.out / f"{NAME}.json", warm_start_tables.to_json(records, what.geometries, about))
+    for table in made:
+        table.show(console)
+    console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+    return records
+
+
+def description(what: WarmStart) -> dict[str, str]:
+    """What a reader must know to compare."""
+    return {
+        "suite": f"{what.suite.spec.name} {what.suite.sha256[:12]}",
+        "resolution": f"{what.suite.spec.resolution}",
+        "prediction": f"{what.base.name} {what.base.config.get('weights', '')[:12]}".strip(),
+        "mitsuba": str(installed_version("mitsuba")),
+        "cores": str(os.cpu_count()),
+        "code": what.versions.code[:12],
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_text(text, encoding="utf-8")
+    os.replace(temporary, path)
