@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device
+from unirender.options import Device, at_least
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
@@ -247,17 +247,6 @@ class Bench:
     def run(self) -> int:
         """Runs the chosen command."""
         return self.command.run()
-
-
-def at_least(low: int, **options: int | None) -> None:
-    """Looks at options that have a least value; None is one that was not given.
-
-    Raises:
-        UsageError: one is below `low`.
-    """
-    for name, value in options.items():
-        if value is not None and value < low:
-            raise UsageError(f"--{name.replace('_', '-')} {value}: expected at least {low}")
 
 
 def named_folders(pairs: tuple[str, ...]) -> dict[str, Path]:

@@ -118,11 +118,11 @@ def open_folder(path: Path) -> Path:
     return path
 
 
-def write_files(folder: Path, files: Mapping[str, str]) -> None:
-    """Writes texts, each moved into place when complete."""
-    for name, text in files.items():
-        temporary = folder / f"{name}.tmp"
-        temporary.write_text(text, encoding="utf-8")
+def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Writes texts (UTF-8) and pictures, each moved into place when complete."""
+    for name, content in files.items():
+        temporary = folder / f".{name}.part"
+        temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
         os.replace(temporary, folder / name)
 
 

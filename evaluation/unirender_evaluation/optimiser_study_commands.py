@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from unirender.errors import UsageError
+from unirender.options import at_least
 
 
 @dataclass(frozen=True)
@@ -12,7 +13,7 @@ class BenchIngredients:
     """Measure what each ingredient of the optimiser is worth on objects of the multi-view table. A second run
     continues."""
 
-    out: Path = Path("ingredients")
+    out: Path = Path("results/ingredients")
     """Folder of the study: records.jsonl, ingredients.md, ingredients.json."""
     suite: str = "tiny"
     """A bundled suite, or the path of a suite's TOML file."""
@@ -27,8 +28,8 @@ class BenchIngredients:
         """Looks at the values; `UsageError` where one is outside its range."""
         from unirender_evaluation.optimiser_study_ingredients import chosen, ingredients
 
-        _at_least(1, objects=self.objects)
-        _at_least(0, seed=self.seed)
+        at_least(1, objects=self.objects)
+        at_least(0, seed=self.seed)
         chosen(ingredients(self.seed), self.variants)
 
     def run(self) -> int:
@@ -62,7 +63,7 @@ class BenchRace:
     """Race the optimiser against the plain loop of Mitsuba's tutorials to the same albedo error. A second run
     continues with the objects that are missing."""
 
-    out: Path = Path("race")
+    out: Path = Path("results/race")
     """Folder of the race: curves.jsonl, race.md, race.json, race.png."""
     suite: str = "tiny"
     """A bundled suite, or the path of a suite's TOML file."""
@@ -79,8 +80,8 @@ class BenchRace:
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""
-        _at_least(1, objects=self.objects, iterations=self.iterations, every=self.every)
-        _at_least(0, seed=self.seed)
+        at_least(1, objects=self.objects, iterations=self.iterations, every=self.every)
+        at_least(0, seed=self.seed)
         if not self.losses or len(set(self.losses)) < len(self.losses):
             raise UsageError(f"--losses {' '.join(self.losses)}: expected srgb, linear or both, each once")
 
@@ -102,13 +103,7 @@ class BenchRace:
             **{"plain loop": f"Adam, {self.iterations} steps of 16 samples, measured every {self.every} steps"}
         )
         table = race_table(races, protocol)
-        write_files(folder, {"race.md": table.markdown(), "race.json": to_json(races, protocol)})
-        draw(races, folder / "race.png")
+        files = {"race.md": table.markdown(), "race.json": to_json(races, protocol), "race.png": draw(races)}
+        write_files(folder, files)
         table.show(console)
         return 0
-
-
-def _at_least(low: int, **options: int) -> None:
-    for name, value in options.items():
-        if value < low:
-            raise UsageError(f"--{name} {value}: expected at least {low}")

@@ -1,10 +1,10 @@
 """The race as a table, as JSON and as a picture."""
 
+import io
 import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 from unirender_evaluation.optimiser_study_curves import Finish, finish, geometric_mean
 from unirender_evaluation.optimiser_study_race import ObjectRace
@@ -87,13 +87,8 @@ def to_json(races: Sequence[ObjectRace], protocol: Sequence[tuple[str, str]]) ->
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def draw(races: Sequence[ObjectRace], path: Path) -> None:
-    """Albedo over seconds, a panel for each object, as a PNG.
-
-    Args:
-        races: at least one.
-        path: the file.
-    """
+def draw(races: Sequence[ObjectRace]) -> bytes:
+    """Albedo over seconds as a PNG, a panel for each of at least one object."""
     from matplotlib.figure import Figure
 
     across = min(len(races), 2)
@@ -115,4 +110,6 @@ def draw(races: Sequence[ObjectRace], path: Path) -> None:
     for axes in panels[len(races) :]:
         axes.axis("off")
     panels[0].legend(fontsize=8)
-    figure.savefig(path, format="png", dpi=110, metadata={"Software": None})
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=110, metadata={"Software": None})
+    return picture.getvalue()

@@ -4,8 +4,8 @@ Every object has a folder named by its content key: the optimisation goes on in 
 (`mesh.glb`, `environment.exr`, `strip.png`, ...) stays there. Its record is stored as soon as it is measured.
 """
 
+import io
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from unirender_evaluation.multiview_scenes import suite_scene
 from unirender_evaluation.multiview_scoring import solution_looks
 from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
@@ -92,9 +93,9 @@ def measured(what: UnknownMesh, scene: Scene, progress: Progress | None = None) 
     solution = optimize(world.views, None, what.config, folder, progress=progress, pictures=False)
     looks = solution_looks(world, solution)
     values = score_found(world, solution, looks) | stage_seconds(folder)
-    temporary = folder / f".{STRIP}.part"
-    found_strip(world, looks).save(temporary, format="PNG")
-    os.replace(temporary, folder / STRIP)
+    picture = io.BytesIO()
+    found_strip(world, looks).save(picture, format="PNG")
+    write_files(folder, {STRIP: picture.getvalue()})
     total = values[metric_key("time", SECONDS)]
     return Record(TABLE, PROTOCOL, METHOD, scene.key, scene.object, values, what.key(scene), seconds=total)
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from unirender.errors import UsageError
+from unirender.options import at_least
 from unirender_reference.optimize.config import OptimizeConfig
 
 LEAST_VIEWS = 4
@@ -38,8 +39,7 @@ class BenchUnknownMesh:
         Raises:
             UsageError: one is outside its range.
         """
-        if self.objects < 1:
-            raise UsageError(f"--objects {self.objects}: expected at least 1")
+        at_least(1, objects=self.objects)
         if self.views < LEAST_VIEWS:
             raise UsageError(
                 f"--views {self.views}: expected at least {LEAST_VIEWS}: fewer silhouettes enclose no object"

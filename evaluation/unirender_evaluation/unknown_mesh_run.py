@@ -1,6 +1,7 @@
 """A run of `unirender bench unknown-mesh`: measures with progress, prints, writes."""
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -9,6 +10,7 @@ from rich.console import Console
 
 from unirender_evaluation import unknown_mesh_tables
 from unirender_evaluation.multiview_scenes import scene_material
+from unirender_evaluation.optimiser_study import open_folder, write_files
 from unirender_evaluation.records import Record
 from unirender_evaluation.stratification import Material
 from unirender_evaluation.suites import Scene
@@ -30,6 +32,7 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
         progress: show where an optimisation stands.
     """
     names = {scene.key: scene_name(scene, scene_material(what.suite, scene)) for scene in scenes}
+    open_folder(what.out)
     records, computed = [], 0
     with contextlib.ExitStack() as shown:
 
@@ -45,8 +48,8 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
     made = unknown_mesh_tables.tables(records, names, what.settings)
     about = description(what)
     lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
-    _write(what, f"{NAME}.md", "\n".join(lines))
-    _write(what, f"{NAME}.json", unknown_mesh_tables.to_json(records, names, about))
+    content = unknown_mesh_tables.to_json(records, names, about)
+    write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
     for table in made:
         table.show(console)
     console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
@@ -65,12 +68,6 @@ def description(what: UnknownMesh) -> dict[str, str]:
         "resolution": f"{what.suite.spec.resolution}",
         "mitsuba": str(installed_version("mitsuba")),
         "cores": str(os.cpu_count()),
-        "code": what.versions.code[:12],
+        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
         "date": datetime.now(UTC).date().isoformat(),
     }
-
-
-def _write(what: UnknownMesh, name: str, text: str) -> None:
-    temporary = what.out / f".{name}.part"
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, what.out / name)

@@ -91,7 +91,6 @@ class WarmStart:
 
 def measure(what: WarmStart, scenes: Sequence[Scene]) -> Iterator[tuple[Record, bool]]:
     """The records of scenes, and whether each was measured now; those that are stored are not measured again."""
-    what.out.mkdir(parents=True, exist_ok=True)
     store = Store.open(what.out / "records.jsonl")
     for scene in scenes:
         case = Case(what, scene)

@@ -7,6 +7,7 @@ from typing import Literal
 import tyro
 
 from unirender.errors import UsageError
+from unirender.options import at_least
 from unirender_reference.optimize.single_config import SingleConfig
 
 
@@ -41,8 +42,7 @@ class BenchWarmStart:
         Raises:
             UsageError: one is outside its range.
         """
-        if self.scenes < 1:
-            raise UsageError(f"--scenes {self.scenes}: expected at least 1")
+        at_least(1, scenes=self.scenes)
         if not self.geometries or len(set(self.geometries)) < len(self.geometries):
             raise UsageError(f"--geometries {' '.join(self.geometries)}: expected at least one, none of them twice")
 

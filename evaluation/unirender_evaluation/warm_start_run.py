@@ -1,5 +1,6 @@
 """A run of `unirender bench warm-start`: measures with progress, prints, writes."""
 
+import hashlib
 import os
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -10,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender_evaluation import warm_start_tables
+from unirender_evaluation.optimiser_study import open_folder, write_files
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.versions import installed_version
@@ -39,6 +41,7 @@ def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Reco
         scenes: at least one.
         console: for progress and tables.
     """
+    open_folder(what.out)
     records, computed = [], 0
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
@@ -50,8 +53,8 @@ def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Reco
     made = warm_start_tables.tables(records, what.geometries)
     about = description(what)
     lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
-    _write(what.out / f"{NAME}.md", "\n".join(lines))
-    _write(what.out / f"{NAME}.json", warm_start_tables.to_json(records, what.geometries, about))
+    content = warm_start_tables.to_json(records, what.geometries, about)
+    write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
     for table in made:
         table.show(console)
     console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
@@ -66,12 +69,6 @@ def description(what: WarmStart) -> dict[str, str]:
         "prediction": f"{what.base.name} {what.base.config.get('weights', '')[:12]}".strip(),
         "mitsuba": str(installed_version("mitsuba")),
         "cores": str(os.cpu_count()),
-        "code": what.versions.code[:12],
+        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
         "date": datetime.now(UTC).date().isoformat(),
     }
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)

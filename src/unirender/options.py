@@ -181,3 +181,14 @@ class InputOptions:
         if picture.clipped > MANY_CLIPPED:
             notice(f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there")
         return picture
+
+
+def at_least(low: int, **options: int | None) -> None:
+    """Looks at options that have a least value; None is one that was not given.
+
+    Raises:
+        UsageError: one is below `low`.
+    """
+    for name, value in options.items():
+        if value is not None and value < low:
+            raise UsageError(f"--{name.replace('_', '-')} {value}: expected at least {low}")
