@@ -68,6 +68,8 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         Ingredient(FULL, "", "Full method", full),
         start("one-material", "one roughness and metallic instead of maps", materials="one"),
         start("no-correction", "no correction by path-traced pictures", rounds=0),
+        start("huber", "Huber's loss alone", sharpen=False),
+        start("coarse-light", "16 x 32 light cells, however smooth the surface", fine_below=0.0),
         start("rough-light", "light without smoothness", smooth_light=0.0),
         start("coloured-light", "light of any colour", neutral_light=0.0),
         start("rough-albedo", "base colour without smoothness", smooth_albedo=0.0),

@@ -129,7 +129,8 @@ def look_notes(settings: MultiviewSettings) -> tuple[str, ...]:
     """What the figures of the looks are."""
     return (
         "As in the multi-view table, by rendered buffers: inside the true mask, weighted by coverage; what the result "
-        "does not cover there is black, with roughness and metallic 0. Aligned: one least-squares factor.",
+        "does not cover there is black, with roughness and metallic 0. Aligned: one "
+        "least-squares factor in linear light, for albedo of the object, for relit of each picture.",
         f"Maps: all {settings.seen + settings.held_out} cameras; novel view and relit: the held-out ones, "
         f"{settings.truth_spp} spp, against results at {settings.spp} spp.",
     )

@@ -81,7 +81,8 @@ def tables(records: Sequence[Record], geometries: Sequence[str]) -> list[TextTab
 NOTES = (
     f"Differences are paired by picture: mean [{CONFIDENCE:.0%} bootstrap interval over objects]. Inside the true "
     "mask, weighted by coverage. Fit and relit: `shade` of the result under its own light, against the picture, and "
-    "under the object's other light, against Mitsuba's path tracing of the truth. Aligned: one least-squares factor.",
+    "under the object's other light, against Mitsuba's path tracing of the truth. Aligned: one "
+    "least-squares factor in linear light, for albedo of the object, for relit of each picture.",
     "Seconds: of the optimisation; a warm start's prediction comes on top. Cold and warm have the same configuration; "
     "a stage ends early when a step gains little.",
 )

@@ -23,7 +23,7 @@ class OptimizeConfig:
     texture_size: int = 128
     """Texels along each side of the textures."""
     light_rows: int = 16
-    """Rows of the environment; it has twice as many columns."""
+    """Rows of the environment, which has twice as many columns; 24 where the surface is smooth (`fine_below`)."""
     patience: int = 3
     """Looks at the held-out views without a gain of 0.02 dB, after which the refinement ends; its best state counts.
     0: it runs to its end. Without held-out views there is nothing to stop by."""

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender_reference.optimize.descent import interpolation
 from unirender_reference.optimize.differences import difference_matrix, side_by_side
 
 LEAST_SINE = 0.15  # of theta, in the weights of differences: columns meet at the poles
@@ -108,3 +109,14 @@ class LightGrid:
         fine = above * (1 - down) + below * down
         blocks = fine.reshape(self.rows, oversampling, self.columns, oversampling, 3)
         return blocks.mean(axis=(1, 3)).reshape(-1, 3).astype(np.float32)
+
+
+def interpolated_light(environment: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarray, "rows columns 3"]:
+    """The light on a finer grid of Mitsuba's `envmap`, interpolated as the renderer does."""
+    height, width = environment.shape[:2]
+    columns = width * rows // height
+    place = np.linspace(0, height - 1, rows)
+    low = np.minimum(place.astype(int), height - 2)
+    share = (place - low)[:, None, None]
+    taller = environment[low] * (1 - share) + environment[low + 1] * share
+    return np.einsum("jw,hwc->hjc", interpolation(columns, width, True), taller).astype(np.float32)

@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from unirender_reference.optimize.bsdf_lobes import F0
-from unirender_reference.optimize.huber import huber_cost
 from unirender_reference.optimize.pixel_fit import LEAST_ALBEDO, SCALE_SPREAD, Appearance, PixelFit
 from unirender_reference.optimize.roughness_nodes import NODES
 
@@ -71,7 +70,7 @@ def _costs(fit: PixelFit, appearance: Appearance) -> Float[np.ndarray, "p k"]:
             radiance = scale * gain + rest
             residual = np.abs(seen.weight * (radiance - seen.radiance))
             residual = np.where(seen.clipped & (radiance > seen.radiance), 0, residual)
-            columns.append(seen.sums @ huber_cost(residual).sum(axis=1).astype(np.float32))
+            columns.append(seen.sums @ fit.loss.cost(residual).sum(axis=1).astype(np.float32))
     return np.stack(columns, axis=1)
 
 

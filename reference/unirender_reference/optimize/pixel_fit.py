@@ -8,7 +8,7 @@ the matrices mixed for (r, m) (`material_mix`), a pixel's radiance is linear in 
 The surface is cut into patches of about a pixel's footprint. Base colour is `pattern` (of each pixel, known) times one
 scale for each patch and channel, which is eliminated: for any light and material the best scale has a closed form.
 
-Residuals are differences of display values in units of `SIGMA`, to first order, under Huber's loss; a pixel that shows
+Residuals are differences of display values in units of `SIGMA`, to first order, under a robust loss; a pixel that shows
 255 only says that the radiance is at least that.
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
 
-from unirender_reference.optimize.huber import huber_cost, huber_weight
 from unirender_reference.optimize.losses import tone_slope
 from unirender_reference.optimize.material_mix import Mixed, lobes_at, material_slopes, mixed
+from unirender_reference.optimize.robust import HUBER, Loss
 from unirender_reference.optimize.transport import Transport
 
 SIGMA = 0.01  # display values: rounding to 8 bits, and what the matrices leave out
@@ -109,7 +109,7 @@ class Prediction:
         gain: U E pattern: derivative of the radiance by the scale.
         radiance: I.
         residual: in units of SIGMA, before the robust loss.
-        robust: Huber's weights of the squared residuals, (0, 1]; 0 for a clipped pixel that the model is above of.
+        robust: the loss's weights of the squared residuals; 0 for a clipped pixel that the model is above of.
         scale: (P, 3) of the patches.
         free: (P, 3) where the scale lies inside its bounds.
         cost: robust squares of the residuals and of the scales' prior.
@@ -132,12 +132,14 @@ class PixelFit:
     Attributes:
         pattern: known variation of the base colour; ones where nothing is known.
         scale_prior: what the scales are drawn to: a grey where the pattern is ones, 1 for a known base colour.
+        loss: of the residuals.
     """
 
     transport: Transport
     seen: Observations
     pattern: Pixels
     scale_prior: float
+    loss: Loss = HUBER
 
     def coarse(self) -> "PixelFit":
         """The same for a light of half the rows and columns."""
@@ -172,10 +174,10 @@ class PixelFit:
             gain=gain,
             radiance=radiance,
             residual=residual,
-            robust=np.where(above, 0, huber_weight(size)),
+            robust=np.where(above, 0, self.loss.weight(size)),
             scale=scale,
             free=free,
-            cost=float(huber_cost(size).sum() + tie * ((scale - self.scale_prior) ** 2).sum()),
+            cost=float(self.loss.cost(size).sum() + tie * ((scale - self.scale_prior) ** 2).sum()),
         )
 
     def material_slopes(

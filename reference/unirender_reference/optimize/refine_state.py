@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender_reference.optimize.descent import PyramidAdam, interpolation
+from unirender_reference.optimize.descent import PyramidAdam
+from unirender_reference.optimize.light_grid import interpolated_light
 from unirender_reference.optimize.parameters import NAMES, Name, to_map, to_parameter
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.solution import Solution
@@ -107,14 +108,3 @@ class RefineState:
             own = [arrays[f"moment.{name}.{index}"] for index in range(len(state.moments[name].arrays()))]
             state.moments[name].restore(own, state.iteration)
         return state
-
-
-def interpolated_light(environment: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarray, "rows columns 3"]:
-    """The light on a finer grid of Mitsuba's `envmap`, interpolated as the renderer does."""
-    height, width = environment.shape[:2]
-    columns = width * rows // height
-    place = np.linspace(0, height - 1, rows)
-    low = np.minimum(place.astype(int), height - 2)
-    share = (place - low)[:, None, None]
-    taller = environment[low] * (1 - share) + environment[low + 1] * share
-    return np.einsum("jw,hwc->hjc", interpolation(columns, width, True), taller).astype(np.float32)

@@ -21,9 +21,9 @@ from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from unirender_reference.optimize.huber import huber_cost, huber_weight
 from unirender_reference.optimize.losses import tone_slope
 from unirender_reference.optimize.material_mix import Lobes, Mixed, lobes_at, material_slopes, mixed
+from unirender_reference.optimize.robust import HUBER
 from unirender_reference.optimize.roughness_nodes import NODES
 from unirender_reference.optimize.single_config import Priors
 from unirender_reference.optimize.single_picture import Picture
@@ -148,7 +148,7 @@ class Fit:
         residual = self.slope / self.noise * (model.image - self.picture.radiance)
         beyond = self.picture.saturated & (residual > 0)
         residual = np.where(beyond, 0, residual)
-        share = np.where(beyond, 0, huber_weight(np.abs(residual)))
+        share = np.where(beyond, 0, HUBER.weight(np.abs(residual)))
         return residual, share
 
     def misfit(self, model: Model) -> float:
@@ -157,7 +157,7 @@ class Fit:
         return float(np.sqrt(np.square(residual).mean() / np.mean(self.picture.coverage)))
 
     def cost(self, at: Unknowns, model: Model) -> float:
-        data = huber_cost(np.abs(self.residuals(model)[0])).sum()
+        data = HUBER.cost(np.abs(self.residuals(model)[0])).sum()
         pixels = np.sum(at.pixel * (self.q @ at.pixel)) + TOP * np.square(model.above).sum()
         light, gain = at.light @ self.k_light @ at.light, at.gain @ self.k_gain @ at.gain
         return float(data + pixels + light + gain + self._material_cost(at))

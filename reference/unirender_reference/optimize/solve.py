@@ -19,11 +19,11 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from unirender_reference.optimize.light_grid import LightGrid
+from unirender_reference.optimize.light_grid import LightGrid, interpolated_light
 from unirender_reference.optimize.light_solve import LightPrior, Solved, solve_light
 from unirender_reference.optimize.material_search import search_materials
 from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe, patches
-from unirender_reference.optimize.refine_state import interpolated_light
+from unirender_reference.optimize.robust import cauchy
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.surface_points import SurfacePoints, blocker, trace_points
@@ -38,7 +38,8 @@ GREY = 0.4
 STARTS = tuple(itertools.product((0.25, 0.7), (0.15, 0.85)))  # (roughness, metallic)
 POINTS = 16  # in a pixel
 LATER_ITERATIONS = 3  # after a correction
-FINE = LightGrid(32, 64)  # what mirrors need
+FINE = LightGrid(24, 48)  # what mirrors need
+LEAST_SCALE = 0.2  # of the residuals under Cauchy's loss, in units of SIGMA
 LEAST_SHARE = 1.5  # pixels for each of its texels
 
 OnStep = Callable[[Step], bool]
@@ -150,7 +151,15 @@ class _Work:
         solved = solve_light(self.fit, full, self.prior, self.config.iterations)
         narrow = solved.appearance.roughness[0] < self.config.fine_below and self.grid.rows < FINE.rows
         enough = min(len(self.points), self.config.fine_pixels) >= LEAST_SHARE * FINE.count
-        return self._finer(solved.appearance) if narrow and enough else solved
+        if narrow and enough:
+            solved = self._finer(solved.appearance)
+        return self._sharp(solved) if self.config.sharpen else solved
+
+    def _sharp(self, solved: Solved) -> Solved:
+        """Solved again under a loss at the residuals' own scale."""
+        size = np.abs(solved.prediction.residual)[~self.fit.seen.clipped]
+        self.fit = replace(self.fit, loss=cauchy(size, LEAST_SCALE))
+        return solve_light(self.fit, solved.appearance, self.prior, self.config.iterations)
 
     def _finer(self, found: Appearance) -> Solved:
         """A solution of one material, solved on for a finer light."""

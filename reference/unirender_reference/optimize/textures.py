@@ -10,7 +10,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from unirender_reference.optimize.differences import difference_matrix, side_by_side
-from unirender_reference.optimize.huber import huber_cost
+from unirender_reference.optimize.robust import HUBER
 from unirender_reference.optimize.surface_points import SurfacePoints
 from unirender_reference.optimize.texels import texel_weights
 
@@ -58,7 +58,7 @@ def best_smoothness(
     for smooth in SMOOTHNESS:
         texels = fit_texels(seen[~held], gain[~held], target[~held], weight[~held], start, smooth)
         residual = weight[held] * (gain[held] * (seen[held] @ texels) - target[held])
-        cost = float(huber_cost(np.abs(residual)).sum())
+        cost = float(HUBER.cost(np.abs(residual)).sum())
         if cost >= least:
             break
         best, least = smooth, cost

@@ -20,9 +20,11 @@ class TransportConfig:
     pixels: int = 9000
     """At most so many pixels of all views, drawn at random; memory and time grow with it."""
     fine_below: float = 0.25
-    """Below this roughness the light is solved for on 32 x 64 texels, if the views have pixels enough for it."""
+    """Below this roughness the light is solved for on 24 x 48 texels, if the views have pixels enough for it."""
     fine_pixels: int = 6000
     """At most so many of the pixels then."""
+    sharpen: bool = True
+    """Solve again under Cauchy's loss at the residuals' own scale: highlights that it lacks decide less."""
     iterations: int = 6
     """Steps of Levenberg-Marquardt, at most: of each start on a coarse light, and of the best one on the full light."""
     rounds: int = 2

@@ -5,16 +5,19 @@ import itertools
 from unirender_reference.optimize.transport_config import TransportConfig
 
 # What the parts take beside each other: seconds of one run of 8 views of 64 pixels on 2 cores. Only ratios count.
-MATRICES, START, FULL, MAPS, ROUND = 8.0, 0.6, 2.6, 2.2, 4.0
+MATRICES, START, FULL, SHARPER, MAPS, ROUND = 8.0, 0.6, 2.6, 2.0, 2.2, 4.0
 
 
 def solve_shares(config: TransportConfig, starts: int) -> list[float]:
-    """The share of all work that is done after each solve that the stage reports, if nothing ends it before.
+    """The share of all work that is done after each solve that the stage reports, if nothing ends it early.
+
+    A finer light, which is known to be needed only on the way, is not foreseen.
 
     Args:
         config: which solves there are.
         starts: materials that it starts from.
     """
+    full = FULL + (SHARPER if config.sharpen else 0)
     maps = [MAPS] if config.materials == "maps" else []
-    done = list(itertools.accumulate([MATRICES, *[START] * starts, FULL, *maps, *[ROUND] * config.rounds]))
+    done = list(itertools.accumulate([MATRICES, *[START] * starts, full, *maps, *[ROUND] * config.rounds]))
     return [work / done[-1] for work in done[1:]]

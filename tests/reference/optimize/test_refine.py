@@ -10,9 +10,9 @@ import refine_problems as problems
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference import backend
+from unirender_reference.optimize.light_grid import interpolated_light
 from unirender_reference.optimize.parameters import Name
 from unirender_reference.optimize.refine import Fit, RefineConfig, RefineState, refine
-from unirender_reference.optimize.refine_state import interpolated_light
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
 from unirender_reference.optimize.views import Step, Views
