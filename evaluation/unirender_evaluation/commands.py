@@ -233,15 +233,18 @@ class Bench:
     """The benchmark: score methods, write the report again, check the truth, export inputs; study the optimiser."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[BenchRun, tyro.conf.subcommand("run")]
-        | Annotated[BenchCheck, tyro.conf.subcommand("check")]
-        | Annotated[BenchExport, tyro.conf.subcommand("export")]
-        | Annotated[BenchReport, tyro.conf.subcommand("report")]
-        | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
-        | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
-        | Annotated[BenchRace, tyro.conf.subcommand("race")]
-        | Annotated[BenchUnknownMesh, tyro.conf.subcommand("unknown-mesh")]
-        | Annotated[BenchWarmStart, tyro.conf.subcommand("warm-start")]
+        Annotated[
+            Annotated[BenchRun, tyro.conf.subcommand("run")]
+            | Annotated[BenchCheck, tyro.conf.subcommand("check")]
+            | Annotated[BenchExport, tyro.conf.subcommand("export")]
+            | Annotated[BenchReport, tyro.conf.subcommand("report")]
+            | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
+            | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
+            | Annotated[BenchRace, tyro.conf.subcommand("race")]
+            | Annotated[BenchUnknownMesh, tyro.conf.subcommand("unknown-mesh")]
+            | Annotated[BenchWarmStart, tyro.conf.subcommand("warm-start")],
+            tyro.conf.arg(name=""),
+        ]
     ] = field()
 
     def run(self) -> int:

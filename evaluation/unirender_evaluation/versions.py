@@ -97,13 +97,13 @@ NOT_IN_RECORDS = (
     "workers",
 )
 # Commands and files of the optimiser: what it finds does not depend on them.
-NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "placement", "strips", "transforms")
+NOT_IN_OPTIMIZED = ("commands", "coverage", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR"),
         (
-            *(f"unirender/{name}.py" for name in ("cli", "commands", "options")),
+            *(f"unirender/{name}.py" for name in ("cli", "command_line", "commands", "options")),
             *(
                 f"unirender_evaluation/{name}.py"
                 for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, *OPTIMIZED, *VIEWS, *STUDIES, "versions")

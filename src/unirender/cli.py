@@ -19,11 +19,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from unirender.command_line import interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import notice
 from unirender.training.run import Train
-from unirender_evaluation.commands import Bench
+from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
+from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
+from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
+from unirender_evaluation.warm_start_command import BenchWarmStart
 from unirender_reference.commands import Dataset
 from unirender_reference.measure.commands import Reference
 from unirender_reference.measure.lights import Lights
@@ -84,6 +88,8 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
+RESUMABLE = (Dataset, Train, BenchRun, BenchTruth, BenchIngredients, BenchRace, BenchUnknownMesh, BenchWarmStart)
+
 
 def read_light(path: Path) -> "np.ndarray":
     """Radiance `[h w 3]` of a light file as it stands there: lat-long HDR or EXR, or a photograph."""
@@ -107,8 +113,11 @@ def predict_maps(image_srgb: "np.ndarray", mask: "np.ndarray", camera: "Camera")
 @functools.cache
 def shipped_pipeline() -> "UniRenderPipeline":
     """The shipped model, loaded once."""
+    import diffusers
+
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
+    diffusers.utils.logging.disable_progress_bar()  # of loading: two small files
     pipeline = UniRenderPipeline.from_pretrained()
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
@@ -137,29 +146,42 @@ def main(argv: list[str] | None = None) -> None:
 
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
-    if (sys.argv[1:] if argv is None else argv) == ["--version"]:
+    arguments = sys.argv[1:] if argv is None else argv
+    if arguments == ["--version"]:
         print(f"unirender {importlib.metadata.version('unirender')}")
         sys.exit(0)
-    command = tyro.cli(
-        Command, args=argv, prog="unirender", description="A physics-checked renderer and inverse renderer."
-    )
+    command = None
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
     try:
+        command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
         status = run(command)
-    except KeyboardInterrupt:
-        notice("interrupted")
-        status = 130
-    except Exception as error:
-        if os.environ.get("UNIRENDER_DEBUG"):
+    except (KeyboardInterrupt, Exception) as error:
+        if interrupted(error):
+            notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
+            status = 130
+        elif os.environ.get("UNIRENDER_DEBUG"):
             raise
-        kind = "" if isinstance(error, UnirenderError) else f"internal error: {type(error).__name__}: "
-        hint = "" if isinstance(error, UnirenderError) else " (UNIRENDER_DEBUG=1 shows where)"
-        notice(f"error: {kind}{' '.join(str(error).split())}{hint}")
-        status = 2 if isinstance(error, UsageError) else 1
+        else:
+            status = refuse(error)
     finally:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+def resumes(command: Any) -> bool:
+    """Whether a command that was stopped goes on when it is run again."""
+    if isinstance(command, Optimize):
+        return command.input.is_dir()
+    return isinstance(command.command if isinstance(command, Bench) else command, RESUMABLE)
+
+
+def refuse(error: BaseException) -> int:
+    """Prints an error as one line; returns the exit status."""
+    kind = "" if isinstance(error, UnirenderError) else f"internal error: {type(error).__name__}: "
+    hint = "" if isinstance(error, UnirenderError) else " (UNIRENDER_DEBUG=1 shows where)"
+    notice(f"error: {kind}{' '.join(str(error).split())}{hint}")
+    return 2 if isinstance(error, UsageError) else 1
 
 
 if __name__ == "__main__":

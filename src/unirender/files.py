@@ -57,30 +57,28 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     shown, path = path, Path(path).resolve()
     if path == Path.cwd() or path in Path.cwd().parents:
-        raise UsageError(
-            f"{shown}: is the folder that you are in (or one around it), expected a new one; name --output"
-        )
+        raise UsageError(f"{shown}: is the folder that you are in (or one around it), expected a new one; name another")
     if path.exists() and not path.is_dir():
         raise UnirenderError(f"{shown}: is a file, expected a folder to write to")
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            raise UnirenderError(f"{shown}: exists and is not empty; choose another --output or pass --overwrite")
+            raise UnirenderError(f"{shown}: exists and is not empty; choose another folder or pass --overwrite")
         if not (path / META_FILE).is_file():
             raise UnirenderError(
-                f"{shown}: has no {META_FILE}, expected an earlier result to overwrite; choose another --output"
+                f"{shown}: has no {META_FILE}, expected an earlier result to overwrite; choose another folder"
             )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
     except OSError as error:
-        raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another --output") from error
+        raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
     try:
         yield temporary
         os.chmod(temporary, 0o755)
         try:
             _move_into_place(temporary, path)
         except OSError as error:
-            raise UnirenderError(f"{shown}: cannot be replaced ({error.strerror}); choose another --output") from error
+            raise UnirenderError(f"{shown}: cannot be replaced ({error.strerror}); choose another folder") from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise

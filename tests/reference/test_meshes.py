@@ -214,7 +214,9 @@ def test_scene_graph_is_flattened_and_materials_stay_apart(tmp_path):
         ("text.glb", "this is no mesh", "no GLB file"),
         ("points.ply", "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
          "end_header\n0 0 0\n", "no faces"),
-        ("empty.obj", "# nothing\n", "no faces|cannot be read"),
+        ("empty.obj", "# nothing\n", "no faces"),
+        ("letter.obj", "Dear reader,\nthis is a letter.\n", "has no faces.* is it an OBJ file"),
+        ("points.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "has no faces.*: 3 lines of v, none of f"),
         ("nan.obj", "v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
         ("point.obj", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "zero extent"),
     ],

@@ -119,11 +119,16 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
         folder: where its MTL files and textures may lie.
 
     Raises:
-        UnirenderError: a line cannot be read, an index or a file is missing, or a limit is exceeded.
+        UnirenderError: no faces, a line cannot be read, an index or a file is missing, or a limit is exceeded.
     """
     check_bytes(path.stat().st_size, "the file")
     lines = _Lines()
     lines.read(path)
+    if not lines.sizes:
+        raise UnirenderError(
+            f"has no faces, expected a triangle mesh: {len(lines.points) // 3:,} lines of v, none of f; is it an OBJ "
+            "file?"
+        )
     points = np.array(lines.points).reshape(-1, 3)
     corners = np.array(lines.corners, np.int64).reshape(-1, 3)
     triangles, polygon = _fans(np.array(lines.sizes, np.int64))

@@ -10,6 +10,8 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.machine import require_cores
+from unirender_reference.optimize.option_checks import require_least
 from unirender_reference.optimize.single_config import SingleConfig
 
 if TYPE_CHECKING:
@@ -78,16 +80,11 @@ class Optimize:
 
         Raises:
             UsageError: one is outside its range, or options contradict each other.
+            UnirenderError: one asks for more than the machine has.
         """
-        for name in ("size", "most_views"):
-            value = getattr(self, name)
-            if value is not None and value < (8 if name == "size" else 1):
-                raise UsageError(f"--{name.replace('_', '-')} {value}: expected {8 if name == 'size' else 1} or more")
-        if self.hold_out < 0 or self.hold_out == 1 or self.threads < 0:
-            raise UsageError(
-                f"--hold-out {self.hold_out}, --threads {self.threads}: expected 0, or 2 and more held out in turn; 0 "
-                "or more threads"
-            )
+        require_least(self, "", {"size": 8, "most_views": 1, "threads": 0})
+        if self.hold_out < 0 or self.hold_out == 1:
+            raise UsageError(f"--hold-out {self.hold_out}: expected 2 or more, or 0 (those that the folder holds out)")
         if self.fov is not None and not 0 < self.fov < 180:
             raise UsageError(f"--fov {self.fov:g}: expected degrees between 0 and 180")
         self.config.check()
@@ -98,6 +95,12 @@ class Optimize:
         given += _changed(self.single, SingleConfig(), "single.") if folder else _changed(self.config, OptimizeConfig())
         if given:
             raise UsageError(f"{', '.join(given)}: of {kind}, but {self.input} is {'a folder' if folder else 'none'}")
+        if folder and self.mesh is not None:
+            changed = _changed(self.config, OptimizeConfig())
+            given = [option for option in changed if option.startswith("--shape")]
+            if given:
+                raise UsageError(f"{', '.join(given)}: of the reconstruction, but --mesh gives the shape")
+        require_cores(self.threads)
 
     def run(self, predict: Predict | None = None) -> int:
         """Optimises, or goes on; returns the exit status.
@@ -121,6 +124,7 @@ class Optimize:
 
         from unirender_reference.optimize.export import SOLUTION_FILE
         from unirender_reference.optimize.live import live_report
+        from unirender_reference.optimize.report import refinement_note
         from unirender_reference.optimize.run import optimize
 
         views, obj, place = self.read()
@@ -145,6 +149,8 @@ class Optimize:
             f"{self.out}: {len(views.seen)} views, {record['seconds']:.1f} s; masked PSNR of the pictures: {figures}; "
             f"IoU of the masks: {record['mask_iou']:.3f}"
         )
+        if note := refinement_note(record["stages"]):
+            print(note)
         return 0
 
     def read(self) -> "tuple[Views, MeshObject | None, Sphere]":
@@ -161,7 +167,7 @@ class Optimize:
             return placed(views, place), None, place
         obj, place = load_mesh_placed(self.mesh)
         views = placed(views, place)
-        check_alignment(views, obj)
+        check_alignment(views, obj, place, self.up)
         return views, obj, place
 
     def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "Progress") -> "Solution":
@@ -184,12 +190,15 @@ class Optimize:
         return solution_from_predictions(views, obj, predictions, self.config.texture_size, self.config.light_rows)
 
     def _run_picture(self, predict: Predict | None) -> int:
+        import time
+
         from rich.console import Console
 
         from unirender.files import new_folder, write_result
         from unirender_reference.optimize.live import live_report
         from unirender_reference.optimize.picture import history_text, read_picture_input
         from unirender_reference.optimize.report import Report
+        from unirender_reference.optimize.single_render import rerendered
         from unirender_reference.optimize.single_view import optimize_image
 
         given = read_picture_input(self.input, self.mask, self.fov, self.normal, self.size)
@@ -208,6 +217,7 @@ class Optimize:
                 steps.append(step)
                 report(Report(step, 1, 1, None, None))
 
+            began = time.perf_counter()
             start = None if predict is None else predict(given.image, given.mask, given.camera)
             found = optimize_image(
                 given.image,
@@ -220,11 +230,14 @@ class Optimize:
                 hdr=given.hdr,
                 on_step=on_step,
             )
+            seconds = time.perf_counter() - began
+            again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
-            write_result(folder, found, meta | {"config": dataclasses.asdict(self.single)})
+            meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(self.single)}
+            write_result(folder, found, meta, again.image_linear)
+            again.strip.save(folder / "views.png")
             (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
-        seconds = f": {steps[-1].seconds:.1f} s" if steps else ""
-        print(f"{self.out}{seconds}")
+        print(f"{self.out}: {seconds:.1f} s; masked PSNR of the picture, rendered again: {again.psnr_db:.2f} dB")
         return 0
 
 

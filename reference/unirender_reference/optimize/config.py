@@ -3,9 +3,15 @@
 from dataclasses import dataclass, field
 
 from unirender.errors import UsageError
+from unirender_reference.optimize.machine import require_memory
+from unirender_reference.optimize.option_checks import require_least
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.transport_config import TransportConfig
+
+# Bytes of memory, measured with textures of 512 and 1024 texels and lights of 16 to 48 rows.
+TEXEL_BYTES = 450.0  # for a texel of the textures or of a light that is refined: maps, their pyramids, Adam's moments
+PAIR_BYTES = 100.0  # for two columns of the light that the transport stage solves for: its normal equations
 
 
 @dataclass(frozen=True)
@@ -37,14 +43,20 @@ class OptimizeConfig:
 
         Raises:
             UsageError: one is outside its range.
+            UnirenderError: one takes more memory than the machine has.
         """
-        for name, least in (("texture_size", 4), ("light_rows", 8), ("patience", 0), ("shape_rounds", 0), ("seed", 0)):
-            if getattr(self, name) < least:
-                option = name.replace("_", "-")
-                raise UsageError(f"--{option} {getattr(self, name)}: expected {least} or more")
+        require_least(self, "", {"texture_size": 4, "light_rows": 8, "patience": 0, "shape_rounds": 0, "seed": 0})
+        require_least(self, "", {"save_seconds": 0})
         if self.light_rows % 2:
             raise UsageError(f"--light-rows {self.light_rows}: expected an even number")
-        if not self.save_seconds >= 0:
-            raise UsageError(f"--save-seconds {self.save_seconds:g}: expected 0 or more")
         self.transport.check()
         self.refine.check()
+        columns = 2.0 * self.light_rows**2
+        require_memory(
+            {
+                f"--texture-size {self.texture_size}": TEXEL_BYTES * self.texture_size**2,
+                f"--light-rows {self.light_rows}": columns
+                * (PAIR_BYTES * columns if self.transport.enabled else TEXEL_BYTES),
+                f"--refine.light-rows {self.refine.light_rows}": TEXEL_BYTES * 2.0 * self.refine.light_rows**2,
+            }
+        )

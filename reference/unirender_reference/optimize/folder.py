@@ -12,7 +12,6 @@ import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -23,22 +22,18 @@ from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.files import new_folder, write_png
 from unirender.pictures import check_mask, read_mask, read_picture
 from unirender_reference.meshes.images import area_means
-from unirender_reference.optimize.transforms import Frame, read_transforms
+from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
 from unirender_reference.optimize.views import SATURATED, View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
-Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)  # from +z up
 LEAST_SHARE = 1e-6  # of a new pixel: less is rounding
-LEAST_VALUE = 0.5 / 255
 
 _log = logging.getLogger("unirender.optimize")
 
-Up = Literal["y", "z"]
-
 
 def read_views(
-    folder: Path,
+    folder: str | Path,
     *,
     up: Up = "y",
     hold_out: int = 0,
@@ -60,6 +55,7 @@ def read_views(
     Raises:
         UnirenderError: one sentence that names the file and what is wrong with it.
     """
+    folder = Path(folder)
     main = next((folder / name for name in SEEN_FILES if (folder / name).is_file()), None)
     if main is None:
         there = "is no folder" if not folder.is_dir() else f"has no {' or '.join(SEEN_FILES)}"
@@ -77,31 +73,40 @@ def read_views(
         raise UnirenderError(f"{main}: all {len(frames)} pictures are held out, expected some to optimise against")
     both = {frame.file.resolve() for frame in seen} & {frame.file.resolve() for frame in held_out}
     if both:
-        raise UnirenderError(f"{folder}: {min(both).name} is both seen and held out; expected each picture once")
+        names = " and ".join(frame.name for frame in (*seen, *held_out) if frame.file.resolve() == min(both))
+        raise UnirenderError(f"{names}: one picture is both seen and held out; expected each once")
     seen, held_out = _spread(seen, most_views), _spread(held_out, most_views)
     hdr = {frame.file.suffix.lower() == ".exr" for frame in (*seen, *held_out)}
     if len(hdr) > 1:
         raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
     linear = hdr.pop()
+    sizes: set[str] = set()
     views = Views(
-        seen=tuple(_view(frame, folder, linear, up, longest_side) for frame in seen),
-        held_out=tuple(_view(frame, folder, linear, up, longest_side) for frame in held_out),
+        seen=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in seen),
+        held_out=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in held_out),
         hdr=linear,
     )
-    _warn(views, folder)
+    for size in sorted(sizes):
+        _log.warning("%s: %s", main, size)
+    try:
+        views.require_light()
+    except UnirenderError as error:
+        raise UnirenderError(f"{folder}: {error}") from error
+    _warn(views, [*seen, *held_out])
     return views
 
 
-def _warn(views: Views, folder: Path) -> None:
-    """Logs what is hardly meant: black pictures, and one picture twice."""
+def _warn(views: Views, frames: Sequence[Frame]) -> None:
+    """Logs what is hardly meant: black pictures, one picture twice, and a lens in pixels of another size."""
     names: dict[bytes, str] = {}
-    for view in (*views.seen, *views.held_out):
-        if view.mask.any() and view.image[view.mask[..., 0] > 0].max() < LEAST_VALUE:
-            _log.warning("%s: %s is black wherever its mask covers it", folder, view.name)
+    for view, frame in zip((*views.seen, *views.held_out), frames, strict=True):
+        if view.mask.any() and views.black(view):
+            _log.warning("%s: the picture is black wherever its mask covers it; leave it out", frame.name)
         digest = hashlib.sha256(view.image.tobytes() + view.mask.tobytes()).digest()
         if digest in names:
-            _log.warning("%s: %s and %s are the same picture; expected each once", folder, names[digest], view.name)
-        names.setdefault(digest, view.name)
+            other = names[digest].rpartition(": ")[2]
+            _log.warning("%s: the same picture as %s; expected each once", frame.name, other)
+        names.setdefault(digest, frame.name)
 
 
 def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
@@ -110,9 +115,10 @@ def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
     return [frames[index * len(frames) // most] for index in range(most)]
 
 
-def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None) -> View:
-    """Reads one picture with its mask."""
+def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, sizes: set[str]) -> View:
+    """Reads one picture with its mask; a lens in pixels of another size is noted among `sizes`."""
     image, mask, _ = read_picture_file(frame.file)
+    sizes |= frame.other_size(*image.shape[:2])
     if frame.mask is not None:
         mask = read_mask(frame.mask, image.shape[:2])
     if mask is None:
@@ -200,7 +206,7 @@ def reduced(view: View, longest_side: int, linear: bool) -> View:
     return View(np.clip(srgb_encode(image), 0, 1), mask, camera, view.pose, view.name, clipped)
 
 
-def write_views(views: Views, folder: Path) -> None:
+def write_views(views: Views, folder: str | Path) -> None:
     """Writes views as `read_views` reads them: PNG with alpha (8 bits), or EXR (float32) where they are `hdr`.
 
     Raises:

@@ -21,10 +21,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.color import display_slope, srgb_encode
+from unirender_reference.optimize.robust import cauchy
 from unirender_reference.optimize.views import View, Views
 
 LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
 EPSILON = 0.01  # of the relative loss
+LEAST_ERROR = 0.002  # display values: half a step of 8 bits; of the scale of errors
 
 Images = Float[np.ndarray, "n h w 3"]
 
@@ -47,6 +49,7 @@ class ImageLoss:
         self.target = np.stack([views.linear(view) for view in pictures])
         self.coverage = np.stack([view.mask for view in pictures])
         self._count = float(self.coverage.sum() * 3)
+        self._share: Images = np.ones_like(self.target)
         self.saturated: Bool[np.ndarray, "n h w 3"] = np.zeros(self.target.shape, bool)
         if one_sided:
             self.saturated = np.stack([views.saturated(view) for view in pictures]) & (self.coverage > 0)
@@ -71,8 +74,22 @@ class ImageLoss:
         counted = ~(self.saturated & (x > t))
         if background is None:
             counted &= self.coverage > 0
-        value = float(error.sum(where=counted, dtype=np.float64)) / self._count
-        return value, (np.where(counted, slope, 0) / self._count).astype(np.float32)
+        value = float((self._share * error).sum(where=counted, dtype=np.float64)) / self._count
+        return value, (np.where(counted, self._share * slope, 0) / self._count).astype(np.float32)
+
+    def weigh(self, images: Images) -> None:
+        """From now on pixels count by how well these images explain them: Cauchy's weights at the errors' own scale.
+
+        They are held fixed, so that a loss whose derivative is linear in x keeps its unbiased gradient.
+
+        Args:
+            images: premultiplied linear radiance, with little noise.
+        """
+        error = np.abs(tone_slope(self.target) * (images - self.target))
+        counted = (self.coverage > 0) & ~(self.saturated & (images > self.target))
+        if counted.any():
+            weight = cauchy(error[counted], LEAST_ERROR).weight(error)
+            self._share = (weight / weight[counted].mean()).astype(np.float32)
 
     def psnr(self, images: Images, other: Images | None = None) -> float:
         """Of display values over covered pixels, in dB.

@@ -12,7 +12,7 @@ def require_least(options: Any, group: str, least: Mapping[str, float], above: b
 
     Args:
         options: a dataclass.
-        group: its name on the command line.
+        group: its name on the command line; empty: none.
         least: by field, the smallest value that serves.
         above: the values have to be larger than that.
 
@@ -25,4 +25,6 @@ def require_least(options: Any, group: str, least: Mapping[str, float], above: b
             continue
         if not math.isfinite(value) or value < bound or (above and value == bound):
             wanted = f"more than {bound:g}" if above else f"{bound:g} or more"
-            raise UsageError(f"--{group}.{name.replace('_', '-')} {value:g}: expected {wanted}")
+            shown = f"{value:g}" if isinstance(value, float) else str(value)
+            prefix = f"{group}." if group else ""
+            raise UsageError(f"--{prefix}{name.replace('_', '-')} {shown}: expected {wanted}")

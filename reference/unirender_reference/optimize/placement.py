@@ -1,11 +1,6 @@
 """Where the object stands among the cameras: from its mesh or its masks into the unit sphere of the contract.
 
-A mesh lies where the masks are if its coverage of the pictures is theirs: intersection over union (IoU), the sum of the
-smaller over the sum of the larger of both coverages in all pixels of all pictures. Less than `LEAST_IOU` is refused;
-masks whose outline is wrong by half a pixel everywhere lower the demand, which counts where pictures are small.
-Measured with 14 objects and 6 views of 24, 64 and 160 pixels: masks rounded to 0 and 1, wrong by half a pixel, or
-blurred pass all; of 126 quarter and half turns of the meshes about an axis 121, 124 and 125 are refused. The others
-are half turns of objects that are nearly symmetric.
+A mesh has to cover the pictures as their masks do (`coverage`); where it does not, `misplaced` looks for the cause.
 """
 
 import dataclasses
@@ -17,26 +12,17 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.multiview import pose_towards
-from unirender_reference.optimize.shape.cameras import Cameras
-from unirender_reference.optimize.shape.tracer import MeshTracer
+from unirender_reference.optimize.coverage import coverage_of, least_iou, mask_iou
+from unirender_reference.optimize.misplaced import OPENCV, likely_cause
+from unirender_reference.optimize.transforms import Up
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import MeshObject, Sphere
 
 MARGIN = 1.05  # of a sphere that is known from masks alone
-LEAST_IOU = 0.88
-OUTLINE_ERROR = 0.5  # pixels by which masks may be wrong along their outline
-SIDES, MOST_RAYS = (4, 2), 3e7  # rays along the side of a pixel: the first number, unless it takes more rays
 FULL = 0.9  # of a frame: a mesh that covers as much may have a mask that covers all
 SHOWN = 3  # names in a message
 EDGES = (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])
-OPENCV = (
-    "are the poses in OpenCV's axes (+z forward)? negate columns 2 and 3 of each transform_matrix; or world to camera? "
-    "invert them"
-)
-OTHER_AXES = (
-    "try --up z (poses with +z up, as Blender and NeRF's synthetic scenes have them, and a glTF mesh), or "
-    "another mesh; do its units and axes, and the masks, belong to the poses?"
-)
+UNIT_SPHERE = Sphere(np.zeros(3), 1.0)
 
 
 def placed(views: Views, sphere: Sphere) -> Views:
@@ -114,27 +100,14 @@ def _names(names: Sequence[str]) -> str:
     return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
 
 
-def coverage_of(views: Sequence[View], obj: MeshObject) -> Float[np.ndarray, "k h w"]:
-    """The share of each pixel that the mesh covers, sampled on a grid."""
-    cameras = Cameras(views)
-    rays = len(cameras) * cameras.height * cameras.width * SIDES[0] ** 2
-    return MeshTracer(obj.vertices, obj.faces).coverage(cameras, SIDES[0] if rays <= MOST_RAYS else SIDES[1])
-
-
-def mask_iou(views: Sequence[View], coverage: Float[np.ndarray, "k h w"]) -> float:
-    """Intersection over union of masks and coverage, over all pictures together."""
-    masks = np.stack([view.mask[..., 0] for view in views])
-    return float(np.minimum(masks, coverage).sum() / max(float(np.maximum(masks, coverage).sum()), 1e-9))
-
-
-def least_iou(coverage: Float[np.ndarray, "k h w"]) -> float:
-    """The IoU below which masks are not those of a mesh with this coverage."""
-    outline = float(((coverage > 0) & (coverage < 1)).sum())
-    return max(0.0, LEAST_IOU - OUTLINE_ERROR * outline / max(float(coverage.sum()), 1e-9))
-
-
-def check_alignment(views: Views, obj: MeshObject) -> None:
+def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, up: Up = "y") -> None:
     """Looks whether a mesh lies where the masks are.
+
+    Args:
+        views: in the unit sphere of the mesh.
+        obj: the mesh.
+        place: where it stood among the poses as they were given; for the message, as the next.
+        up: which way was up in these.
 
     Raises:
         UnirenderError: a mask covers a whole frame that the mesh does not, or masks and mesh overlap too little.
@@ -144,13 +117,14 @@ def check_alignment(views: Views, obj: MeshObject) -> None:
     full = [view.name for view, own in pairs if view.mask.min() > 0.5 and own.mean() < FULL]
     if full:
         raise _no_outline(full)
-    iou, least = mask_iou(views.seen, coverage), least_iou(coverage)
+    iou, least = mask_iou(views.seen, coverage), least_iou(views.seen)
     if iou >= least:
         return
-    away = sum(float(view.pose[:3, 2] @ view.pose[:3, 3]) <= 0 for view in views.seen)  # the object is at the origin
-    hint = (
-        f"{away} of {len(views.seen)} cameras look away from it: {OPENCV}" if 2 * away > len(views.seen) else OTHER_AXES
-    )
+    try:
+        shown = sphere_of_masks(views)
+    except UnirenderError:  # the masks do not tell
+        shown = None
+    hint = likely_cause(views.seen, obj, least, place, up, shown)
     raise UnirenderError(
         f"mesh {obj.name}: it covers other pixels than the masks of the pictures: IoU (intersection over union) "
         f"{iou:.2f}, expected at least {least:.2f}; {hint}"
@@ -165,7 +139,7 @@ def check_in_picture(mask: Float[np.ndarray, "h w 1"], camera: Camera, obj: Mesh
     """
     view = View(np.zeros((*mask.shape[:2], 3), np.float32), mask, camera, pose_towards(0, 0, camera))
     coverage = coverage_of([view], obj)
-    iou, least = mask_iou([view], coverage), least_iou(coverage)
+    iou, least = mask_iou([view], coverage), least_iou([view])
     if iou < least:
         raise UnirenderError(
             f"--mesh {obj.name}: it covers other pixels than the picture's mask: IoU (intersection over union) "

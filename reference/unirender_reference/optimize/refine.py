@@ -22,6 +22,7 @@ from unirender_reference.passes import derive_seed
 __all__ = ["RefineConfig", "RefineState", "refine"]
 
 LIGHT_WIDTH, TEXTURE_WIDTH = 0.1, 0.02  # of the smoothness priors
+WEIGHT_SPP = 256  # of the pictures that say what the start explains
 HELD_OUT_SPP = 64  # always the same samples: differences between steps are sharper than the figure
 
 Maps = Mapping[str, Float[np.ndarray, "..."]]
@@ -52,6 +53,8 @@ def refine(
     state = RefineState.begin(start, config) if state is None else state
     began = time.perf_counter()
     fit = Fit(views, state.solution(start, config), config)
+    if config.robust:
+        fit.weigh(state.maps(config, state.first))
     while state.iteration < config.iterations:
         values = fit.step(state)
         if not on_step(Step("refine", state.iteration, time.perf_counter() - began, values)):
@@ -93,6 +96,11 @@ class Fit:
         self.scene = TexturedScene(first, views.seen, config.depth)
         self.loss = ImageLoss(views, config.loss, config.one_sided)
         self._held_out = HeldOut(views, first, config) if config.held_out_every and views.held_out else None
+
+    def weigh(self, maps: Maps) -> None:
+        """Lets pixels count, from now on, by how well these maps explain them."""
+        images = self.scene.image(maps, WEIGHT_SPP, derive_seed(self.config.seed, "weights"))
+        self.loss.weigh(images[..., :3])
 
     def step(self, state: RefineState) -> dict[str, float]:
         """One step of Adam; returns the losses by name."""

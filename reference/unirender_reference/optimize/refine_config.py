@@ -21,6 +21,8 @@ class RefineConfig:
     """How pictures are compared; `losses` has the equations. "log" is NvDiffRec's."""
     one_sided: bool = True
     """More light than a display shows is no error where the picture is saturated."""
+    robust: bool = True
+    """Pixels count by how well the start explains them, under Cauchy's loss at the errors' own scale."""
     spp: int = 16
     """Samples per pixel of the picture."""
     spp_gradient: int = 8
@@ -35,9 +37,9 @@ class RefineConfig:
     """Steps in display values of albedo and logarithms of light, or in the linear values themselves."""
     albedo_rate: float = 0.01
     """Learning rate of the albedo, in display values or linear ones."""
-    roughness_rate: float = 0.005
+    roughness_rate: float = 0.002
     """Learning rate of roughness."""
-    metallic_rate: float = 0.005
+    metallic_rate: float = 0.002
     """Learning rate of metallic."""
     light_rate: float = 0.005
     """Learning rate of the light, in natural logarithms or linear radiance."""
@@ -98,8 +100,10 @@ class RefineConfig:
         require_least(self, "refine", {"beta_2": 0})
         if self.beta_2 >= 1:
             raise UsageError(f"--refine.beta-2 {self.beta_2}: expected less than 1")
-        if self.light_rows:
-            require_least(self, "refine", {"light_rows": LEAST_LIGHT_ROWS})
+        if self.light_rows and self.light_rows < LEAST_LIGHT_ROWS:
+            raise UsageError(
+                f"--refine.light-rows {self.light_rows}: expected {LEAST_LIGHT_ROWS} or more, or 0 (as the start has)"
+            )
 
     @classmethod
     def plain(cls, iterations: int = 800) -> "RefineConfig":
@@ -108,6 +112,7 @@ class RefineConfig:
             iterations=iterations,
             loss="srgb",
             one_sided=False,
+            robust=False,
             spp=16,
             spp_gradient=16,
             decorrelated=True,

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,9 +54,10 @@ class RefineState:
         }
         return cls(0, {name: values.copy() for name, values in first.items()}, moments, first)
 
-    def maps(self, config: RefineConfig) -> dict[str, Float[np.ndarray, "..."]]:
-        """What a `TexturedScene` shows."""
-        maps = {name: to_map(name, self.parameters[name], config.parametrisation) for name in NAMES}
+    def maps(self, config: RefineConfig, parameters: Mapping[Name, Any] | None = None) -> dict[str, Any]:
+        """What a `TexturedScene` shows: the present parameters, or others, such as `first`."""
+        shown = self.parameters if parameters is None else parameters
+        maps = {name: to_map(name, shown[name], config.parametrisation) for name in NAMES}
         return {name: values[..., 0] if name in ("roughness", "metallic") else values for name, values in maps.items()}
 
     def solution(self, start: Solution, config: RefineConfig) -> Solution:

@@ -1,7 +1,8 @@
-"""Where an optimisation stands, for whoever shows it. Light to import."""
+"""Where an optimisation stands, and what to say of it at its end, for whoever shows it. Light to import."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from unirender_reference.optimize.views import Step
 
@@ -26,3 +27,13 @@ class Report:
 
 
 Progress = Callable[[Report], None]
+
+
+def refinement_note(stages: Sequence[Mapping[str, Any]]) -> str | None:
+    """A sentence where a refinement found nothing better than its start; None: each did.
+
+    Args:
+        stages: of `solution.json`.
+    """
+    idle = [row["stage"] for row in stages if row.get("kept_step") == 0]
+    return f"{', '.join(idle)}: no gain on the held-out views, the start was kept" if idle else None

@@ -13,6 +13,7 @@ from typing import Any
 
 from unirender.errors import UnirenderError
 from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
 from unirender_reference.optimize.report import Progress, Report
 from unirender_reference.optimize.result import write_result
@@ -25,7 +26,8 @@ from unirender_reference.optimize.watch import FIGURE, Watch
 from unirender_reference.shapes import MeshObject, Sphere
 from unirender_reference.versions import versions
 
-SHAPE, TRANSPORT, REFINE, RESHAPE = "shape", "transport", "refine", "reshape"
+SHAPE, CARVE, TRANSPORT, REFINE, RESHAPE = "shape", "carve", "transport", "refine", "reshape"
+COMPARED_SPP = 64  # twice, of the pictures that tell the better solution
 
 
 def optimize(
@@ -43,12 +45,13 @@ def optimize(
     """Finds textures, light and, where it is not given, the shape of an object from pictures of it.
 
     Args:
-        views: pictures with cameras; the object lies in the unit sphere of their world.
+        views: pictures with cameras; the object lies in the unit sphere of their world (`placement.placed`). Linear
+            ones may have any scale: the work is done at one exposure, and the light that is found has their scale.
         obj: the mesh; None: it is reconstructed from the masks. Its own textures do not count. A mesh without
             texture coordinates of its own for each point of the surface gets new ones.
         config: the stages.
         out: folder of the run, which goes on where an earlier process left it; None: nothing is written.
-        init: a start instead of the transport stage (and of `obj`).
+        init: a start instead of the transport stage (and of `obj`); its light has the scale of the pictures.
         progress: called after every step.
         place: where the object stands in its own units, for the mesh file.
         pictures: whether to render strips to look at, too.
@@ -57,25 +60,37 @@ def optimize(
             derivatives round in another order each time.
 
     Raises:
-        UnirenderError: the folder holds another run, or what a stage says.
+        UnirenderError: the folder holds another run, all pictures are black, the masks do not bound an object that has
+            no mesh, or what a stage says.
     """
     config.check()
     if init is not None and obj is not None:
         raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")
+    views.require_light()
+    if obj is None and init is None:
+        from unirender_reference.optimize.shape.bounds import check_masks
+
+        check_masks(views, config.shape.cells)
+    exposure = exposure_of_views(views)
     header = {
         "config": {name: value for name, value in dataclasses.asdict(config).items() if name != "save_seconds"},
-        "inputs": fingerprint(views, obj, init) | {"place": _described(place)},
+        "inputs": fingerprint(views, obj, init) | {"place": _described(place), "exposure": exposure},
         "versions": versions(denoise=False),
     }
     with contextlib.ExitStack() as stack:
         stack.enter_context(renderer_threads(threads))
         folder = None if out is None else stack.enter_context(open_run(out, header))
         show = progress or (lambda report: None)
-        run = _Run(views, config, folder, show, _plan(obj, init, config), began)
-        solution = run.solution(obj, init)
+        run = _Run(divided_views(views, exposure), config, folder, show, _plan(obj, init, config), began)
+        solution = lit(run.solution(obj, None if init is None else lit(init, 1 / exposure)), exposure)
         if folder is not None and not _written(folder, pictures):
-            files = write_result(solution, views, folder, header, place, pictures=pictures, clock=lambda: run.seconds)
-            folder.save(run.seconds, {"written": files, "pictures": pictures})
+            finished = folder.progress.seconds if folder.progress.live.get("written") else None  # files were lost since
+
+            def seconds() -> float:
+                return run.seconds if finished is None else finished
+
+            files = write_result(solution, views, folder, header, place, pictures=pictures, clock=seconds)
+            folder.save(seconds(), {"written": files, "pictures": pictures})
     return solution
 
 
@@ -120,7 +135,9 @@ def _plan(obj: MeshObject | None, init: Solution | None, config: OptimizeConfig)
         return [TRANSPORT, REFINE]
     again = TRANSPORT if config.transport.enabled else REFINE
     rounds = [name for k in range(1, config.shape_rounds + 1) for name in (f"{RESHAPE}-{k}", f"{again}-{k}")]
-    return [SHAPE, TRANSPORT, *rounds, REFINE] if again == TRANSPORT else [SHAPE, TRANSPORT, REFINE, *rounds]
+    if again == REFINE:
+        return [SHAPE, TRANSPORT, REFINE, *rounds]
+    return [SHAPE, TRANSPORT, *([CARVE] if config.shape.carve else []), *rounds, REFINE]
 
 
 class _Run:
@@ -166,27 +183,47 @@ class _Run:
 
             return reconstruct(self.views, shape, self._on_step(name, shape.mask_steps))
         if kind == TRANSPORT:
-            from unirender_reference.optimize.solve import STARTS, solve_appearance
-            from unirender_reference.optimize.transport_progress import solve_shares
-
             mesh = found.obj if isinstance(found, Solution) else found
             assert mesh is not None  # given, or found by the stage before
-            shares = solve_shares(config.transport, len(STARTS))
-            return solve_appearance(
-                self.views,
-                mesh,
-                config.transport,
-                self._on_step(name, len(shares), shares=shares),
-                config.texture_size,
-                config.light_rows,
-                config.seed,
-            )
+            return self._solved(name, mesh)
         assert isinstance(found, Solution)
+        if kind == CARVE:
+            from unirender_reference.optimize.shape.carve import carved_object
+
+            hollow = carved_object(self.views, shape)
+            if hollow is not None:
+                return self._better(found, self._solved(name, hollow))
+            self._on_step(name, 1)(Step(name, 1, 0.0, {"hollows": 0.0}))
+            return found
         if kind == RESHAPE:
             from unirender_reference.optimize.shape.refine_shape import refine_shape
 
             return refine_shape(self.views, found, shape, self._on_step(name, shape.image_steps))
         return self._refine(name, found)
+
+    def _solved(self, name: str, mesh: MeshObject) -> Solution:
+        from unirender_reference.optimize.solve import STARTS, solve_appearance
+        from unirender_reference.optimize.transport_progress import solve_shares
+
+        config = self.config
+        shares = solve_shares(config.transport, len(STARTS))
+        on_step = self._on_step(name, len(shares), shares=shares)
+        return solve_appearance(
+            self.views, mesh, config.transport, on_step, config.texture_size, config.light_rows, config.seed
+        )
+
+    def _better(self, *solutions: Solution) -> Solution:
+        """The one that explains the pictures best."""
+        from unirender_reference.optimize.losses import ImageLoss
+        from unirender_reference.optimize.solution_scene import solution_images
+
+        seen, loss = self.views.seen, ImageLoss(self.views)
+
+        def explained(solution: Solution) -> float:
+            one, other = (solution_images(solution, seen, COMPARED_SPP, seed)[..., :3] for seed in (0, 1))
+            return loss.psnr(one, other)
+
+        return max(solutions, key=explained)
 
     def _on_step(
         self, name: str, total: int, first: int = 0, shares: Sequence[float] | None = None

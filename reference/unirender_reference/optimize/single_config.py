@@ -5,12 +5,16 @@ looks like many a dielectric under another light. Everything that a picture leav
 widths are standard deviations, most of them of logarithms, so that twice and half as much cost the same.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 from unirender.errors import UsageError
+from unirender_reference.optimize.machine import require_memory
 from unirender_reference.optimize.option_checks import require_least
+
+MATRIX_BYTES = 96.0  # of memory for a pixel and a column of the light: 24 matrices (`transport`)
 
 
 @dataclass(frozen=True)
@@ -112,21 +116,26 @@ class SingleConfig:
     """Of the places of surface points within their pixels."""
 
     def __post_init__(self) -> None:
-        require_least(self, "single", {"fine_steps": 0, "noise_factor": 0, "seed": 0})
+        counts = {"fine_steps": 0, "seed": 0, "coarse_pixels": 16, "pixels": 16, "light_rows": 4}
+        require_least(self, "single", counts | {"noise_factor": 0})
         for name, widths in (("priors", self.priors), ("trust", self.trust)):
             fields = {} if widths is None else dict.fromkeys(asdict(widths), 0)
             require_least(widths, f"single.{name}", fields, above=name == "priors")
         if min(self.steps, default=0) < 0:
-            raise UsageError(f"--single.steps {' '.join(map(str, self.steps))}: expected 0 or more each")
+            raise UsageError(f"--single.steps {_words(self.steps)}: expected 0 or more each")
+        if not all(0 < misfit < math.inf for misfit in self.noise):
+            raise UsageError(f"--single.noise {_words(self.noise)}: expected more than 0 each")
         if len(self.steps) != len(self.noise) or not self.steps:
             raise UsageError(
-                f"steps, noise: got {len(self.steps)} and {len(self.noise)} stages, expected as many, >= 1"
+                f"--single.steps {_words(self.steps)}, --single.noise {_words(self.noise)}: expected as many numbers "
+                "in both, a pair for each stage"
             )
-        if min(self.noise) <= 0 or min(self.pixels, self.coarse_pixels) < 16 or self.light_rows < 4:
-            raise UsageError(
-                f"got noise {self.noise}, pixels {self.pixels}, coarse_pixels {self.coarse_pixels}, light_rows "
-                f"{self.light_rows}; expected noise > 0, at least 16 pixels and 4 rows"
-            )
+        entries = min(self.pixels, self.coarse_pixels) * 2.0 * self.light_rows**2
+        require_memory({f"--single.light-rows {self.light_rows}": MATRIX_BYTES * entries})
+
+
+def _words(values: Iterable[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 COLD: Mapping[str, float] = MappingProxyType({"albedo": 0.25, "roughness": 0.5, "metallic": 0.5})

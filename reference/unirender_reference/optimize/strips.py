@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
@@ -21,10 +22,11 @@ from unirender_reference.sheets import LIGHT, environment_preview, table_sheet
 RELIT = ("blender-studio", "blender-sunset", "pmndrs-forest", "blender-night")
 TURNS, ELEVATION_DEG = 8, 15.0
 SHOWN_VIEWS, LEAST_SIDE = 8, 96
+MOST_LETTERS = 18  # of a picture's name above its column
 
 
 def views_strip(views: Views, found: Float[np.ndarray, "n h w 4"]) -> Image.Image:
-    """Given above found, for some of the views; those that are held out are marked.
+    """Given above found, for some of the views under their names; those that are held out are marked.
 
     Args:
         views: seen, then held out.
@@ -35,8 +37,16 @@ def views_strip(views: Views, found: Float[np.ndarray, "n h w 4"]) -> Image.Imag
     times = max(1, LEAST_SIDE // max(views.height, views.width))
     given = [_enlarged(_over(views.linear(every[k]), every[k].mask), times) for k in chosen]
     rendered = [_enlarged(_over(found[k][..., :3], found[k][..., 3:]), times) for k in chosen]
-    labels = [f"view {k}" + ("\nheld out" if k >= len(views.seen) else "\n") for k in chosen]
+    names = short_names([view.name for view in every])
+    labels = [names[k] + ("\nheld out" if k >= len(views.seen) else "\n") for k in chosen]
     return table_sheet([given, rendered], ["given", "found"], labels)
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Names of pictures without folder and suffix, where these still differ; of long ones, the end."""
+    stems = [PurePosixPath(name).stem for name in names]
+    shown = stems if len(set(stems)) == len(set(names)) else names
+    return [name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}" for name in shown]
 
 
 def turntable(solution: Solution, side: int = 96, spp: int = 36) -> Image.Image:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,9 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 
+Up = Literal["y", "z"]
+
+Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)  # from a world with +z up
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp")  # tried where a path of a picture has none
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -68,6 +71,16 @@ class Frame:
             return Camera(fov_deg, (center[0] / width, center[1] / height))
         except (UnirenderError, ZeroDivisionError) as error:
             raise UnirenderError(f"{self.name}: focal length {focal:g} pixels, expected more than 0") from error
+
+    def other_size(self, height: int, width: int) -> set[str]:
+        """A sentence, if focal length or centre count in pixels of another size than the picture has."""
+        stated = self._number("w", width), self._number("h", height)
+        if stated == (width, height) or not {"fl_x", "fl_y", "cx", "cy"} & self.values.keys():
+            return set()
+        return {
+            f"pictures are {width} x {height}, w and h say {stated[0]:g} x {stated[1]:g}: focal lengths and cx, cy are "
+            f"multiplied by {height / stated[1]:.4g}"
+        }
 
     def _focal(self, width: float, height: float) -> float:
         """In pixels of the stated size."""
@@ -171,7 +184,7 @@ def _pose(entry: Mapping[str, Any], where: str) -> Float[np.ndarray, "4 4"]:
         pose = np.concatenate([pose, [[0, 0, 0, 1]]])
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.allclose(pose[3], [0, 0, 0, 1], atol=1e-6):
         raise UnirenderError(
-            f"{where}: transform_matrix is no 4 x 4 matrix of finite numbers with the last row 0 0 0 1; expected "
-            "camera to world"
+            f"{where}: transform_matrix is no 4 x 4 matrix of finite numbers with the last row 0 0 0 1, and no 3 x 4 "
+            "matrix without that row; expected camera to world"
         )
     return pose

@@ -12,6 +12,7 @@ from unirender.errors import UnirenderError
 ROTATION_TOLERANCE = 1e-3
 RANGE_TOLERANCE = 1e-3
 SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
+BLACK = 0.5 / 255  # display values of 8 bits below are 0
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class View:
 
     Attributes:
         image: (h, w, 3) straight colour, as in a PNG with alpha (not premultiplied; whatever it is where the mask is
-            0): display values in [0, 1], or linear radiance in display units if the views are `hdr`.
+            0): display values in [0, 1], or linear radiance of any scale if the views are `hdr`.
         mask: (h, w, 1) coverage, [0, 1].
         camera: vertical field of view and principal point.
         pose: (4, 4) camera to world: columns are the camera's right, up, towards the viewer, and its position.
@@ -67,7 +68,7 @@ class Views:
     Attributes:
         seen: what is optimised against.
         held_out: what the fit is watched by (early stop), never optimised against; may be empty.
-        hdr: images are linear radiance in display units; else display values, clipped at 1.
+        hdr: images are linear radiance, of one scale; else display values, clipped at 1.
     """
 
     seen: tuple[View, ...]
@@ -102,6 +103,23 @@ class Views:
         if self.hdr:
             return np.zeros(view.image.shape, bool)
         return view.image >= SATURATED if view.clipped is None else view.clipped
+
+    def black(self, view: View) -> bool:
+        """Whether a picture shows no light wherever its mask covers it."""
+        covered = view.image[view.mask[..., 0] > 0]
+        return float(covered.max(initial=0)) <= (0 if self.hdr else BLACK)
+
+    def require_light(self) -> None:
+        """Looks whether there is anything to see.
+
+        Raises:
+            UnirenderError: all pictures are black wherever their masks cover them.
+        """
+        if all(map(self.black, self.seen)):
+            raise UnirenderError(
+                f"views: all {len(self.seen)} pictures are black wherever their masks cover them, expected an object "
+                "under light; do the masks belong to the pictures?"
+            )
 
     def linear(self, view: View) -> Float[np.ndarray, "h w 3"]:
         """The picture as premultiplied linear radiance; display values of 1 may stand for more."""

@@ -72,7 +72,7 @@ def test_angle_of_view_across_the_width_is_the_same_camera(folder: Path):
     same_views(views, read_views(edited(folder, as_angle)), 0.0)
 
 
-def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path):
+def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path, caplog: pytest.LogCaptureFixture):
     """Pictures at half the stated size (instant-ngp's images_2) have the same camera."""
     views = read_views(folder)
 
@@ -82,7 +82,14 @@ def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path):
             for key in ("fl_x", "fl_y", "cx", "cy"):
                 frame[key] *= 2
 
-    same_views(views, read_views(edited(folder, doubled)), 0.0)
+    with caplog.at_level(logging.WARNING, "unirender"):
+        same_views(views, read_views(folder), 0.0)
+        assert not caplog.text
+        same_views(views, read_views(edited(folder, doubled)), 0.0)
+    assert (
+        caplog.text.count("pictures are 16 x 12, w and h say 32 x 24: focal lengths and cx, cy are multiplied by 0.5")
+        == 1
+    )
 
 
 def test_pictures_without_suffix_in_the_layout_of_nerf_synthetic(folder: Path):
@@ -183,9 +190,10 @@ def test_black_pictures_and_one_picture_twice_are_noticed(folder: Path, caplog: 
         Image.fromarray(pixels).save(folder / "images/0001.png")
         shutil.copy(folder / "images/0000.png", folder / "images/0002.png")
         read_views(edited(folder, lambda content: content["frames"].append(content["frames"][3])))
-    assert "images/0001.png is black wherever its mask covers it" in caplog.text
-    assert "images/0000.png and images/0002.png are the same picture" in caplog.text
-    assert "images/0003.png and images/0003.png are the same picture" in caplog.text
+    said = caplog.text
+    assert "frames[1] (images/0001.png): the picture is black wherever its mask covers it; leave it out" in said
+    assert "frames[2] (images/0002.png): the same picture as frames[0] (images/0000.png)" in said
+    assert "frames[4] (images/0003.png): the same picture as frames[3] (images/0003.png)" in said
 
 
 def broken(change: Callable[[dict], object]) -> Callable[[Path], object]:
@@ -234,6 +242,13 @@ def other_size(folder: Path) -> None:
     Image.open(folder / "images/0000.png").resize((32, 24)).save(folder / "images/0000.png")
 
 
+def all_black(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        pixels = np.asarray(Image.open(path)).copy()
+        pixels[..., :3] = 0
+        Image.fromarray(pixels).save(path)
+
+
 def seen_and_held_out(folder: Path) -> None:
     shutil.copy(folder / "transforms.json", folder / "transforms_test.json")
 
@@ -275,7 +290,12 @@ BAD = {
         broken(lambda content: [frame.update(held_out=True) for frame in content["frames"]]),
         "all 4 pictures are held out",
     ),
-    "seen and held out": (seen_and_held_out, "is both seen and held out"),
+    "seen and held out": (
+        seen_and_held_out,
+        r"transforms.json: frames\[0\] .* and .*transforms_test.json: frames\[0\] .* both seen and held out",
+    ),
+    "all black": (all_black, "all 4 pictures are black wherever their masks cover them"),
+    "rows of a pose": (first(transform_matrix=np.eye(4)[:2].tolist()), "no 3 x 4 matrix without that row"),
     "no mask": (opaque, "has no alpha channel, and its frame no mask_path"),
     "empty mask": (empty_mask, "the mask is empty"),
     "mask missing": (first(mask_path="gone.png"), "gone.png: no such file"),

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from unirender_reference.optimize.live import clock, live_report
 from unirender_reference.optimize.plots import loss_curve
-from unirender_reference.optimize.report import Report
+from unirender_reference.optimize.report import Report, refinement_note
 from unirender_reference.optimize.views import Step
 
 FIRST = Report(Step("transport", 1, 2.4, {"cost": 12.5}), 1, 2, None, None)
@@ -46,18 +46,47 @@ def test_clock(seconds: float, shown: str):
     assert clock(seconds) == shown
 
 
+def drawn(history: list[dict], path: Path) -> np.ndarray:
+    loss_curve(history, path)
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def blue_rows(image: np.ndarray) -> list[float]:
+    """The height of a line in matplotlib's first colour, column by column, in pixels from the top."""
+    blue = (image[..., 2] - image[..., 0] > 60) & (image[..., 2] > image[..., 1])
+    return [float(np.nonzero(blue[:, column])[0].mean()) for column in np.nonzero(blue.any(axis=0))[0]]
+
+
 def test_the_curve_goes_down_where_the_loss_does(tmp_path: Path):
-    """The upper panel's line ends below its beginning; a flat history draws another picture."""
-    pictures = []
+    """The upper panel's line ends below its beginning; that of a flat history does not."""
+    falls = []
     for factor in (0.8, 1.0):
         history = [{"stage": "refine", "values": {"loss": factor**k, "psnr": 20 + k}} for k in range(30)]
-        loss_curve([{"stage": "transport", "values": {"cost": 3.0}}, *history], tmp_path / "loss.png")
-        image = np.asarray(Image.open(tmp_path / "loss.png").convert("RGB")).astype(int)
-        upper = image[: image.shape[0] // 2]
-        blue = (upper[..., 2] - upper[..., 0] > 60) & (upper[..., 2] > upper[..., 1])  # matplotlib's first colour
-        rows = [np.nonzero(blue[:, column])[0].mean() for column in np.nonzero(blue.any(axis=0))[0]]
-        pictures.append(rows[-1] - rows[0])
-    assert pictures[0] > 80
-    assert abs(pictures[1]) < 3
-    loss_curve([], tmp_path / "empty.png")
-    assert (tmp_path / "empty.png").stat().st_size > 0
+        image = drawn(history, tmp_path / "loss.png")
+        rows = blue_rows(image[: image.shape[0] // 2])
+        falls.append(rows[-1] - rows[0])
+    assert falls[0] > 80
+    assert abs(falls[1]) < 3
+
+
+def test_the_transport_stage_has_a_panel_of_its_own(tmp_path: Path):
+    """Its cost falls in the upper panel; a history without a cost has one panel less."""
+    costs = [{"stage": "transport", "values": {"cost": 0.5**k, "roughness": 0.3}} for k in range(25)]
+    losses = [{"stage": "refine", "values": {"loss": 1.0, "psnr": 30.0}} for _ in range(25)]
+    both, alone = (drawn(history, tmp_path / "loss.png") for history in (costs + losses, losses))
+    assert both.shape[0] > alone.shape[0] + 100
+    rows = blue_rows(both[: both.shape[0] // 3])
+    assert rows[-1] - rows[0] > 80
+    only = drawn(costs, tmp_path / "loss.png")
+    assert only.shape[0] < alone.shape[0]
+    assert blue_rows(only)[-1] - blue_rows(only)[0] > 80
+
+
+def test_a_run_without_a_step_has_a_curve_without_lines(tmp_path: Path):
+    assert not blue_rows(drawn([], tmp_path / "empty.png"))
+
+
+def test_a_refinement_that_gained_nothing_is_named():
+    rows = [{"stage": "transport", "steps": 9}, {"stage": "refine", "steps": 30, "kept_step": 0}]
+    assert refinement_note(rows) == "refine: no gain on the held-out views, the start was kept"
+    assert refinement_note([rows[0], {**rows[1], "kept_step": 20}]) is None

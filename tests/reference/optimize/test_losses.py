@@ -83,6 +83,26 @@ def test_more_light_than_a_display_shows_is_no_error() -> None:
     assert hdr(bright)[0] > 0  # linear pictures do not saturate
 
 
+def test_what_nothing_explains_counts_little_and_the_rest_as_before() -> None:
+    views = views_of(np.full((1, 8, 8, 3), 0.5, np.float32))
+    weighed, plain = ImageLoss(views, "slope"), ImageLoss(views, "slope")
+    explained = plain.target + np.random.default_rng(0).normal(0, 2e-3, plain.target.shape).astype(np.float32)
+    explained[0, 0, 0] += 0.5  # a highlight that the light's texels cannot make
+    weighed.weigh(explained)
+    x = plain.target + 0.1
+    ratio = weighed(x)[1] / plain(x)[1]
+    assert ratio[0, 0, 0].max() < 1e-3 * np.median(ratio)
+    assert ratio.mean() == pytest.approx(1, rel=1e-5)  # rates and priors keep their meaning
+    np.testing.assert_allclose(weighed(plain.target + 0.2)[1], 2 * weighed(x)[1], rtol=1e-3)  # fixed: no bias by noise
+
+
+def test_pixels_that_say_one_or_more_have_no_say_in_the_scale() -> None:
+    views = views_of(np.ones((1, 4, 4, 3), np.float32))
+    loss = ImageLoss(views)
+    loss.weigh(loss.target + 1)  # all are above what a display shows
+    assert loss(loss.target - 0.1)[0] == ImageLoss(views)(loss.target - 0.1)[0] > 0
+
+
 def test_only_covered_pixels_count_unless_there_is_a_background() -> None:
     display = np.full((1, 2, 2, 3), 0.5, np.float32)
     mask = np.ones((1, 2, 2, 1), np.float32)

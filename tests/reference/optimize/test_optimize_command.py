@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import logging
+import os
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ import tyro
 from optimizer_runs import rendered_views, truth
 from PIL import Image
 
+from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, read_exr
 from unirender.files import read_result, write_png
@@ -21,8 +24,10 @@ from unirender_reference.meshes import load_mesh_placed
 from unirender_reference.optimize.commands import Optimize
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
-from unirender_reference.optimize.picture import read_normals, read_picture_input
+from unirender_reference.optimize.machine import memory_bytes, require_cores, require_memory
+from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input
 from unirender_reference.optimize.placement import placed
+from unirender_reference.optimize.single_render import rerendered
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes import Sphere
@@ -177,8 +182,8 @@ def test_linear_pictures_are_not_for_the_model(solution: Solution, data: Path, t
         (["--overwrite", "--fov", "40"], "--fov, --overwrite: of one picture"),
         (["--size", "4"], "--size 4: expected 8 or more"),
         (["--most-views", "0"], "--most-views 0: expected 1 or more"),
-        (["--hold-out", "1"], "--hold-out 1"),
-        (["--threads", "-1"], "--threads -1"),
+        (["--hold-out", "1"], "^--hold-out 1: expected 2 or more"),
+        (["--threads", "-1"], "^--threads -1: expected 0 or more"),
         (["--texture-size", "2"], "--texture-size 2: expected 4 or more"),
         (["--light-rows", "9"], "--light-rows 9: expected an even number"),
         (["--single.seed", "3", "--single.light-rows", "8"], "--single.light-rows, --single.seed: of one picture"),
@@ -193,7 +198,8 @@ def test_linear_pictures_are_not_for_the_model(solution: Solution, data: Path, t
                 ("refine.held-out-every", "-1", "0 or more"),
                 ("refine.decay", "-1", "more than 0"),
                 ("refine.light-rate", "nan", "0 or more"),
-                ("refine.light-rows", "2", "4 or more"),
+                ("refine.light-rows", "2", "4 or more, or 0"),
+                ("save-seconds", "-1", "0 or more"),
                 ("transport.pixels", "0", "16 or more"),
                 ("transport.smooth-light", "-1", "0 or more"),
             )
@@ -206,6 +212,42 @@ def test_wrong_command_lines_of_a_folder(data: Path, tmp_path: Path, arguments: 
     with pytest.raises(UsageError, match=message):
         command(data / "views", "--out", tmp_path / "out", *arguments).run()
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_leaves_nothing_to_reconstruct(data: Path, tmp_path: Path):
+    """An option without effect would yet make it another run."""
+    given = [data / "views", "--out", tmp_path / "out", "--shape.cells", "32", "--shape-rounds", "1"]
+    with pytest.raises(UsageError, match=r"^--shape\.cells, --shape-rounds: of the reconstruction, but --mesh"):
+        command(*given, "--mesh", data / "mesh.glb").run()
+    command(*given).check()  # the twin
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--threads", str((os.cpu_count() or 1) + 1)], rf"expected at most {os.cpu_count()}, the cores"),
+        (["--texture-size", "1000000"], r"--texture-size 1000000: would take about [\d,]+ GiB of memory"),
+        (["--light-rows", "9998"], r"--light-rows 9998: would take about [\d,]+ GiB"),
+        (["--light-rows", "1000000", "--transport.no-enabled"], r"--light-rows 1000000: would take about"),
+        (["--refine.light-rows", "1000000"], r"--refine\.light-rows 1000000: would take about"),
+    ],
+)
+def test_more_than_the_machine_has(data: Path, tmp_path: Path, arguments: list[str], message: str):
+    with pytest.raises(UnirenderError, match=message) as refused:
+        command(data / "views", "--mesh", data / "mesh.glb", "--out", tmp_path / "out", *arguments).run()
+    assert not isinstance(refused.value, UsageError)  # a larger machine could do it
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_that_the_machine_has_may_be_asked_for(monkeypatch: pytest.MonkeyPatch):
+    require_cores(os.cpu_count() or 1)
+    present = memory_bytes()
+    assert present > 2**30
+    require_memory({"--texture-size 8": 0.99 * present})
+    with pytest.raises(UnirenderError, match="--light-rows 8"):
+        require_memory({"--texture-size 8": 0.99 * present, "--light-rows 8": 1.01 * present})
+    monkeypatch.setattr(os, "sysconf_names", {}, raising=False)
+    require_memory({"--texture-size 8": 1e30})  # a system that does not tell
 
 
 def test_wrong_command_lines_of_a_picture(tmp_path: Path):
@@ -261,5 +303,51 @@ def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureF
     meta = json.loads((tmp_path / "out/meta.json").read_text())
     assert (meta["command"], meta["init"], meta["config"]["light_rows"]) == ("optimize", "none", 8)
     assert (tmp_path / "out/history.jsonl").read_text().count("\n") >= 2
-    with pytest.raises(UnirenderError, match="exists and is not empty"):
+    said = capsys.readouterr().out
+    assert f"rendered again: {meta['psnr_db']:.2f} dB" in said
+    again = channels_rgb(read_exr(tmp_path / "out/image.exr")[0])
+    shown, given = image_srgb(unpremultiply(again, view.mask)), view.image
+    error = np.average(((shown - given) ** 2).mean(-1), weights=view.mask[..., 0])
+    assert -10 * np.log10(error) == pytest.approx(meta["psnr_db"], abs=0.5)  # the file has the samples' noise
+    assert 18 < meta["psnr_db"] < 60
+    assert Image.open(tmp_path / "out/views.png").height > 2 * 80
+    with pytest.raises(UnirenderError, match="exists and is not empty; choose another folder"):
         chosen.run()
+
+
+@pytest.mark.slow
+def test_the_seconds_of_one_picture_count_the_prediction(
+    solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    view = rendered_views(solution, 1, 0, 12).seen[0]
+    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+    few = ["--single.steps", "0", "--single.noise", "0.1", "--single.fine-steps", "0", "--single.light-rows", "8"]
+
+    def predict(image, mask, camera) -> Intrinsics:
+        time.sleep(3)
+        one = np.ones_like(mask)
+        maps = Intrinsics(0.3 * np.repeat(one, 3, -1), roughness=0.6 * one, metallic=0.1 * one)
+        normal = np.concatenate([0 * one, 0 * one, one], -1)
+        return maps.replace(normal=normal, environment=np.full((16, 32, 3), 0.4, np.float32))
+
+    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", "--no-progress", "--init", "unirender", *few)
+    began = time.perf_counter()
+    assert chosen.run(predict) == 0
+    seconds = float(capsys.readouterr().out.split(": ")[1].split(" s")[0])
+    assert 3 <= seconds < time.perf_counter() - began
+
+
+def test_a_picture_rendered_again_has_the_exposure_of_its_fit(solution: Solution):
+    """In any unit a linear picture is scored alike, and the picture of its maps has its unit."""
+    view = rendered_views(solution, 1, 0, 12, hdr=True).seen[0]
+    one = np.ones_like(view.mask)
+    maps = Intrinsics(0.4 * np.repeat(one, 3, -1), roughness=0.5 * one, metallic=0 * one, mask=view.mask)
+    maps = maps.replace(normal=np.concatenate([0 * one, 0 * one, one], -1))
+    found = []
+    for unit in (1.0, 100.0):
+        lit = maps.replace(environment=np.full((8, 16, 3), 0.3 * unit, np.float32))
+        given = PictureInput(view.image * np.float32(unit), view.mask, view.camera, None, hdr=True)
+        found.append(rerendered(given, lit, None, "one.exr"))
+    assert found[0].psnr_db == pytest.approx(found[1].psnr_db, abs=1e-3)
+    np.testing.assert_allclose(found[1].image_linear, 100 * found[0].image_linear, rtol=1e-4, atol=1e-6)
+    assert np.array_equal(np.array(found[0].strip), np.array(found[1].strip))

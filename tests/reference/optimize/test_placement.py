@@ -1,6 +1,7 @@
 """Where the object stands: by mesh, by masks; its texture coordinates; predictions laid on it."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -17,6 +18,7 @@ from unirender_reference.optimize.placement import check_alignment, check_in_pic
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.hull import visual_hull
 from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.transforms import Y_UP, Up
 from unirender_reference.optimize.uv import charted, has_own_texels
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.optimize.warm import solution_from_predictions
@@ -103,8 +105,70 @@ def test_a_mesh_in_other_axes_is_refused(side: int):
     check_alignment(views, solution.obj)
     for axis in (0, 1, 2):
         for quarters in (1, 2, 3):
-            with pytest.raises(UnirenderError, match=r"IoU .* 0\.\d\d, expected at least 0\.\d\d; try --up z"):
+            with pytest.raises(
+                UnirenderError, match=r"IoU .* 0\.\d\d, expected at least 0\.\d\d; (turned so that|with --up z)"
+            ):
                 check_alignment(views, turned(solution.obj, axis, quarters))
+
+
+def test_the_axis_that_is_up_is_advised_where_it_is_the_cause(views: Views, solution: Solution):
+    """Poses with +z up and a mesh with +y up, off the world's origin; and --up z for poses that need none."""
+    place, other = Sphere(np.array([3.0, -2.0, 1.0]), 0.5), truth(5)
+    given = rendered_views(other, seen=6, held_out=0, side=32)
+    cases: list[tuple[np.ndarray, Up, str]] = [
+        (Y_UP.T, "y", r"; with --up z .* would be (0\.9|1\.0)"),
+        (Y_UP, "z", r"; without --up z .* would be (0\.9|1\.0)"),
+    ]
+    for turn, up, advice in cases:
+        world = away(given, place)
+        wrong = tuple(dataclasses.replace(view, pose=(turn @ view.pose).astype(np.float32)) for view in world.seen)
+        with pytest.raises(UnirenderError, match=advice):
+            check_alignment(placed(Views(wrong), place), other.obj, place, up)
+        check_alignment(placed(world, place), other.obj, place, up)
+
+
+@pytest.mark.parametrize(
+    ("size", "center", "message"),
+    [
+        (0.01, (0, 0, 0), r"the object is about 0\.0\d+ times as large as the mesh: .* units"),
+        (100, (0, 0, 0), r"the object is about [89]\d times as large as the mesh"),
+        (1, (10, 0, 0), r"it lies about \((10|9\.9)\d*, \S+, \S+\), the mesh about \(0, 0, 0\) in the poses' units"),
+        (2, (0, 6, 0), r"about (1\.[89]|2)\d* times as large as the mesh and it lies about \(\S+, [56]"),
+    ],
+)
+def test_another_size_or_place_is_named(solution: Solution, size: float, center: tuple[float, ...], message: str):
+    """Of the object in the pictures, where the mesh is that of the unit sphere; and --up z is not advised."""
+    views = rendered_views(solution, seen=6, held_out=0, side=32)
+    with pytest.raises(UnirenderError, match=message) as caught:
+        check_alignment(away(views, Sphere(np.array(center, np.float64), size)), solution.obj)
+    assert "--up z" not in str(caught.value)
+
+
+@pytest.mark.parametrize("side", [8, 64])
+def test_a_wrong_size_of_the_pictures_is_refused_at_any_size(solution: Solution, side: int):
+    """w and h twice as large as the pictures are: half the focal length, and a centre at a quarter."""
+    views = rendered_views(solution, seen=6, held_out=0, side=side)
+    half = math.tan(math.radians(Camera().fov_deg / 2))
+    for camera, message in (
+        (Camera(math.degrees(2 * math.atan(half * 2)), (0.25, 0.25)), "principal point lies at 0.25 of the width"),
+        (
+            Camera(math.degrees(2 * math.atan(half * 2))),
+            "times as large as the mesh: .* field of view" if side > 8 else "is it another mesh, or a field of view",
+        ),
+    ):
+        wrong = tuple(dataclasses.replace(view, camera=camera) for view in views.seen)
+        with pytest.raises(UnirenderError, match=message):
+            check_alignment(Views(wrong), solution.obj)
+    check_alignment(views, solution.obj)
+
+
+def test_nothing_far_away_passes_in_small_pictures(solution: Solution):
+    """The demand is that of the masks, whatever the mesh covers."""
+    for side in (8, 24):
+        views = rendered_views(solution, seen=6, held_out=0, side=side)
+        for place in (Sphere(np.array([10.0, 0, 0]), 1.0), Sphere(np.zeros(3), 100.0), Sphere(np.zeros(3), 0.01)):
+            with pytest.raises(UnirenderError, match=r"expected at least 0\.[5-7]"):
+                check_alignment(placed(views, place), solution.obj)
 
 
 @pytest.mark.parametrize("change", ["rounded", "grown", "shrunk", "shifted"])
@@ -159,9 +223,9 @@ def test_a_close_up_that_cuts_the_object_off_needs_its_mesh(views: Views, soluti
         sphere_of_masks(near)
 
 
-def test_a_mesh_before_one_picture(views: Views, solution: Solution):
+def test_a_mesh_before_one_picture(solution: Solution):
     """The first view is the contract's."""
-    mask = views.seen[0].mask
+    mask = rendered_views(solution, 1, 0, 64).seen[0].mask
     check_in_picture(mask, Camera(), solution.obj)
     for mesh, fov in ((turned(solution.obj, 0, 1), 36.0), (sphere(), 36.0)):
         with pytest.raises(UnirenderError, match=r"IoU .* does it face the camera"):

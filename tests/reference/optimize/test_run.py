@@ -279,8 +279,13 @@ def test_reports_count_down():
 @pytest.mark.parametrize(
     ("given", "transport", "rounds", "stages"),
     [
-        ("nothing", True, 0, ["shape", "transport", "refine"]),
-        ("nothing", True, 2, ["shape", "transport", "reshape-1", "transport-1", "reshape-2", "transport-2", "refine"]),
+        ("nothing", True, 0, ["shape", "transport", "carve", "refine"]),
+        (
+            "nothing",
+            True,
+            2,
+            ["shape", "transport", "carve", "reshape-1", "transport-1", "reshape-2", "transport-2", "refine"],
+        ),
         ("nothing", False, 1, ["shape", "transport", "refine", "reshape-1", "refine-1"]),
         ("mesh", True, 1, ["transport", "refine"]),
         ("start", True, 1, ["refine"]),

@@ -1,6 +1,8 @@
 """Shape from masks: projection, hull, outlines and their derivative, the fit."""
 
 import dataclasses
+import logging
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,8 +10,12 @@ import pytest
 from posed_spheres import blank_views, mask_views
 from reference_scenes import environment, sphere
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
+from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.placement import placed, sphere_of_masks
+from unirender_reference.optimize.run import optimize
 from unirender_reference.optimize.shape import tracer
+from unirender_reference.optimize.shape.bounds import check_masks, check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -22,7 +28,7 @@ from unirender_reference.optimize.shape.topology import mesh_edges, neighbours, 
 from unirender_reference.optimize.shape.tracer import MeshTracer
 from unirender_reference.optimize.views import Views
 from unirender_reference.render import Renderer
-from unirender_reference.shapes import MeshObject, signed_volume
+from unirender_reference.shapes import MeshObject, Sphere, make_object, signed_volume
 
 SIZE = 32
 
@@ -126,6 +132,45 @@ def test_masks_that_contradict_each_other_are_refused() -> None:
     masks[2] = 0
     with pytest.raises(UnirenderError, match="no point of the unit sphere lies inside all 4 masks"):
         visual_hull(masks, Cameras(views.seen), 16)
+
+
+def _lit(views: Views) -> Views:
+    seen = tuple(dataclasses.replace(view, image=np.full_like(view.image, 0.5)) for view in views.seen)
+    return dataclasses.replace(views, seen=seen)
+
+
+def _placed_masks(count: int, obj: MeshObject | None = None) -> Views:
+    views = _lit(mask_views(obj or sphere(), count, SIZE))
+    return placed(views, sphere_of_masks(views))
+
+
+def test_masks_that_do_not_bound_the_object_are_refused_before_anything_is_written(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two from opposite sides leave it endless, three bound what is no ball, roughly; six bound a ball."""
+    with pytest.raises(
+        UnirenderError, match=r"the 2 masks do not bound the object: .* reaches 2(\.\d)? times .*--mesh"
+    ):
+        optimize(_placed_masks(2), None, OptimizeConfig(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    with caplog.at_level(logging.WARNING, "unirender"):
+        check_masks(_placed_masks(6), 64)
+        assert not caplog.text
+        check_masks(_placed_masks(3, make_object(0, "train")), 64)
+    assert "3 pictures and no mesh: the shape will be rough" in caplog.text
+    with pytest.raises(UnirenderError, match=r"reaches 1\.4 times as far"):
+        check_reach(1.4, 5)
+
+
+def test_a_world_that_is_not_that_of_the_unit_sphere_is_named(tmp_path: Path) -> None:
+    for place in (Sphere(np.array([-20.0, 0, 4]), 0.5), Sphere(np.zeros(3), 0.2)):
+        views = placed(_placed_masks(6), place)
+        with pytest.raises(
+            UnirenderError, match=r"expected the unit sphere: .*placed\(views, sphere_of_masks\(views\)\)"
+        ):
+            optimize(views, None, OptimizeConfig(), tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+        check_masks(placed(views, sphere_of_masks(views)), 64)
 
 
 def test_a_camera_inside_the_unit_sphere_is_refused() -> None:
@@ -274,5 +319,5 @@ def test_vertex_normals_of_a_sphere_point_outwards() -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("cells", 4), ("image_weight", 0.0), ("stiffness", -1.0), ("depth", 1)])
 def test_options_that_make_no_sense_are_refused(name: str, value: Any) -> None:
-    with pytest.raises(UnirenderError, match=f"shape {name}: got {value}"):
+    with pytest.raises(UsageError, match=f"--shape.{name.replace('_', '-')} {value:g}: expected"):
         ShapeConfig(**{name: value})

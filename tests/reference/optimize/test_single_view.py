@@ -1,6 +1,8 @@
 """Single-view optimisation: what it finds of made pictures, what it leaves alone, and what it refuses."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -195,8 +197,19 @@ def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, 
     ):
         with pytest.raises(UnirenderError, match=reason):
             optimize_image(image, cover, CAMERA, QUICK, init=init)
-    with pytest.raises(UsageError, match="as many"):
-        SingleConfig(steps=(1, 2), noise=(0.1,))
+    wrong: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"steps": (1, 2), "noise": (0.1,)}, "--single.steps 1 2, --single.noise 0.1: expected as many"),
+        ({"steps": (), "noise": ()}, "expected as many"),
+        ({"noise": (0.1, 0.0, 0.1)}, "--single.noise 0.1 0 0.1: expected more than 0"),
+        ({"noise": (0.1, math.nan, 0.1)}, "expected more than 0"),
+        ({"pixels": 8}, "--single.pixels 8: expected 16 or more"),
+        ({"light_rows": 2}, "--single.light-rows 2: expected 4 or more"),
+    )
+    for options, reason in wrong:
+        with pytest.raises(UsageError, match=reason):
+            SingleConfig(**options)
+    with pytest.raises(UnirenderError, match=r"--single\.light-rows 100000: would take about"):
+        SingleConfig(light_rows=100_000)
 
 
 def test_the_gradient_is_that_of_the_cost(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:

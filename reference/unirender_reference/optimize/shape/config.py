@@ -2,7 +2,10 @@
 
 from dataclasses import dataclass
 
-from unirender.errors import UnirenderError
+from unirender_reference.optimize.machine import require_memory
+from unirender_reference.optimize.option_checks import require_least
+
+POINT_BYTES = 180.0  # of memory for a point of the grid: measured with 64 to 192 cells
 
 
 @dataclass(frozen=True)
@@ -17,6 +20,8 @@ class ShapeConfig:
     """Weight of the thin plate in the first steps towards the masks."""
     final_smoothness: float = 0.3
     """Weight of the thin plate in the last third of these steps."""
+    carve: bool = True
+    """Look for hollows that no outline shows, where colours disagree; kept where they explain the pictures better."""
     image_steps: int = 12
     """Gauss-Newton steps towards the pictures, with light and materials given."""
     image_weight: float = 1.0
@@ -33,12 +38,8 @@ class ShapeConfig:
     """Of all samples."""
 
     def __post_init__(self) -> None:
-        least = {"cells": 8, "mask_steps": 0, "image_steps": 0, "spp": 1, "depth": 2, "seed": 0}
-        for name, value in least.items():
-            if getattr(self, name) < value:
-                raise UnirenderError(f"shape {name}: got {getattr(self, name)}, expected at least {value}")
-        for name in ("smoothness", "final_smoothness", "image_weight", "image_smoothness"):
-            if not getattr(self, name) > 0:
-                raise UnirenderError(f"shape {name}: got {getattr(self, name)}, expected more than 0")
-        if not self.stiffness >= 0:
-            raise UnirenderError(f"shape stiffness: got {self.stiffness}, expected at least 0")
+        counts = {"cells": 8, "mask_steps": 0, "image_steps": 0, "spp": 1, "depth": 2, "seed": 0}
+        require_least(self, "shape", counts | {"stiffness": 0})
+        weights = ("smoothness", "final_smoothness", "image_weight", "image_smoothness")
+        require_least(self, "shape", dict.fromkeys(weights, 0), above=True)
+        require_memory({f"--shape.cells {self.cells}": POINT_BYTES * (self.cells + 1) ** 3})

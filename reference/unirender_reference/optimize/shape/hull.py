@@ -17,6 +17,7 @@ from unirender_reference.optimize.shape.topology import face_vectors, neighbours
 HALF = 1.05  # half side of the grid: the unit sphere and a margin that no mask reaches
 FINER = 8  # places along the side of a pixel at which the coverage is read
 SMALLEST_PIECE = 0.02  # of the largest piece's surface; smaller ones are splinters of the hull
+WIDE, WIDE_CELLS = 2.0, 32  # half side and cells of a grid that tells whether the masks bound the object at all
 
 
 def mask_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
@@ -68,6 +69,24 @@ def visual_hull(masks: Float[np.ndarray, "k h w"], cameras: Cameras, cells: int)
             "with +y up and +z towards the viewer"
         )
     return least.reshape((cells + 1,) * 3)
+
+
+def hull_reach(masks: Float[np.ndarray, "k h w"], cameras: Cameras) -> float:
+    """How far from the origin points lie inside all masks, as a coarse grid over [-WIDE, WIDE]^3 tells; 0: none do.
+
+    Args:
+        masks: coverage of each view.
+        cameras: of the same views.
+    """
+    axis = np.linspace(-WIDE, WIDE, WIDE_CELLS + 1)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    for view, mask in enumerate(masks):
+        points = points[cameras.depth(points, view) > 0]
+        column, row = np.floor(cameras.project(points, view)).T
+        inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
+        points, column, row = points[inside], column[inside].astype(int), row[inside].astype(int)
+        points = points[mask[row, column] > 0.5]
+    return float(np.linalg.norm(points, axis=1).max(initial=0))
 
 
 def extract(

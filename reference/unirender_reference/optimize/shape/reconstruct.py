@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
+from unirender_reference.optimize.shape.bounds import check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -30,20 +31,45 @@ def reconstruct(views: Views, config: ShapeConfig, on_step: Callable[[Step], boo
         on_step: told about every step; False ends the fit.
 
     Raises:
-        UnirenderError: no point lies inside all masks, or a camera stands inside the unit sphere.
+        UnirenderError: no point lies inside all masks, they do not bound the object, or a camera stands inside the
+            unit sphere.
+    """
+    cameras, masks = Cameras(views.seen), coverages(views)
+    fit = fit_masks(visual_hull(masks, cameras, config.cells), masks, cameras, config, on_step)
+    check_reach(float(np.linalg.norm(fit.vertices, axis=1).max()), len(masks))
+    return charted_object(fit.vertices, fit.faces)
+
+
+def fit_masks(
+    field: Float[np.ndarray, "side side side"],
+    masks: Float[np.ndarray, "k h w"],
+    cameras: Cameras,
+    config: ShapeConfig,
+    on_step: Callable[[Step], bool] | None = None,
+) -> MeshFit:
+    """The surface of a field, moved towards the masks.
+
+    Args:
+        field: positive inside, on a grid over [-HALF, HALF]^3 (`hull`).
+        masks: coverage of each view.
+        cameras: of the same views.
+        config: the steps.
+        on_step: told about every step; False ends the fit.
     """
     began = time.perf_counter()
-    cameras = Cameras(views.seen)
-    masks = np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
-    vertices, faces = extract(visual_hull(masks, cameras, config.cells))
-    fit = MeshFit(vertices, faces, masks, cameras)
+    fit = MeshFit(*extract(field), masks, cameras)
     for index in range(config.mask_steps):
         last = index >= config.mask_steps - config.mask_steps // 3
         error = fit.step(config.final_smoothness if last else config.smoothness)
         step = Step("shape", index + 1, time.perf_counter() - began, {"mask_rmse": error, "loss": error**2})
         if on_step is not None and not on_step(step):
             break
-    return charted_object(fit.vertices, faces)
+    return fit
+
+
+def coverages(views: Views) -> Float[np.ndarray, "k h w"]:
+    """The masks of the views that are fitted."""
+    return np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
 
 
 def charted_object(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> MeshObject:

@@ -1,0 +1,48 @@
+"""What the machine has, against what options ask for: one sentence before the work instead of a crash in it."""
+
+import os
+from collections.abc import Mapping
+
+from unirender.errors import UnirenderError
+
+GIB = 2**30
+
+
+def require_cores(threads: int) -> None:
+    """Looks at a number of threads; 0: one for each core.
+
+    Raises:
+        UnirenderError: there are not so many cores.
+    """
+    cores = os.cpu_count() or 1
+    if threads > cores:
+        raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine")
+
+
+def require_memory(needed: Mapping[str, float]) -> None:
+    """Looks at options with which memory grows.
+
+    Args:
+        needed: by option, with its value: about how many bytes it takes.
+
+    Raises:
+        UnirenderError: one takes more than the machine has in all.
+    """
+    present = memory_bytes()
+    for option, wanted in needed.items():
+        if wanted > present:
+            raise UnirenderError(
+                f"{option}: would take about {_gib(wanted)} of memory, and this machine has {_gib(present)}; expected "
+                "a smaller number"
+            )
+
+
+def memory_bytes() -> float:
+    """Of the machine; infinite where the system does not tell."""
+    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
+        return float("inf")
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+
+
+def _gib(count: float) -> str:
+    return f"{count / GIB:,.0f} GiB"

@@ -1,0 +1,74 @@
+"""A command line as the command that it asks for, or one sentence on what is wrong with it. Light to import."""
+
+import contextlib
+import difflib
+import io
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import tyro
+
+from unirender.errors import UnirenderError, UsageError
+
+OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
+
+
+def parse(commands: Any, argv: Sequence[str], prog: str, description: str) -> Any:
+    """The command of a command line.
+
+    Args:
+        commands: a union of dataclasses, a subcommand each; one of them may hold a union of its own as `command`.
+        argv: the words after the program's name.
+        prog: the program's name.
+        description: for its help.
+
+    Raises:
+        UnirenderError: a group of options refuses its values.
+        UsageError: the command has no such option.
+        SystemExit: help was asked for (0), or something else is wrong (2); tyro has printed it.
+    """
+    words = list(argv)
+    try:
+        with contextlib.redirect_stderr(io.StringIO()):
+            command, unknown = tyro.cli(
+                commands, args=words, prog=prog, description=description, return_unknown_args=True
+            )
+    except SystemExit as stopped:
+        for error in causes(stopped):
+            if isinstance(error, UnirenderError):
+                raise error from None
+        if not stopped.code:
+            raise
+        command = tyro.cli(commands, args=words, prog=prog, description=description)  # says what is wrong
+        unknown = []
+    if unknown:
+        raise UsageError(_unknown_words(command, words, unknown, prog))
+    return command
+
+
+def _unknown_words(command: Any, argv: Sequence[str], unknown: Sequence[str], prog: str) -> str:
+    """The sentence on words that no option takes, with the nearest options of that command."""
+    nested = getattr(command, "command", None)
+    path = " ".join([prog, *(word for word in argv if not word.startswith("-"))][: 2 if nested is None else 3])
+    options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        tyro.cli(type(command if nested is None else nested), args=["--help"])
+    known = sorted(set(OPTION.findall(printed.getvalue())))
+    near = dict.fromkeys(match for option in options for match in difflib.get_close_matches(option, known, n=2))
+    meant = f"; did you mean {' or '.join(near)}?" if near else ";"
+    wrong = "no option of" if options else "not expected by"
+    return f"{', '.join(options or unknown)}: {wrong} `{path}`{meant} `{path} --help` lists what it takes"
+
+
+def interrupted(error: BaseException) -> bool:
+    """Whether an error is Ctrl-C, or comes of it: Dr.Jit's loops wrap it."""
+    return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))
+
+
+def causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An error, what it came of, and so on back to the first."""
+    while error is not None:
+        yield error
+        error = error.__cause__ or error.__context__

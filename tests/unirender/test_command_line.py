@@ -1,0 +1,143 @@
+"""What the command line says of a line that is wrong, and of Ctrl-C."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import diffusers
+import pytest
+from optimizer_runs import rendered_views, truth
+
+from unirender import cli
+from unirender.command_line import causes, interrupted
+from unirender_reference.optimize.export import write_solution
+from unirender_reference.optimize.folder import write_views
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, str]:
+    """(exit status, what was printed to stderr)."""
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([*arguments])
+    return stopped.value.code, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (
+            ["optimize", "x", "--out", "y", "--texure-size", "3"],
+            "--texure-size: no option of `unirender optimize`; did you mean --texture-size or --size? "
+            "`unirender optimize --help` lists what it takes",
+        ),
+        (
+            ["bench", "race", "--objcts=4", "--zzzzzzzz"],
+            "--objcts, --zzzzzzzz: no option of `unirender bench race`; did you mean --objects or --out? "
+            "`unirender bench race --help` lists what it takes",
+        ),
+        (["doctor", "now"], "now: not expected by `unirender doctor`; `unirender doctor --help` lists what it takes"),
+        (["optimize", "x", "--out", "y", "--shape.cells", "0"], "--shape.cells 0: expected 8 or more"),
+        (["bench", "unknown-mesh", "--shape.depth", "1"], "--shape.depth 1: expected 2 or more"),
+        (
+            ["bench", "warm-start", "--single.steps", "1"],
+            "--single.steps 1, --single.noise 0.1 0.05 0.025: expected as many numbers in both, a pair for each stage",
+        ),
+    ],
+)
+def test_what_a_command_does_not_take(arguments: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said(capsys, *arguments) == (2, f"unirender: error: {line}\n")
+
+
+def test_what_the_machine_does_not_have(capsys: pytest.CaptureFixture[str]) -> None:
+    """Not the command line is wrong then: a larger machine could do it."""
+    status, line = said(capsys, "optimize", "x", "--out", "y", "--shape.cells", "100000")
+    assert status == 1
+    assert line.startswith("unirender: error: --shape.cells 100000: would take about 167,643,093 GiB of memory")
+
+
+def test_a_missing_command_or_option_is_told_by_the_parser(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, word in ((["bake"], "bake"), (["optimize", "x"], "--out"), (["bench"], "warm-start")):
+        status, text = said(capsys, *arguments)
+        assert status == 2
+        assert word in text
+        assert text.count("For full helptext") == 1
+
+
+def test_help_has_titles_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("ingredients", "race", "unknown-mesh", "warm-start"):
+        with pytest.raises(SystemExit) as stopped:
+            cli.main(["bench", name, "--help"])
+        text = capsys.readouterr().out
+        assert stopped.value.code == 0
+        assert "command" not in [line.split()[1].split(".")[0] for line in text.splitlines() if line.startswith("╭")]
+        assert "minutes on 2 cores" in " ".join(text.split())
+        assert "(default: )" not in text
+
+
+def _raised(error: BaseException, cause: BaseException | None, handled: BaseException | None) -> BaseException:
+    """The error as it is caught, with what it came of."""
+    try:
+        if handled is None:
+            raise error from cause
+        try:
+            raise handled
+        except BaseException:
+            raise error  # noqa: B904 - as Dr.Jit does, without "from"
+    except BaseException as caught:
+        return caught
+
+
+def test_ctrl_c_is_found_behind_other_errors() -> None:
+    stop = KeyboardInterrupt()
+    assert interrupted(stop)
+    assert interrupted(_raised(RuntimeError("dr.while_loop(): ..."), stop, None))
+    assert interrupted(_raised(RuntimeError("clean-up"), None, stop))
+    assert not interrupted(_raised(RuntimeError("dr.while_loop(): ..."), ValueError("nan"), None))
+    inner = _raised(RuntimeError("b"), stop, None)
+    assert [type(error) for error in causes(_raised(OSError(), inner, None))] == [OSError, RuntimeError, type(stop)]
+
+
+@pytest.mark.parametrize(("folder", "more"), [(True, "; run the same command again to go on"), (False, "")])
+def test_ctrl_c_in_a_loop_of_the_renderer(
+    folder: bool, more: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(command: object) -> int:
+        raise RuntimeError("dr.while_loop(): encountered an exception (see above).") from KeyboardInterrupt()
+
+    monkeypatch.setattr(cli, "run", run)
+    given = tmp_path if folder else tmp_path / "one.png"
+    assert said(capsys, "optimize", str(given), "--out", "y") == (130, f"unirender: interrupted{more}\n")
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
+    solution = truth()
+    write_views(rendered_views(solution, 2, 0, 16), tmp_path / "views")
+    write_solution(solution, tmp_path)
+    out = tmp_path / "out"
+    options = ["--transport.no-enabled", "--refine.iterations", "100000", "--texture-size", "16", "--light-rows", "8"]
+    command = [sys.executable, "-m", "unirender.cli", "optimize", str(tmp_path / "views"), "--out", str(out), *options]
+    process = subprocess.Popen([*command, "--mesh", str(tmp_path / "mesh.glb")], stderr=subprocess.PIPE, text=True)
+    text = ""
+    try:
+        while process.poll() is None and not (out / "history.jsonl").exists():
+            time.sleep(0.05)
+        for _ in range(10):  # native code may swallow one
+            process.send_signal(signal.SIGINT)
+            try:
+                _, text = process.communicate(timeout=10)
+                break
+            except subprocess.TimeoutExpired:
+                continue
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert text.endswith("unirender: interrupted; run the same command again to go on\n")
+
+
+@pytest.mark.slow
+def test_the_shipped_model_loads_without_a_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    diffusers.utils.logging.enable_progress_bar()
+    cli.shipped_pipeline.__wrapped__()
+    assert "Loading" not in capsys.readouterr().err
