@@ -97,7 +97,7 @@ NOT_IN_RECORDS = (
     "workers",
 )
 # Commands and files of the optimiser: what it finds does not depend on them.
-NOT_IN_OPTIMIZED = ("commands", "coverage", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
+NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},

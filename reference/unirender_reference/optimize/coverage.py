@@ -51,4 +51,5 @@ def least_iou(views: Sequence[View]) -> float:
 
 
 def masks_of(views: Sequence[View]) -> Float[np.ndarray, "k h w"]:
-    return np.stack([view.mask[..., 0] for view in views])
+    """The coverage that the views show."""
+    return np.stack([view.mask[..., 0] for view in views]).astype(np.float64)

@@ -190,7 +190,7 @@ class _Run:
         if kind == CARVE:
             from unirender_reference.optimize.shape.carve import carved_object
 
-            hollow = carved_object(self.views, shape)
+            hollow = carved_object(self.views, found.obj, shape)
             if hollow is not None:
                 return self._better(found, self._solved(name, hollow))
             self._on_step(name, 1)(Step(name, 1, 0.0, {"hollows": 0.0}))

@@ -10,13 +10,14 @@ from reference_scenes import environment, sphere
 from unirender.color import image_srgb
 from unirender_reference.exposure import scene_exposure
 from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.coverage import masks_of
 from unirender_reference.optimize.run import _Run
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.carve import carve, carved_object
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.shape.hull import visual_hull
 from unirender_reference.optimize.shape.measure import score_shape
-from unirender_reference.optimize.shape.reconstruct import coverages, reconstruct
+from unirender_reference.optimize.shape.reconstruct import reconstruct
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.render import Renderer
@@ -49,7 +50,8 @@ def cup() -> MeshObject:
 def test_a_cup_is_hollow() -> None:
     views, config = pictures(cup(), 1.0, 0.3), ShapeConfig(cells=CELLS)
     other = Cameras(blank_views(5, SIZE))
-    hull, hollow = reconstruct(views, config), carved_object(views, config)
+    hull = reconstruct(views, config)
+    hollow = carved_object(views, hull, config)
     assert hollow is not None
     closed, opened = (score_shape(obj, cup(), other) for obj in (hull, hollow))
     assert opened.normal_cosine > closed.normal_cosine + 0.01
@@ -59,8 +61,8 @@ def test_a_cup_is_hollow() -> None:
 def test_what_agrees_stays() -> None:
     """A grey ball looks the same from all sides; pictures of which every other one is darker do not fit together."""
     views = Views(tuple(dataclasses.replace(view, image=np.full_like(view.image, 0.5)) for view in _ball().seen))
-    assert carved_object(views, ShapeConfig(cells=24)) is None
-    masks, cameras = coverages(views), Cameras(views.seen)
+    assert carved_object(views, sphere(), ShapeConfig(cells=24)) is None
+    masks, cameras = masks_of(views.seen), Cameras(views.seen)
     hull = visual_hull(masks, cameras, 24)
     images = np.stack([view.image for view in views.seen])
     same, left = carve(hull, images, masks, cameras, 0.03)
@@ -73,7 +75,7 @@ def test_what_agrees_stays() -> None:
 def test_a_point_is_not_seen_through_the_object() -> None:
     """One side red, the other green: no point is asked to be both."""
     views = _ball()
-    masks, cameras = coverages(views), Cameras(views.seen)
+    masks, cameras = masks_of(views.seen), Cameras(views.seen)
     centers, images = cameras.center, np.full((len(masks), SIZE, SIZE, 3), 0.5, np.float32)
     y, x = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5, indexing="ij")
     for view in range(len(masks)):

@@ -10,6 +10,7 @@ import logging
 import numpy as np
 
 from unirender.errors import UnirenderError
+from unirender_reference.optimize.coverage import masks_of
 from unirender_reference.optimize.placement import sphere_of_masks
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.hull import hull_reach, visual_hull
@@ -34,7 +35,7 @@ def check_masks(views: Views, cells: int) -> None:
         UnirenderError: the world is not that of the unit sphere, what lies inside all masks is not bounded to about it,
             or nothing does.
     """
-    cameras, masks = Cameras(views.seen), np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
+    cameras, masks = Cameras(views.seen), masks_of(views.seen)
     reach = hull_reach(masks, cameras)
     if not 0 < reach <= MOST_REACH:
         _check_placed(views)

@@ -5,9 +5,9 @@ cup's wall, from each another part of it: their colours cannot agree. A grid poi
 of the cameras that see it cannot agree is not on the surface, and is taken away, until every point is consistent.
 
 A camera says an interval for each channel: of the four pixels around the point, which allows for half a pixel of
-misplacement. Intervals agree if one value lies in all of them, to within a tolerance. Surfaces whose
-colour depends on the direction, mirrors above all, disagree with themselves and are carved away; so a carved shape is
-only a proposal. It has to fill the masks as well as the hull does, and then to explain the pictures better (`run`).
+misplacement. Intervals agree if one value lies in all of them, to within a tolerance. Surfaces whose colour depends
+on the direction, mirrors above all, disagree with themselves and are carved away; so a carved shape is only a
+proposal. It has to fill the masks as well as the hull does, and then to explain the pictures better (`run`).
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from unirender.color import image_srgb
+from unirender_reference.optimize.coverage import coverage_of, masks_of
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.config import ShapeConfig
-from unirender_reference.optimize.shape.fit import MeshFit
 from unirender_reference.optimize.shape.hull import HALF, visual_hull
-from unirender_reference.optimize.shape.reconstruct import charted_object, coverages, fit_masks
+from unirender_reference.optimize.shape.reconstruct import charted_object, fit_masks
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes import MeshObject
 
@@ -35,28 +35,30 @@ SMOOTH = 1.5  # grid steps: of the occupancy whose gradient is the normal
 ROUNDED = 1.0  # grid steps: of the distance to what was taken away
 
 
-def carved_object(views: Views, config: ShapeConfig) -> MeshObject | None:
+def carved_object(views: Views, closed: MeshObject, config: ShapeConfig) -> MeshObject | None:
     """The visual hull with its hollows, grey, with charts; None where colours tell of none or cannot be relied on.
 
     Args:
         views: posed pictures with masks.
+        closed: what was reconstructed from the masks alone; a proposal fills them about as well.
         config: grid and steps.
     """
-    cameras, masks = Cameras(views.seen), coverages(views)
+    cameras, masks = Cameras(views.seen), masks_of(views.seen)
     images = np.stack([image_srgb(view.image) if views.hdr else view.image for view in views.seen])
     hull = visual_hull(masks, cameras, config.cells)
-    most = LOOSER * _mask_error(fit_masks(hull, masks, cameras, config), masks)
+    most = LOOSER * _mask_error(coverage_of(views.seen, closed), masks)
     for tolerance in TOLERANCES:
         field, left = carve(hull, images, masks, cameras, tolerance)
         if LEAST_LEFT < left < MOST_LEFT:
             fit = fit_masks(field, masks, cameras, config)
-            if _mask_error(fit, masks) <= most:
-                return charted_object(fit.vertices, fit.faces)
+            hollow = charted_object(fit.vertices, fit.faces)
+            if _mask_error(coverage_of(views.seen, hollow), masks) <= most:
+                return hollow
     return None
 
 
-def _mask_error(fit: MeshFit, masks: Float[np.ndarray, "k h w"]) -> float:
-    return float(np.sqrt(np.square(fit.coverage() - masks).mean()))
+def _mask_error(coverage: Float[np.ndarray, "k h w"], masks: Float[np.ndarray, "k h w"]) -> float:
+    return float(np.sqrt(np.square(coverage - masks).mean()))
 
 
 def carve(

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
+from unirender_reference.optimize.coverage import masks_of
 from unirender_reference.optimize.shape.bounds import check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap
@@ -34,7 +35,7 @@ def reconstruct(views: Views, config: ShapeConfig, on_step: Callable[[Step], boo
         UnirenderError: no point lies inside all masks, they do not bound the object, or a camera stands inside the
             unit sphere.
     """
-    cameras, masks = Cameras(views.seen), coverages(views)
+    cameras, masks = Cameras(views.seen), masks_of(views.seen)
     fit = fit_masks(visual_hull(masks, cameras, config.cells), masks, cameras, config, on_step)
     check_reach(float(np.linalg.norm(fit.vertices, axis=1).max()), len(masks))
     return charted_object(fit.vertices, fit.faces)
@@ -65,11 +66,6 @@ def fit_masks(
         if on_step is not None and not on_step(step):
             break
     return fit
-
-
-def coverages(views: Views) -> Float[np.ndarray, "k h w"]:
-    """The masks of the views that are fitted."""
-    return np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
 
 
 def charted_object(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> MeshObject:
