@@ -172,6 +172,21 @@ def test_the_demodulated_loss_is_of_light_alone(views: Views, truth: Solution) -
     np.testing.assert_allclose(other["albedo"], one["albedo"], atol=1e-6)
 
 
+def test_pixels_are_weighed_by_what_the_start_explains(
+    views: Views, truth: Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the start also where a run goes on from another state, and not at all where that is off."""
+    shown: list[float] = []
+    monkeypatch.setattr(Fit, "weigh", lambda self, maps: shown.append(float(maps["albedo"].mean())))
+    state = RefineState.begin(truth, FAST)
+    first = float(state.maps(FAST)["albedo"].mean())
+    state.parameters["albedo"] = 0.5 * state.parameters["albedo"]
+    refine(views, truth, dataclasses.replace(FAST, iterations=0), state=state)
+    assert shown == [pytest.approx(first)]
+    refine(views, truth, dataclasses.replace(FAST, iterations=0, robust=False))
+    assert len(shown) == 1
+
+
 def test_common_random_numbers_draw_the_same_pictures(views: Views, truth: Solution) -> None:
     for common in (True, False):
         fit = Fit(views, truth, dataclasses.replace(FAST, common_random_numbers=common))
