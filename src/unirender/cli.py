@@ -88,6 +88,7 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
+READER_LEFT = 141  # as a shell reports SIGPIPE
 RESUMABLE = (Dataset, Train, BenchRun, BenchTruth, BenchIngredients, BenchRace, BenchUnknownMesh, BenchWarmStart)
 
 
@@ -142,20 +143,25 @@ class NoticeHandler(logging.Handler):
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Entry point of the `unirender` script; exits with 0, 1 (failure), 2 (usage) or 130 (interrupted).
+    """Entry point of the `unirender` script.
 
+    Exits with 0, 1 (failure), 2 (usage), 130 (interrupted) or 141 (who read its output left: `unirender ... | head`).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv
-    if arguments == ["--version"]:
-        print(f"unirender {importlib.metadata.version('unirender')}")
-        sys.exit(0)
     command = None
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
     try:
+        if arguments == ["--version"]:
+            print(f"unirender {importlib.metadata.version('unirender')}", flush=True)
+            sys.exit(0)
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
         status = run(command)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        drop_output()
+        status = READER_LEFT
     except (KeyboardInterrupt, Exception) as error:
         if interrupted(error):
             notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
@@ -167,6 +173,11 @@ def main(argv: list[str] | None = None) -> None:
     finally:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+def drop_output() -> None:
+    """What is still to be printed goes nowhere: the reader of the standard output has left."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def resumes(command: Any) -> bool:

@@ -1,5 +1,6 @@
 """What the command line says of a line that is wrong, and of Ctrl-C."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -141,3 +142,17 @@ def test_the_shipped_model_loads_without_a_bar(capsys: pytest.CaptureFixture[str
     diffusers.utils.logging.enable_progress_bar()
     cli.shipped_pipeline.__wrapped__()
     assert "Loading" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["bench", "unknown-mesh", "--help"]])
+def test_who_reads_the_output_may_leave(arguments: list[str]) -> None:
+    """As in `unirender ... --help | head`: no error is printed."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        ended = subprocess.run(
+            [sys.executable, "-m", "unirender.cli", *arguments], stdout=writer, stderr=subprocess.PIPE, timeout=300
+        )
+    finally:
+        os.close(writer)
+    assert (ended.returncode, ended.stderr) == (141, b"")
