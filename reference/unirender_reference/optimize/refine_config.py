@@ -15,7 +15,7 @@ class RefineConfig:
 
     enabled: bool = True
     """Off: the start is returned as it is."""
-    iterations: int = 60
+    iterations: int = 40
     """Steps of Adam."""
     loss: Literal["log", "srgb", "linear", "relative", "slope"] = "slope"
     """How pictures are compared; `losses` has the equations. "log" is NvDiffRec's."""
