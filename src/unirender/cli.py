@@ -12,6 +12,7 @@ import functools
 import importlib.metadata
 import logging
 import os
+import select
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,11 +160,11 @@ def main(argv: list[str] | None = None) -> None:
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
         status = run(command)
         sys.stdout.flush()
-    except BrokenPipeError:
-        drop_output()
-        status = READER_LEFT
     except (KeyboardInterrupt, Exception) as error:
-        if interrupted(error):
+        if isinstance(error, BrokenPipeError) and reader_left():
+            drop_output()
+            status = READER_LEFT
+        elif interrupted(error):
             notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
             status = 130
         elif os.environ.get("UNIRENDER_DEBUG"):
@@ -173,6 +174,13 @@ def main(argv: list[str] | None = None) -> None:
     finally:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+def reader_left() -> bool:
+    """Whether nobody reads the standard output any more; another pipe that breaks is an error like others."""
+    output = select.poll()
+    output.register(sys.stdout.fileno(), 0)
+    return bool(output.poll(0))
 
 
 def drop_output() -> None:

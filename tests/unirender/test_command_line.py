@@ -156,3 +156,16 @@ def test_who_reads_the_output_may_leave(arguments: list[str]) -> None:
     finally:
         os.close(writer)
     assert (ended.returncode, ended.stderr) == (141, b"")
+
+
+def test_another_pipe_that_breaks_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def broken(command: object) -> int:
+        raise BrokenPipeError("of a worker")
+
+    monkeypatch.setattr(cli, "run", broken)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["doctor"])
+    assert stopped.value.code == 1
+    assert "BrokenPipeError: of a worker" in capfd.readouterr().err
