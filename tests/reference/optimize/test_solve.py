@@ -10,7 +10,7 @@ from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.solve import FINE, STARTS, solve_appearance, start_solution
 from unirender_reference.optimize.transport_config import TransportConfig
 from unirender_reference.optimize.transport_progress import solve_shares
-from unirender_reference.optimize.views import Views
+from unirender_reference.optimize.views import View, Views
 
 CONFIG = TransportConfig(iterations=6, rounds=1, correction_spp=64)
 TEXELS, ROWS = 32, 8
@@ -67,6 +67,25 @@ def test_equal_seeds_give_equal_solutions(views, found) -> None:
     for again, first, other in zip(solved(0), parts(found[0]), solved(1), strict=True):
         np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-6)
         assert not np.allclose(other, first, rtol=1e-3, atol=1e-4)
+
+
+def test_highlights_that_no_light_can_make_are_outvoted(views) -> None:
+    """A white disc stands at another place of every picture: `sharpen` keeps it out of light and materials."""
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[: views.height, : views.width]
+
+    def spoiled(view: View) -> View:
+        y, x = rng.uniform(0.35, 0.65, 2) * views.height
+        disc = ((rows - y) ** 2 + (columns - x) ** 2 < (0.12 * views.height) ** 2)[..., None]
+        return replace(view, image=np.where(disc & (view.mask > 0), np.float32(0.97), view.image))
+
+    wrong = replace(views, seen=tuple(spoiled(view) for view in views.seen))
+
+    def error(sharpen: bool) -> float:
+        config = replace(CONFIG, rounds=0, sharpen=sharpen)
+        return shown_error(solve_appearance(wrong, cases.bare(), config, texture_size=TEXELS, light_rows=ROWS), views)
+
+    assert error(True) < 0.9 * error(False)
 
 
 def test_switched_off_it_is_a_flat_start(views) -> None:
