@@ -13,7 +13,7 @@ from unirender.options import at_least
 @dataclass(frozen=True)
 class BenchIngredients:
     """Measure what each ingredient of the optimiser is worth on objects of the multi-view table. A second run
-    continues. All rows take about 75 minutes on 2 cores.
+    continues. All rows take 60 to 80 minutes on 2 cores.
     """
 
     out: Path = Path("results/ingredients")
