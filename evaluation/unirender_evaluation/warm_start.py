@@ -85,7 +85,7 @@ class WarmStart:
         config: dict[str, Any] = {} if protocol == PICTURE else {"optimize_image": asdict(self.config)}
         if method != COLD or protocol == "predicted-normals":
             config["prediction"] = dict(self.base.config)
-        what = f"{TABLE}/{protocol}/{method}"
+        what = f"{TABLE}/{scene.key}/{protocol}/{method}"  # the scene's hash is its object's
         return content_key(self.suite, scene, what, config, self.code)
 
 

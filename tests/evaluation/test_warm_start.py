@@ -105,6 +105,8 @@ def test_keys_follow_what_a_record_depends_on(what: WarmStart) -> None:
     assert not same(other_model, GEOMETRY, COLD), "its normals are the prediction's"
     assert same(other_config, PICTURE, PREDICTION)
     assert not same(other_config, "known-mesh", COLD)
+    keys = {what.key(own, "known-mesh", WARM) for own in what.suite.scenes}
+    assert len(keys) == len(what.suite.scenes), "two lights of one object are two pictures"
 
 
 def test_identical_methods_differ_by_exactly_nothing(records: list[Record]) -> None:
