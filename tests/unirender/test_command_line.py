@@ -111,6 +111,11 @@ def test_ctrl_c_in_a_loop_of_the_renderer(
     assert said(capsys, "optimize", str(given), "--out", "y") == (130, f"unirender: interrupted{more}\n")
 
 
+def heed_ctrl_c() -> None:
+    """A process inherits that Ctrl-C is ignored, where the tests run in the background of a shell."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.slow
 def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
     solution = truth()
@@ -119,7 +124,8 @@ def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--transport.no-enabled", "--refine.iterations", "100000", "--texture-size", "16", "--light-rows", "8"]
     command = [sys.executable, "-m", "unirender.cli", "optimize", str(tmp_path / "views"), "--out", str(out), *options]
-    process = subprocess.Popen([*command, "--mesh", str(tmp_path / "mesh.glb")], stderr=subprocess.PIPE, text=True)
+    command += ["--mesh", str(tmp_path / "mesh.glb")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c)
     text = ""
     try:
         while process.poll() is None and not (out / "history.jsonl").exists():
