@@ -21,7 +21,15 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import path_integrator, python_integrator
-from unirender_reference.passes import TRUTH_BATCHES, Estimate, derive_seed, integrator_passes, mean_estimate
+from unirender_reference.materials import Surface, surface_parameters
+from unirender_reference.passes import (
+    TRUTH_BATCHES,
+    Estimate,
+    derive_seed,
+    integrator_passes,
+    mean_estimate,
+    ratio_estimate,
+)
 from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, Renderer
 
 EFFECTS = ("unshadowed", "shadow", "interreflection")
@@ -73,6 +81,24 @@ def render_effects(
         for name, integrator in integrators.items()
     }
     return Effects(**{name: mean_estimate(*result, batches) for name, result in passes.items()})
+
+
+def render_unshadowed(
+    renderer: Renderer,
+    surface: Surface,
+    environment: Float[np.ndarray, "h w 3"],
+    roughness: float | None,
+    spp: int,
+    seed: int = 0,
+    batches: int = TRUTH_BATCHES,
+) -> Estimate:
+    """The unshadowed light of one of the contract's surfaces, divided by coverage: of `mirror` it is s without shadows,
+    of `white` it is d without; arguments as `Renderer.specular`."""
+    parameters = {"roughness": roughness} if "roughness" in surface_parameters(surface) else {}
+    scene = renderer.scene.show(surface, parameters, environment)
+    own = derive_seed(seed, "unshadowed", surface)
+    passes = integrator_passes(scene, python_integrator(_unshadowed), spp, own, batches, renderer.counters)
+    return ratio_estimate(*passes, batches)
 
 
 def interreflection_integrator(depth: int) -> Any:

@@ -1,25 +1,35 @@
 """The light that a surface receives from an environment, in closed form: d and s without shadows.
 
 Both follow from normals, roughness and the map alone (`unirender.lighting` fixes its grid); what the ground truth
-renders has shadows besides.
+renders has shadows besides. `unirender bench derived-light` measures how near they come.
 
-Notation: n normal, v view direction, l light direction, h half vector, alpha = roughness^2.
+Notation: n normal, v view direction, l light direction, h half vector, alpha = roughness^2, D the GGX distribution of
+normals, G1 Smith's shadowing; p = D G1(v) / (4 n.v) the density of l when visible normals are sampled.
+
+A lobe is integrated in one of two ways. Over the *grid* of the map's texels: exact where the lobe is wider than a few
+of them. By *samples* of the lobe: exact where it is narrow. Wide lobes take the first alone; sharp ones both, each
+direction shared out by the power heuristic between p and the density of the grid (Veach and Guibas 1995), so that the
+samples have the core of the lobe and the grid its tail, where samples are few and a small sun falls between them.
 """
 
-import functools
 import math
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
+from unirender.ggx import facing_normal, frames, halton, smith_g1, unit, visible_normals
 from unirender.lighting import environment_directions, resample_environment, sample_environment, texel_solid_angles
 
 QUADRATURE_SHAPE = (32, 64)  # resolution at which wide lobes are integrated
-SHARP_ROUGHNESS = 0.35  # below it a lobe is narrower than a quadrature texel: lobe samples with filtered lookups
-LOBE_SAMPLES = 64
+TAIL_SHAPE = (64, 128)  # and the tails of sharp ones
+SHARP_ROUGHNESS = 0.35  # below it a lobe is too narrow for `QUADRATURE_SHAPE`
+LOBE_SAMPLES = 48
+GRID_SHARE = 0.03  # samples take over where p times the solid angle of a texel exceeds this
+EDGE = 0.5  # distance of two unit vectors, 29 degrees: neighbours that differ by more are of different surfaces
 MIN_ALPHA = 1e-3  # as Mitsuba's principled BSDF
 _CHUNK = 1 << 21  # evaluations at a time
+_CACHED_CHUNK = 1 << 17  # the same where many passes go over them: they stay in the processor's cache
 
 
 def diffuse_light(
@@ -45,8 +55,8 @@ def specular_light(
 ) -> Float[np.ndarray, "h w 3"]:
     """s without shadows: the GGX lobe of a reflector with F = 1, along the true view rays of the camera.
 
-    Wide lobes are integrated over the map's texels; lobes of roughness below `SHARP_ROUGHNESS` are sampled (visible
-    normals, a fixed low-discrepancy set) and looked up in a mip pyramid at the footprint of a sample.
+    A sharp lobe is averaged over the pixel: a curved surface reflects, within one, more than the lobe is wide. How
+    normals vary inside a pixel is taken from its neighbours.
 
     Args:
         normal: camera axes, unit; 0 gives 0.
@@ -58,16 +68,42 @@ def specular_light(
     view = (camera or Camera()).view_directions(height, width)
     roughness_map = np.broadcast_to(np.asarray(roughness, dtype=np.float32), (height, width, 1))[..., 0]
     facing = np.any(normal != 0, axis=-1)
-    sharp = facing & (roughness_map < SHARP_ROUGHNESS)
-    wide = facing & ~sharp
+    steps = [_steps(normal, facing, axis) for axis in (1, 0)]
+    view_steps = [_steps(view, np.ones_like(facing), axis) for axis in (1, 0)]
+    footprint = np.stack([np.stack(steps, axis=-2), np.stack(view_steps, axis=-2)], axis=-3)[facing]
     out = np.zeros((height, width, 3), dtype=np.float32)
-    alpha = np.maximum(np.square(roughness_map), MIN_ALPHA)
-    if wide.any():
-        n = _facing_normal(normal[wide], view[wide])
-        out[wide] = _specular_quadrature(n, view[wide], alpha[wide], environment)
+    out[facing] = lobe_light(normal[facing], view[facing], roughness_map[facing], environment, footprint)
+    return out
+
+
+def lobe_light(
+    n: Float[np.ndarray, "p 3"],
+    v: Float[np.ndarray, "p 3"],
+    roughness: Float[np.ndarray, " p"],
+    environment: Float[np.ndarray, "h w 3"],
+    footprint: Float[np.ndarray, "p 2 2 3"] | None = None,
+) -> Float[np.ndarray, "p 3"]:
+    """The light that GGX lobes of F = 1 reflect, for any normals and view directions.
+
+    Args:
+        n: unit normals; those that point away from the viewer are bent to graze the view ray.
+        v: unit directions towards the viewer.
+        roughness: perceptual, [0, 1].
+        environment: lat-long radiance, any resolution.
+        footprint: change of (normal, view) over a pixel's width and height, over which sharp lobes are averaged; None:
+            points.
+    """
+    alpha = np.maximum(np.square(roughness), MIN_ALPHA)
+    sharp = roughness < SHARP_ROUGHNESS
+    out = np.zeros((len(n), 3), dtype=np.float32)
+    if not sharp.all():
+        wide = ~sharp
+        out[wide] = _specular_quadrature(facing_normal(n[wide], v[wide]), v[wide], alpha[wide], environment)
     if sharp.any():
-        n = _facing_normal(normal[sharp], view[sharp])
-        out[sharp] = _specular_samples(n, view[sharp], alpha[sharp], environment)
+        over = np.zeros((len(n), 2, 2, 3), dtype=np.float32) if footprint is None else footprint
+        n, v, alpha = n[sharp], v[sharp], alpha[sharp]
+        out[sharp] = _tails(facing_normal(n, v), v, alpha, environment)
+        out[sharp] += _cores(n, v, alpha, over[sharp], environment)
     return out
 
 
@@ -76,25 +112,30 @@ def _chunks(pixels: int, per_pixel: int) -> list[slice]:
     return [slice(i, min(i + step, pixels)) for i in range(0, pixels, step)]
 
 
-def _quadrature(environment: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
+def _quadrature(
+    environment: Float[np.ndarray, "h w 3"], shape: tuple[int, int] = QUADRATURE_SHAPE
+) -> tuple[np.ndarray, np.ndarray]:
     """Directions `[m 3]` and radiance times solid angle `[m 3]`."""
-    shape = QUADRATURE_SHAPE
     if environment.shape[:2] != shape:
         environment = resample_environment(environment, shape)
     radiance = environment * texel_solid_angles(*shape)[..., None]
     return environment_directions(*shape).reshape(-1, 3), radiance.reshape(-1, 3)
 
 
-def _facing_normal(n: Float[np.ndarray, "p 3"], v: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
-    """Shading normals that point away from the viewer are bent to graze the view ray (predicted maps have them)."""
-    cosine = np.sum(n * v, axis=-1, keepdims=True)
-    bent = n + np.maximum(1e-2 - cosine, 0) * v
-    return bent / np.linalg.norm(bent, axis=-1, keepdims=True)
+def _steps(
+    vectors: Float[np.ndarray, "h w 3"], there: Bool[np.ndarray, "h w"], axis: int
+) -> Float[np.ndarray, "h w 3"]:
+    """Change of unit vectors over a pixel's width (axis 1) or height (axis 0).
 
-
-def _smith_g1(cosine: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    squared = np.square(cosine)
-    return 2 / (1 + np.sqrt(1 + np.square(alpha) * (1 - squared) / np.maximum(squared, 1e-8)))
+    The smaller of the differences to the two neighbours, since the larger one may lead across an edge; 0 where neither
+    is there, or both are beyond one.
+    """
+    onward = np.roll(vectors, -1, axis) - vectors
+    size = np.where(there & np.roll(there, -1, axis), np.linalg.norm(onward, axis=-1), np.inf)
+    size[(slice(None), -1) if axis else -1] = np.inf  # the frame ends here
+    back, back_size = np.roll(onward, 1, axis), np.roll(size, 1, axis)
+    nearer = np.where((size < back_size)[..., None], onward, back)
+    return np.where((np.minimum(size, back_size) < EDGE)[..., None], nearer, 0).astype(np.float32)
 
 
 def _specular_quadrature(
@@ -114,77 +155,93 @@ def _specular_quadrature(
         ggx = a2 / (np.pi * np.square(n_h2 * (a2 - 1) + 1))
         n_l_up = np.maximum(n_l, 1e-4)
         # f cos = D G1(v) G1(l) / (4 n.v)
-        weight = ggx * _smith_g1(n_v, alpha[part][:, None]) * _smith_g1(n_l_up, alpha[part][:, None]) / (4 * n_v)
+        weight = ggx * smith_g1(n_v, alpha[part][:, None]) * smith_g1(n_l_up, alpha[part][:, None]) / (4 * n_v)
         out[part] = np.where(n_l > 0, weight, 0).astype(np.float32) @ radiance
     return out
 
 
-def _specular_samples(
+def _grid_solid_angle() -> float:
+    """Mean solid angle of a texel of `TAIL_SHAPE` at the equator, over `GRID_SHARE`: 1 / the density of the grid."""
+    return 2 * math.pi**2 / ((TAIL_SHAPE[0] - 1) * TAIL_SHAPE[1]) / GRID_SHARE
+
+
+def _tails(
     n: Float[np.ndarray, "p 3"],
     v: Float[np.ndarray, "p 3"],
     alpha: Float[np.ndarray, " p"],
     environment: Float[np.ndarray, "h w 3"],
 ) -> Float[np.ndarray, "p 3"]:
-    """Visible-normal sampling (Heitz 2018) with filtered lookups (Krivanek & Colbert 2008)."""
-    pyramid = _mip_pyramid(environment)
-    texel = 4 * np.pi / (environment.shape[0] * environment.shape[1])
+    """The grid's share of sharp lobes: f cos / (1 + (p / q)^2) over all texels, q the density of the grid."""
+    directions, radiance = _quadrature(environment, TAIL_SHAPE)
     out = np.empty((len(n), 3), dtype=np.float32)
-    u1, u2 = _hammersley(LOBE_SAMPLES)
-    for part in _chunks(len(n), LOBE_SAMPLES * 8):
-        a, frame = alpha[part][:, None], _frames(n[part])
-        view = np.einsum("pij,pj->pi", frame, v[part])
-        stretched = np.stack([a[:, 0] * view[:, 0], a[:, 0] * view[:, 1], view[:, 2]], axis=-1)
-        stretched /= np.linalg.norm(stretched, axis=-1, keepdims=True)
-        basis = _visible_disc(stretched)
-        radius, angle = np.sqrt(u1), 2 * np.pi * u2
-        t1 = np.broadcast_to(radius * np.cos(angle), (len(a), LOBE_SAMPLES))
-        blend = (0.5 * (1 + stretched[:, 2]))[:, None]
-        t2 = (1 - blend) * np.sqrt(np.maximum(1 - t1**2, 0)) + blend * (radius * np.sin(angle))
-        t3 = np.sqrt(np.maximum(1 - t1**2 - t2**2, 0))
-        h = np.einsum("psk,pki->psi", np.stack([t1, t2, t3], axis=-1), basis)
-        h = np.concatenate([a[..., None] * h[..., :2], np.maximum(h[..., 2:], 1e-6)], axis=-1)
-        h /= np.linalg.norm(h, axis=-1, keepdims=True)
-        v_h = np.sum(h * view[:, None], axis=-1)
-        light = 2 * v_h[..., None] * h - view[:, None]
-        n_l, n_v = light[..., 2], np.maximum(view[:, 2:3], 1e-4)
+    step = max(1, _CACHED_CHUNK // len(directions))
+    for part in (slice(i, i + step) for i in range(0, len(n), step)):
+        a = alpha[part][:, None]
         a2 = np.square(a)
-        ggx = a2 / (np.pi * np.square(np.square(h[..., 2]) * (a2 - 1) + 1))
-        pdf = ggx * _smith_g1(n_v, a) / (4 * n_v)
-        level = 0.5 * np.log2(np.maximum(1 / (LOBE_SAMPLES * np.maximum(pdf, 1e-9)) / texel, 1.0))
-        weight = np.where(n_l > 0, _smith_g1(np.maximum(n_l, 1e-4), a), 0)
-        world = np.einsum("psi,pij->psj", light, frame)
-        radiance = _sample_pyramid(pyramid, world.reshape(-1, 3), level.reshape(-1)).reshape(*weight.shape, 3)
-        out[part] = np.mean(weight[..., None] * radiance, axis=1)
+        n_v = np.maximum(np.sum(n[part] * v[part], axis=-1, keepdims=True), np.float32(1e-4))
+        n_l = n[part] @ directions.T
+        # p = D G1(v) / (4 n.v), with (n.h)^2 from the three cosines as in `_specular_quadrature`; in place, for speed
+        p = np.square(n_l + n_v)
+        p /= np.maximum(2 + 2 * (v[part] @ directions.T), np.float32(1e-6))
+        p *= a2 - 1
+        p += 1
+        np.divide(a2 * smith_g1(n_v, a) / (4 * np.pi * n_v), np.square(p, out=p), out=p)
+        weight = p * smith_g1(np.maximum(n_l, np.float32(1e-4)), a)
+        p *= np.float32(_grid_solid_angle())
+        weight /= 1 + np.square(p, out=p)
+        weight[n_l <= 0] = 0
+        out[part] = weight @ radiance
     return out
 
 
-def _frames(z: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
-    """Rotation matrices whose rows are x, y, z of a right-handed frame (Duff et al. 2017)."""
-    sign = np.where(z[:, 2] >= 0, 1.0, -1.0)
-    a = -1 / (sign + z[:, 2])
-    b = z[:, 0] * z[:, 1] * a
-    x = np.stack([1 + sign * np.square(z[:, 0]) * a, sign * b, -sign * z[:, 0]], axis=-1)
-    y = np.stack([b, sign + np.square(z[:, 1]) * a, -z[:, 1]], axis=-1)
-    return np.stack([x, y, z], axis=1)
+def _cores(
+    n: Float[np.ndarray, "p 3"],
+    v: Float[np.ndarray, "p 3"],
+    alpha: Float[np.ndarray, " p"],
+    footprint: Float[np.ndarray, "p 2 2 3"],
+    environment: Float[np.ndarray, "h w 3"],
+) -> Float[np.ndarray, "p 3"]:
+    """The samples' share of sharp lobes: visible normals (Heitz 2018) at points spread over the pixel.
+
+    Each sample reads the mip level of its own solid angle (Krivanek and Colbert 2008): that of its share of the lobe,
+    widened by what the pixel's curvature adds.
+    """
+    pyramid = _mip_pyramid(environment)
+    texel = 4 * np.pi / (environment.shape[0] * environment.shape[1])
+    out = np.empty((len(n), 3), dtype=np.float32)
+    across = _reflected_width(n, v, footprint)
+    u1, u2, *offset = halton(LOBE_SAMPLES)
+    offset = np.stack(offset, axis=-1) - np.float32(0.5)
+    step = max(1, _CACHED_CHUNK // (4 * LOBE_SAMPLES))
+    for part in (slice(i, i + step) for i in range(0, len(n), step)):
+        spread = np.einsum("so,pkoc->kpsc", offset, footprint[part])
+        normal, view = (unit((x[part][:, None] + d).reshape(-1, 3)) for x, d in zip((n, v), spread, strict=True))
+        frame = frames(facing_normal(normal, view))
+        view = np.einsum("pij,pj->pi", frame, view)
+        a = np.repeat(alpha[part], LOBE_SAMPLES)
+        h = visible_normals(view, a, np.tile(u1, len(spread[0])), np.tile(u2, len(spread[0])))
+        light = 2 * np.sum(h * view, axis=-1, keepdims=True) * h - view
+        n_l, n_v = light[:, 2], np.maximum(view[:, 2], np.float32(1e-4))
+        # 1 - (n.h)^2 by the tangent components: the difference would be lost in float32
+        slope = np.square(h[:, 0]) + np.square(h[:, 1]) + np.square(a * h[:, 2])
+        p = np.square(a / slope) * smith_g1(n_v, a) / (4 * np.pi * n_v)
+        side = np.sqrt(1 / np.maximum(p, np.float32(1e-9))).reshape(-1, LOBE_SAMPLES, 1) + across[part][:, None]
+        level = 0.5 * np.log2(np.maximum(np.prod(side, axis=-1) / (LOBE_SAMPLES * texel), 1.0)).reshape(-1)
+        share = np.square(p * np.float32(_grid_solid_angle()))
+        weight = np.where(n_l > 0, smith_g1(np.maximum(n_l, np.float32(1e-4)), a), 0) * share / (1 + share)
+        radiance = _sample_pyramid(pyramid, np.einsum("pi,pij->pj", light, frame), level)
+        out[part] = np.mean((weight[:, None] * radiance).reshape(-1, LOBE_SAMPLES, 3), axis=1)
+    return out
 
 
-def _visible_disc(v: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
-    """Rows t1, t2, v of Heitz's frame around the stretched view direction; t1 lies in the surface."""
-    t1 = np.stack([-v[:, 1], v[:, 0], np.zeros(len(v))], axis=-1)
-    length = np.linalg.norm(t1, axis=-1, keepdims=True)
-    t1 = np.where(length > 1e-6, t1 / np.maximum(length, 1e-6), np.array([1.0, 0.0, 0.0]))
-    return np.stack([t1, np.cross(v, t1), v], axis=1)
-
-
-@functools.lru_cache(maxsize=4)
-def _hammersley(count: int) -> tuple[np.ndarray, np.ndarray]:
-    bits = np.arange(count, dtype=np.uint64)
-    reverse = np.zeros(count)
-    scale = 0.5
-    while bits.any():
-        reverse += scale * (bits & 1)
-        bits, scale = bits >> np.uint64(1), scale / 2
-    return (np.arange(count) + 0.5) / count, reverse
+def _reflected_width(
+    n: Float[np.ndarray, "p 3"], v: Float[np.ndarray, "p 3"], footprint: Float[np.ndarray, "p 2 2 3"]
+) -> Float[np.ndarray, "p 2"]:
+    """By how much (radians) the mirror direction turns over a pixel's width and height."""
+    n, v, n_step, v_step = n[:, None], v[:, None], footprint[:, 0], footprint[:, 1]
+    cosine = np.sum(n * v, axis=-1, keepdims=True)
+    cosine_step = np.sum(n_step * v + n * v_step, axis=-1, keepdims=True)
+    return np.linalg.norm(2 * (cosine_step * n + cosine * n_step) - v_step, axis=-1)
 
 
 def _mip_pyramid(environment: Float[np.ndarray, "h w 3"]) -> list[np.ndarray]:

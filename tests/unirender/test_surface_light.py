@@ -9,8 +9,13 @@ from environments import random_directions, smooth_environment
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
-from unirender.lighting import environment_directions, resample_environment, sample_environment
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.lighting import (
+    environment_directions,
+    resample_environment,
+    sample_environment,
+    texel_solid_angles,
+)
+from unirender.surface_light import diffuse_light, lobe_light, specular_light
 
 RNG = np.random.default_rng(4)
 
@@ -114,3 +119,57 @@ def test_light_is_linear_and_needs_a_map() -> None:
         np.testing.assert_allclose(f(normal, 2 * a + b), 2 * f(normal, a) + f(normal, b), rtol=1e-3, atol=1e-4)
     with pytest.raises(UnirenderError, match="at least 2 x 2"):
         diffuse_light(normal, np.ones((1, 8, 3), dtype=np.float32))
+
+
+def sun(height: int = 64) -> np.ndarray:
+    """A dim sky and one bright texel, in front of the object and above."""
+    environment = np.full((height, 2 * height, 3), 0.2, dtype=np.float32)
+    environment[height // 4, height] = 3000.0
+    return environment
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.2, 0.3])
+def test_sharp_lobes_see_a_sun_in_their_tails(roughness: float) -> None:
+    """Against the lobe summed over a map refined 8 times, bilinear as the map itself."""
+    directions = np.array([[0, 0, 1], [0.3, 0.3, 0.9], [0, 0.38, 0.92], [0.1, 0.5, 0.85]], dtype=np.float32)
+    n = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    v = np.repeat(np.array([[0, 0, 1]], dtype=np.float32), len(n), axis=0)
+    made = lobe_light(n, v, np.full(len(n), roughness, np.float32), sun())
+    fine = (8 * 63 + 1, 8 * 128)
+    light = environment_directions(*fine).reshape(-1, 3).astype(np.float64)
+    radiance = sample_environment(sun(), light.astype(np.float32)) * texel_solid_angles(*fine).reshape(-1, 1)
+    alpha = roughness**2
+    for normal, view, found in zip(n.astype(np.float64), v.astype(np.float64), made, strict=True):
+        h = view + light
+        h /= np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-9)
+        cos_l, cos_v = light @ normal, float(view @ normal)
+        d = alpha**2 / (np.pi * ((h @ normal) ** 2 * (alpha**2 - 1) + 1) ** 2)
+        g = [2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2)) for c in (np.maximum(cos_l, 1e-6), cos_v)]
+        expected = np.where(cos_l > 0, d * g[0] * g[1] / (4 * cos_v), 0) @ radiance
+        np.testing.assert_allclose(found, expected, rtol=0.12)
+    other = lobe_light(n, v, np.full(len(n), 1.3 * roughness, np.float32), sun())
+    assert (np.abs(other / made - 1).max(axis=-1) > 0.12).sum() >= 2, "twin: another roughness is told apart"
+
+
+def test_a_sharp_lobe_is_averaged_over_a_curved_pixel() -> None:
+    """The light of a coarse sphere is the mean of a fine one's, and not what its mean normals alone reflect."""
+    size, roughness = 24, 0.1
+    light = np.random.default_rng(0).random((32, 64, 3), dtype=np.float32) ** 4
+    coarse = sphere_normals(size)
+    fine = specular_light(sphere_normals(4 * size), roughness, light).reshape(size, 4, size, 4, 3).mean(axis=(1, 3))
+    inside = coarse[..., 2] > 0.5
+    view = Camera().view_directions(size, size)
+    points = lobe_light(coarse[inside], view[inside], np.full(inside.sum(), roughness, np.float32), light)
+    error, twin = (np.abs(x - fine[inside]).mean() for x in (specular_light(coarse, roughness, light)[inside], points))
+    assert error < 0.6 * twin
+
+
+def test_pixels_across_an_edge_are_of_different_surfaces() -> None:
+    """A crease sharper than the bound does not blur either side."""
+    normal = np.zeros((8, 8, 3), np.float32)
+    normal[:, :4], normal[:, 4:] = [-0.6, 0, 0.8], [0.6, 0, 0.8]
+    left = normal.copy()
+    left[:, 4:] = 0
+    light = smooth_environment()
+    both, alone = specular_light(normal, 0.1, light), specular_light(left, 0.1, light)
+    assert np.array_equal(both[:, :4], alone[:, :4])
