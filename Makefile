@@ -1,6 +1,7 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
+# make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make docs        the HTML documentation (docs/_build/html)
 #
 #   make PYTHON=/path/to/python3.11      another interpreter
@@ -20,7 +21,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test lint docs format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-large lint docs format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -31,7 +32,7 @@ $(VENV)/.runtime: $(REQUIREMENTS)
 
 $(VENV)/.dev: $(REQUIREMENTS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[dev,docs,cluster,denoise]'
+	$(INSTALL) --editable '.[dev,docs,cluster,denoise,sd]'
 	touch $(VENV)/.runtime $@
 
 setup: $(VENV)/.dev
@@ -54,6 +55,10 @@ lint: $(VENV)/.dev
 
 test: lint docs
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# One process, not $(PYTEST_ARGS): it measures its own memory.
+test-large: $(VENV)/.dev
+	$(BIN)/python -m pytest -m large -s
 
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html

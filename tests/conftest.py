@@ -45,6 +45,16 @@ def pytest_configure(config: pytest.Config) -> None:
         )
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves out what is marked `large`, whatever else is deselected: only `-m large` brings it in."""
+    if "large" in str(config.getoption("markexpr")):
+        return
+    left_out = [item for item in items if item.get_closest_marker("large")]
+    if left_out:
+        items[:] = [item for item in items if item not in left_out]
+        config.hook.pytest_deselected(items=left_out)
+
+
 @pytest.fixture(scope="session")
 def regenerate(request: pytest.FixtureRequest) -> bool:
     """True where stored references are to be rewritten."""

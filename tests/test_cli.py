@@ -159,6 +159,55 @@ def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: 
     assert (tmp_path / "out" / "albedo.std.png").exists()
 
 
+def test_sampler_size_and_tiles_are_recorded(ball: Path, tmp_path: Path) -> None:
+    arguments = ("--steps", "3", "--sampler", "unipc", "--size", "96", "--tile", "--no-closed")
+    assert run("decompose", ball, *arguments, "--output", tmp_path / "out") == 0
+    assert run("decompose", ball, "--steps", "3", "--no-closed", "--output", tmp_path / "plain") == 0
+    assert Image.open(tmp_path / "out" / "albedo.png").size == (150, 100)
+    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("out", "plain")]
+    recorded = [[meta[key] for key in ("steps", "sampler", "size", "tile")] for meta in metas]
+    assert recorded == [[3, "unipc", 96, True], [3, "ddim", 64, False]]
+    albedos = [read_result(tmp_path / name).require("albedo")["albedo"] for name in ("out", "plain")]
+    assert np.abs(albedos[0] - albedos[1]).max() > 0.01
+
+
+def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "film").mkdir()
+    picture = Image.open(ball)
+    for name, size in {"f1.png": (75, 50), "f2.png": (75, 50), "f3.png": (75, 50), "f10.png": (60, 40)}.items():
+        picture.resize(size).save(tmp_path / "film" / name)
+    (tmp_path / "film" / "f4.png").write_text("no picture")
+    arguments = ("decompose", tmp_path / "film", "--frames", "--output", tmp_path / "out", "--samples", "2")
+    assert run(*arguments, "--steps", "2") == 1
+    printed = capsys.readouterr()
+    assert "4 pictures (0 of them from before), 1 failed" in printed.out
+    assert "2 pairs of frames: input 0.0000, albedo 0.0000" in printed.out  # f1, f2, f3: the same noise for all
+    assert printed.err.count("f4.png: not a readable picture") == 1
+    assert printed.err.count("field of view") == 1
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert set(summary["pictures"]) == {"f1.png", "f2.png", "f3.png", "f10.png"}
+    assert set(summary["failed"]) == {"f4.png"}
+    assert summary["temporal_difference"]["pairs"] == 2
+    assert summary["temporal_difference"]["normal"] == 0
+    assert summary["pictures"]["f1.png"]["std_max"]["albedo"] > 0
+    # Alone, a picture is decomposed as in its folder.
+    alone = ("--samples", "2", "--steps", "2", "--output", tmp_path / "alone")
+    assert run("decompose", tmp_path / "film" / "f2.png", *alone) == 0
+    both = [read_result(path) for path in (tmp_path / "alone", tmp_path / "out" / "f2.png")]
+    for name, value in both[0].maps.items():
+        np.testing.assert_allclose(both[1].maps[name], value, rtol=5e-3, atol=5e-3, err_msg=name)
+    # Mended and started again, it does what is missing.
+    capsys.readouterr()
+    picture.resize((75, 50)).rotate(20).save(tmp_path / "film" / "f4.png")
+    assert run(*arguments, "--steps", "2") == 0
+    printed = capsys.readouterr().out
+    assert "5 pictures (4 of them from before)\n" in printed
+    changes = json.loads((tmp_path / "out" / "summary.json").read_text())["temporal_difference"]
+    assert changes["pairs"] == 3
+    assert changes["albedo"] > 0
+    assert changes["input"] > 0
+
+
 def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], str]]:
     """Arguments after `decompose`, and what the line must say."""
     (folder / "text.png").write_text("no picture")
@@ -167,6 +216,7 @@ def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], 
 
     values[3, 3] = np.nan
     OpenEXR.File({}, {"RGB": values}).write(str(folder / "nan.exr"))
+    (folder / "masks").mkdir()
     Image.new("RGB", (8, 7), (9, 9, 9)).save(folder / "small.png")
     Image.new("L", (8, 8), 255).save(folder / "mask.png")
     Image.new("L", (150, 100), 0).save(folder / "black.png")
@@ -176,7 +226,8 @@ def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], 
         "cut": ([folder / "cut.png"], "not a readable picture"),
         "nan": ([folder / "nan.exr"], "NaN"),
         "missing": ([folder / "missing.png"], "no such file"),
-        "folder": ([folder], "is a folder"),
+        "empty folder": ([folder / "masks"], "has no pictures"),
+        "frames": ([ball, "--frames"], "is no folder"),
         "mask size": ([ball, "--mask", folder / "mask.png"], "expected 150 x 100"),
         "empty mask": ([ball, "--mask", folder / "black.png"], "empty"),
         "clear": ([folder / "clear.png"], "empty"),
@@ -187,7 +238,19 @@ def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], 
 
 @pytest.mark.parametrize(
     "case",
-    ["text", "cut", "nan", "missing", "folder", "mask-size", "empty-mask", "clear", "small", "checkpoint"],
+    [
+        "text",
+        "cut",
+        "nan",
+        "missing",
+        "empty-folder",
+        "frames",
+        "mask-size",
+        "empty-mask",
+        "clear",
+        "small",
+        "checkpoint",
+    ],
 )
 def test_bad_input_gives_one_line_and_no_output(
     case: str, ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -237,6 +300,11 @@ USAGE = {
     "samples": (["decompose", "PICTURE", "--output", "OUT", "--samples", "0"], "at least 1"),
     "steps": (["render", "FOLDER", "--output", "OUT", "--steps", "0"], "at least 1"),
     "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),
+    "most steps": (["render", "FOLDER", "--output", "OUT", "--steps", "501"], "at most 500"),
+    "sampler": (["decompose", "PICTURE", "--output", "OUT", "--steps", "2", "--sampler", "euler"], "euler"),
+    "sampler of one step": (["decompose", "PICTURE", "--output", "OUT", "--sampler", "unipc"], "one step needs none"),
+    "size": (["decompose", "PICTURE", "--output", "OUT", "--size", "100"], "expected a multiple of 32, like 64"),
+    "no size": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--size", "-64"], "at least 1"),
     "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
@@ -247,6 +315,7 @@ USAGE = {
 }
 FAILURES = {
     "picture": (["edit", "MISSING", "--output", "OUT", "--roughness", "0.5"], "no such file"),
+    "folder of pictures": (["edit", "FOLDER", "--output", "OUT", "--roughness", "0.5"], "is a folder"),
     "light": (["relight", "PICTURE", "--environment", "MISSING", "--output", "OUT"], "missing"),
     "maps": (["render", "FOLDER", "--output", "OUT"], "intrinsics.exr"),
     "no maps": (["render", "PICTURE", "--output", "OUT"], "no EXR file"),

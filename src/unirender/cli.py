@@ -8,6 +8,7 @@ option, a value outside its range, options that contradict each other, nothing t
 what it was asked for. An error is one line.
 """
 
+import contextlib
 import functools
 import importlib.metadata
 import logging
@@ -23,6 +24,7 @@ import tyro
 from unirender.command_line import interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
+from unirender.models.lean_imports import lean_imports
 from unirender.options import notice
 from unirender.training.run import Train
 from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
@@ -89,8 +91,18 @@ Command = (
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 
+MODEL = (Decompose, Edit, Relight, Render)  # in a process of their own these start lean
 READER_LEFT = 141  # as a shell reports SIGPIPE
-RESUMABLE = (Dataset, Train, BenchRun, BenchTruth, BenchIngredients, BenchRace, BenchUnknownMesh, BenchWarmStart)
+RESUMABLE = (
+    Dataset,
+    Train,
+    BenchRun,
+    BenchTruth,
+    BenchIngredients,
+    BenchRace,
+    BenchUnknownMesh,
+    BenchWarmStart,
+)
 
 
 def read_light(path: Path) -> "np.ndarray":
@@ -158,7 +170,8 @@ def main(argv: list[str] | None = None) -> None:
             print(f"unirender {importlib.metadata.version('unirender')}", flush=True)
             sys.exit(0)
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
-        status = run(command)
+        with lean_imports() if argv is None and isinstance(command, MODEL) else contextlib.nullcontext():
+            status = run(command)
         sys.stdout.flush()
     except (KeyboardInterrupt, Exception) as error:
         if isinstance(error, BrokenPipeError) and reader_left():
@@ -192,6 +205,8 @@ def resumes(command: Any) -> bool:
     """Whether a command that was stopped goes on when it is run again."""
     if isinstance(command, Optimize):
         return command.input.is_dir()
+    if isinstance(command, Decompose):
+        return command.input.picture.is_dir()
     return isinstance(command.command if isinstance(command, Bench) else command, RESUMABLE)
 
 

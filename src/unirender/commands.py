@@ -3,6 +3,7 @@
 They know nothing of the ground truth: what reads the light files is passed in by the composition root, `unirender.cli`.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,13 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.errors import UsageError
-from unirender.options import InputOptions, ModelOptions, OutputOptions, notice
+from unirender.errors import UnirenderError, UsageError
+from unirender.options import InputOptions, ModelOptions, OutputOptions, notice, read_input
 
 if TYPE_CHECKING:
     import numpy as np
 
     from unirender.intrinsics import Intrinsics
+    from unirender.pictures import Picture
+    from unirender.pipelines.results import Decomposition
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 MAX_STOPS = 32
@@ -27,33 +30,103 @@ ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a
 
 @dataclass(frozen=True)
 class Decompose:
-    """Inverse rendering: one picture -> albedo, normal, roughness, metallic, s, d and the environment."""
+    """Inverse rendering: one picture -> albedo, normal, roughness, metallic, s, d and the environment.
+
+    Of a folder of pictures, each one: into a folder of its own, with a summary beside them."""
 
     input: tyro.conf.OmitArgPrefixes[InputOptions]
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
+    tile: bool = False
+    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
+    frames: bool = False
+    """The folder's pictures are successive frames: report how much each map changes from one to the next."""
+    export: Path | None = None
+    """Write the maps as a scene for other programs, too: a folder with `scene.xml` for Mitsuba 3 and `card.gltf`. It
+    may lie inside the output folder."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder, write_png, write_result
+        from unirender.files import folder_beside, new_folder
+        from unirender.folders import write_decomposition
+        from unirender.scene_export import write_scene
 
         self.model.check()
+        if self.input.picture.is_dir():
+            return self._run_folder()
+        if self.frames:
+            raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
         picture, camera = self.input.read(), self.model.camera()
-        with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
+        with contextlib.ExitStack() as folders:
+            folder = folders.enter_context(new_folder(self.out.output, overwrite=self.out.overwrite))
+            scene: Path | None = None
+            if self.export is not None:
+                beside = folder_beside(self.export, self.out.output, folder, overwrite=self.out.overwrite)
+                scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, closed=self.closed, **sampling)
+            options = {"closed": self.closed, "tile": self.tile}
+            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
             meta = {"command": "decompose", "input": self.input.picture, "clipped": picture.clipped}
-            meta |= {"closed": self.closed, **self.model.provenance(pipeline)}
-            meta |= {"roughness_mean": result.roughness, "metallic_mean": result.metallic}
-            if result.std is not None:
-                meta["std_max"] = {name: float(spread.max()) for name, spread in result.std.items()}
-            write_result(folder, result.intrinsics, meta)
-            for name, spread in (result.std or {}).items():
-                write_png(folder / f"{name}.std.png", spread / max(float(spread.max()), 1e-6))
+            meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
+            if scene is not None:
+                write_scene(scene, result.intrinsics, meta)
         print(f"{self.out.output}: roughness {result.roughness:.2f}, metallic {result.metallic:.2f}")
         return 0
+
+    def _run_folder(self) -> int:
+        """Returns the exit status: 1 where a picture failed."""
+        from unirender.folders import decompose_folder, list_pictures, write_summary
+        from unirender.frames import temporal_difference
+        from unirender.pipelines.inputs import as_picture
+
+        source, output = self.input.picture, self.out.output
+        if self.export is not None:
+            raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
+        pictures, camera = list_pictures(source), self.model.camera()
+        pipeline, sampling = self.model.load(), self.model.sampling()
+        options = {"closed": self.closed, "tile": self.tile}
+        settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov_deg": camera.fov_deg}
+        remarks: dict[str, list[str]] = {}
+
+        def read(path: Path, mask: Path | None) -> "Picture":
+            picture, said = read_input(path, mask)
+            as_picture(picture.image_srgb, picture.mask)  # what the network would refuse is refused here, by itself
+            for kind, remark in said.items():
+                remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
+            return picture
+
+        def decompose(batch: list["Picture"]) -> list["Decomposition"]:
+            images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
+            each: dict[str, Any] = sampling | {"generator": self.model.generators(len(batch))}
+            return pipeline.decompose_batch(images, masks, cameras=camera, **options, **each)
+
+        found = decompose_folder(
+            pictures,
+            output,
+            read=read,
+            decompose=decompose,
+            settings=settings,
+            masks=self.input.mask,
+            overwrite=self.out.overwrite,
+        )
+        facts = {**settings, "input": source}
+        if self.frames:
+            results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
+            facts["temporal_difference"] = temporal_difference(results)
+        write_summary(output, found, facts)
+        for first, *others in remarks.values():
+            notice(first + (f" (and {len(others)} more)" if others else ""))
+        for reason in found.failed.values():
+            notice(f"error: {reason}")
+        failed = f", {len(found.failed)} failed" if found.failed else ""
+        print(f"{output}: {len(found.figures)} pictures ({found.kept} of them from before){failed}")
+        if self.frames:
+            changes = facts["temporal_difference"]
+            print(f"mean change between {changes.pop('pairs')} pairs of frames: ", end="")
+            print(", ".join(f"{name} {value:.4f}" for name, value in changes.items()) or "none to compare")
+        return 1 if found.failed else 0
 
 
 @dataclass(frozen=True)
@@ -111,6 +184,8 @@ class Edit:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
+    tile: bool = False
+    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
@@ -125,12 +200,12 @@ class Edit:
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
         picture, camera = self.input.read(), self.model.camera()
-        options = {"anchored": self.anchored, "closed": self.closed}
+        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
             meta = {"command": "edit", "input": self.input.picture, "clipped": picture.clipped, **change, **options}
-            meta |= {"bounded": result.bounded, **self.model.provenance(pipeline)}
+            meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
         print(f"{self.out.output}")
         return 0
@@ -150,6 +225,8 @@ class Relight:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
+    tile: bool = False
+    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self, read_light: ReadLight) -> int:
@@ -159,7 +236,7 @@ class Relight:
         self.model.check()
         check_exposure(self.exposure)
         picture, camera = self.input.read(), self.model.camera()
-        options = {"anchored": self.anchored, "closed": self.closed}
+        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
             pipeline, sampling = self.model.load(), self.model.sampling()

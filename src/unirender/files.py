@@ -37,6 +37,7 @@ from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 
+FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
 ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
 
 CAMERA_ATTRIBUTE = "camera"
@@ -82,6 +83,34 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+@contextlib.contextmanager
+def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A second folder of a result: a part of `output`, or a new one of its own that appears with it.
+
+    Args:
+        path: where it is to be.
+        output: the result's folder.
+        temporary: what `new_folder(output)` gave.
+        overwrite: as in `new_folder`.
+
+    Raises:
+        UsageError: it is named like a file, or is the output folder or lies around it.
+        UnirenderError: as `new_folder`.
+    """
+    inner, outer = Path(path).resolve(), Path(output).resolve()
+    if inner.suffix in FILE_SUFFIXES:
+        raise UsageError(f"{path}: named like a file, expected a folder to write to")
+    if inner == outer or inner in outer.parents:
+        raise UsageError(f"{path}: is the output folder {output} (or one around it), expected one inside or beside it")
+    if outer not in inner.parents:
+        with new_folder(path, overwrite=overwrite) as folder:
+            yield folder
+        return
+    folder = temporary / inner.relative_to(outer)
+    folder.mkdir(parents=True)
+    yield folder
 
 
 def _move_into_place(temporary: Path, path: Path) -> None:
@@ -133,10 +162,8 @@ def write_result(
         image_linear: a rendered image, premultiplied; written as `image.exr` and `image.png` (with alpha if the mask is
             known).
     """
-    record = dict(meta)
     attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
-        record |= {"fov_deg": intrinsics.camera.fov_deg, "principal": list(intrinsics.camera.principal)}
         if any(name in IMAGE_MAPS for name in intrinsics.present):
             write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=attributes)
         if intrinsics.environment is not None:
@@ -149,6 +176,14 @@ def write_result(
         write_exr(folder / IMAGE_FILE, image_channels(rgba), attributes=attributes)
         picture = image_srgb(image_linear if mask is None else unpremultiply(image_linear, mask))
         write_png(folder / "image.png", picture if mask is None else np.concatenate([picture, mask], axis=-1))
+    write_meta(folder, meta, None if intrinsics is None else intrinsics.camera)
+
+
+def write_meta(folder: Path, meta: Mapping[str, Any], camera: Camera | None) -> None:
+    """Writes `meta.json`, with the camera if there is one."""
+    record = dict(meta)
+    if camera is not None:
+        record |= {"fov_deg": camera.fov_deg, "principal": list(camera.principal)}
     (folder / META_FILE).write_text(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
 
 

@@ -13,14 +13,17 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 
 if TYPE_CHECKING:
+    import torch
+
     from unirender.camera import Camera
     from unirender.pictures import Picture
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
+Sampler = Literal["ddim", "unipc"]
 
-MOST_STEPS = 1000  # timesteps of the diffusion (`unirender.diffusion.schedule.NUM_TIMESTEPS`, which needs torch)
+MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
 
 
@@ -54,6 +57,11 @@ class ModelOptions:
     """Sampler steps. None: 1, the mean prediction, or 20 where several samples are asked for."""
     samples: int = 1
     """1: the mean prediction. More: that many diffusion samples, their average, and their spread."""
+    sampler: Sampler | None = None
+    """What takes the steps, where there is more than one. None: the checkpoint's scheduler, ddim in those shipped."""
+    size: int | None = None
+    """Side of the square at which the network runs, pixels: a multiple of 32 (of 64 for some checkpoints). None: the
+    size it was trained at, which it is best at."""
     fov: float | None = None
     """Vertical field of view of the picture in degrees. None: 36, and a notice."""
     progress: bool = True
@@ -70,6 +78,9 @@ class ModelOptions:
                 f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each, and at "
                 f"most {MOST_STEPS} steps"
             )
+        if self.sampler is not None and (self.mode == "mean" or self.steps == 1):
+            raise UsageError(f"--sampler {self.sampler}: one step needs none, expected more --steps (or --samples)")
+        at_least(1, size=self.size)
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         if self.fov is not None:
@@ -83,6 +94,7 @@ class ModelOptions:
 
         Raises:
             UnirenderError: no such checkpoint, or the device is not there.
+            UsageError: the model cannot run at that size.
         """
         import diffusers
 
@@ -93,6 +105,9 @@ class ModelOptions:
         diffusers.utils.logging.disable_progress_bar()  # of loading: two small files
         pipeline = UniRenderPipeline.from_pretrained(self.checkpoint, torch_dtype=resolve_dtype(self.dtype, device))
         pipeline.to(device)
+        if self.size is not None:
+            with usage():
+                pipeline.check_size(self.size)
         pipeline.set_progress_bar_config(disable=not self.progress or not sys.stderr.isatty())
         return pipeline
 
@@ -103,15 +118,21 @@ class ModelOptions:
 
     def sampling(self) -> dict[str, Any]:
         """Keyword arguments of the pipeline's methods."""
-        import torch
-
         sampled = self.mode == "sample"
         return {
             "mode": self.mode,
             "num_samples": self.samples if sampled else None,
             "num_inference_steps": self.steps if sampled else None,
-            "generator": torch.Generator().manual_seed(self.seed),
+            "sampler": self.sampler,
+            "size": self.size,
+            "generator": self.generators(1)[0],
         }
+
+    def generators(self, count: int) -> list["torch.Generator"]:
+        """Generators that all draw the same noise."""
+        from unirender.pipelines.settings import same_noise
+
+        return same_noise(self.seed, count)
 
     def camera(self) -> "Camera":
         """The picture's camera; a notice is printed where its field of view is assumed."""
@@ -125,17 +146,20 @@ class ModelOptions:
     def provenance(self, pipeline: "UniRenderPipeline") -> dict[str, Any]:
         """What goes into `meta.json` and the headers: which model ran, and how."""
         import unirender
-        from unirender.diffusion.sampling import steps_of
+        from unirender.diffusion.sampling import sampler_name, steps_of
         from unirender.files import checkpoint_sha256
         from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
 
+        steps = steps_of(self.mode, self.steps)
         return {
             "unirender": unirender.__version__,
             "checkpoint": self.checkpoint or "tiny (shipped)",
             "checkpoint_sha256": checkpoint_sha256(self.checkpoint or SHIPPED_CHECKPOINT),
             "mode": self.mode,
             "seed": self.seed,
-            "steps": steps_of(self.mode, self.steps),
+            "steps": steps,
+            "sampler": (self.sampler or sampler_name(pipeline.scheduler)) if steps > 1 else None,
+            "size": self.size or pipeline.size,
             "samples": self.samples,
             "device": str(pipeline.device),
             "dtype": str(pipeline.dtype).removeprefix("torch."),
@@ -157,9 +181,11 @@ class InputOptions:
     """The picture."""
 
     picture: Annotated[Path, tyro.conf.Positional]
-    """PNG, JPG or EXR (linear, premultiplied), at least 8 pixels along each side."""
+    """PNG, JPG or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a folder of them,
+    too."""
     mask: Path | None = None
-    """Picture of the object's coverage (white: object). None: the alpha channel, else the whole frame."""
+    """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
+    None: the alpha channel, else the whole frame."""
 
     def read(self) -> "Picture":
         """The picture with a mask; notices say what was assumed, and what the picture cannot show.
@@ -167,20 +193,39 @@ class InputOptions:
         Raises:
             UnirenderError: an unreadable file, or a mask that does not fit.
         """
-        import numpy as np
-
-        from unirender.pictures import read_mask, read_picture
-
-        picture = read_picture(self.picture)
-        height, width = picture.image_srgb.shape[:2]
-        if self.mask is not None:
-            picture = dataclasses.replace(picture, mask=read_mask(self.mask, (height, width)))
-        elif picture.mask is None:
-            notice("no mask and no alpha channel: the whole frame is taken as the object (--mask)")
-            picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
-        if picture.clipped > MANY_CLIPPED:
-            notice(f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there")
+        picture, remarks = read_input(self.picture, self.mask)
+        for remark in remarks.values():
+            notice(remark)
         return picture
+
+
+def read_input(path: Path, mask: Path | None) -> tuple["Picture", dict[str, str]]:
+    """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
+
+    Args:
+        path: of the picture.
+        mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
+
+    Raises:
+        UnirenderError: an unreadable file, or a mask that does not fit.
+    """
+    import numpy as np
+
+    from unirender.pictures import read_mask, read_picture
+
+    remarks = {}
+    picture = read_picture(path)
+    height, width = picture.image_srgb.shape[:2]
+    if mask is not None:
+        picture = dataclasses.replace(picture, mask=read_mask(mask, (height, width)))
+    elif picture.mask is None:
+        remarks["mask"] = "no mask and no alpha channel: the whole frame is taken as the object (--mask)"
+        picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
+    if picture.clipped > MANY_CLIPPED:
+        remarks["clipped"] = (
+            f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there"
+        )
+    return picture, remarks
 
 
 def at_least(low: int, **options: int | None) -> None:

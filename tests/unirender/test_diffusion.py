@@ -70,6 +70,22 @@ def test_section_3_2_one_stream_is_always_clean() -> None:
     assert partial.max() <= last - 1
 
 
+def test_section_3_2_draws_every_timestep_alike() -> None:
+    """Chi-square of t on 1 .. T - 1; a draw that favours the low ones a little must fail."""
+    n, last = 30000, 31
+    t = conditional_timesteps(n, last, 0.5, 1.0, torch.Generator().manual_seed(0))
+    noisy = torch.maximum(t.attributes, t.image).numpy()
+
+    def chi_square(values: np.ndarray) -> float:
+        counts = np.bincount(values, minlength=last + 1)[1:last]
+        return float(((counts - n / 30) ** 2 / (n / 30)).sum())
+
+    assert chi_square(noisy) < 66  # 29 degrees of freedom: p < 1e-4
+    rng = np.random.default_rng(0)
+    skewed = np.minimum(noisy, np.where(rng.random(n) < 0.1, rng.integers(1, last, n), last))
+    assert chi_square(skewed) > 66
+
+
 def test_small_batches_round_at_random_to_the_right_share() -> None:
     generator = torch.Generator().manual_seed(0)
     counts = [int((conditional_timesteps(3, 999, 0.5, 0.3, generator).attributes == 0).sum()) for _ in range(2000)]
@@ -90,14 +106,17 @@ def algorithm1_literal(num_timesteps: int, bs: int, rng: np.random.Generator, le
 
 
 def test_algorithm_1_has_the_distribution_of_the_pseudo_code() -> None:
-    """Few timesteps, so that the joint distribution of a pair can be compared cell by cell (chi-square)."""
-    last, bs, draws = 4, 3, 4000
+    """Few timesteps, so that the joint distribution of a pair can be compared cell by cell (chi-square).
+
+    One row at a time: rows of a batch share the stream that is uniform, and would not be independent.
+    """
+    last, bs, draws = 4, 1, 6000
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(1)
     literal, ours = np.zeros((last + 1, last + 1)), np.zeros((last + 1, last + 1))
     for _ in range(draws):
         a, i = algorithm1_literal(last + 1, bs, rng)
         np.add.at(literal, (a, i), 1)
-        t = algorithm1_timesteps(bs, last, generator)
+        t = draw_timesteps("algorithm1", bs, last, 0.5, 0.5, generator)
         np.add.at(ours, (t.attributes.numpy(), t.image.numpy()), 1)
     seen = literal + ours > 0
     assert seen.sum() == 16  # each stream uniform on 0 .. 4, the other 0 or 4, the corners shared
@@ -108,11 +127,17 @@ def test_algorithm_1_has_the_distribution_of_the_pseudo_code() -> None:
 
 
 def test_algorithm_1_picks_one_stream_for_the_whole_batch() -> None:
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(20):
-        t = algorithm1_timesteps(64, 999, generator)
-        ends = [bool(torch.isin(x, torch.tensor([0, 999])).all()) for x in (t.attributes, t.image)]
-        assert sorted(ends) == [False, True]
+    """As the pseudo-code does; each stream as often as the other."""
+    generator, rng = torch.Generator().manual_seed(0), np.random.default_rng(0)
+    draws, first = 400, {"ours": 0, "literal": 0}
+    for _ in range(draws):
+        t = algorithm1_timesteps(16, 999, generator)
+        for name, (a, i) in {"ours": (t.attributes, t.image), "literal": algorithm1_literal(1000, 16, rng)}.items():
+            ends = [bool(np.isin(np.asarray(x), [0, 999]).all()) for x in (a, i)]
+            assert sorted(ends) == [False, True]
+            first[name] += ends[0]
+    for count in first.values():
+        assert abs(count / draws - 0.5) < 5 * 0.5 / math.sqrt(draws)
 
 
 def test_unknown_rule() -> None:
@@ -169,7 +194,7 @@ def test_modes() -> None:
     for mode, steps, words in (
         ("mode", None, "'sample'"),
         ("mean", 5, "takes 1 step"),
-        ("sample", 0, "expected 1 to 1000"),
+        ("sample", 0, "expected 1 to 500"),
     ):
         with pytest.raises(UnirenderError, match=words):
             steps_of(mode, steps)

@@ -1,9 +1,13 @@
 """The dual-stream network: two independent U-Nets at step 0, cross connections afterwards."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
+from diffusers.models.attention import BasicTransformerBlock
+from diffusers.models.resnet import ResnetBlock2D
+from diffusers.models.unets.unet_2d_blocks import CrossAttnDownBlock2D, UNetMidBlock2DCrossAttn
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from tiny_models import make_model
 from torch import Tensor
@@ -112,9 +116,31 @@ def test_other_resolutions_and_odd_sizes() -> None:
     assert out.image.shape == (3, 4, 18, 22)
 
 
-def test_lowest_level_needs_attention() -> None:
-    with pytest.raises(ValueError, match="lowest level 2"):
-        small(attention_levels=(0, 1))
+@pytest.mark.parametrize("levels", [(), (0, 1), (2,)])
+def test_the_mid_block_attends_over_all_pixels_at_any_rate(levels: tuple[int, ...]) -> None:
+    """The light is not aligned with the picture's pixels and reaches them all there."""
+    model = small(attention_levels=levels)
+    for unet in (model.attribute_unet, model.image_unet):
+        assert isinstance(unet.mid_block, UNetMidBlock2DCrossAttn)
+        (block,) = [m for m in unet.mid_block.modules() if isinstance(m, BasicTransformerBlock)]
+        assert not block.attn1.is_cross_attention  # among pixels
+        assert block.attn2 is not None  # the prompt's
+        found = [n for n, b in enumerate(unet.down_blocks) if isinstance(b, CrossAttnDownBlock2D)]
+        assert found == list(levels)
+
+
+def test_levels_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"attention_levels \(1, 3\): expected levels from 0, the finest, to 2"):
+        small(attention_levels=(1, 3))
+    with pytest.raises(ValueError, match="must be multiples of head size 12"):
+        small(attention_levels=(), attention_head_dim=12)
+
+
+def test_linear_projection_changes_layers_and_not_their_number_of_weights() -> None:
+    convolution, linear = small(), small(linear_projection=True)
+    name = "image_unet.mid_block.attentions.0.proj_in.weight"
+    assert [m.state_dict()[name].dim() for m in (convolution, linear)] == [4, 2]
+    assert convolution.num_parameters() == linear.num_parameters()
 
 
 def test_missing_extra_inputs_are_refused() -> None:
@@ -150,7 +176,17 @@ def test_gradient_checkpointing_changes_nothing() -> None:
         (out.attributes.square().mean() + out.image.square().mean()).backward()
         return [p.grad.clone() for p in model.parameters() if p.grad is not None]
 
+    calls: Counter[str] = Counter()
+    for name, module in model.named_modules():
+        if isinstance(module, ResnetBlock2D | BasicTransformerBlock) and not name.endswith("mid_block.resnets.0"):
+            module.register_forward_pre_hook(lambda *_, name=name: calls.update([name]))
+
     plain = gradients()
+    assert set(calls.values()) == {1}
+    calls.clear()
     model.enable_gradient_checkpointing()
     for g, h in zip(plain, gradients(), strict=True):
         torch.testing.assert_close(g, h, rtol=1e-4, atol=1e-6)
+    # every block of both streams is computed again on the way back, but for the one that diffusers leaves out
+    assert set(calls.values()) == {2}
+    assert {name.split(".")[0] for name in calls} == {"attribute_unet", "image_unet"}

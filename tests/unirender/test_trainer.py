@@ -17,18 +17,24 @@ from tiny_models import TRAIN, make_batch
 from torch import Tensor, nn
 
 from unirender.diffusion.sampling import infer_attributes, infer_image
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.training.augment import NO_AUGMENTATION
-from unirender.training.checkpoint import STATE_FILE, load_state, replace_folder, restore_folder, save_state
+from unirender.training.checkpoint import (
+    STATE_FILE,
+    differences,
+    load_state,
+    replace_folder,
+    restore_folder,
+    save_state,
+)
 from unirender.training.data import iterate_batches
 from unirender.training.ema import Ema
-from unirender.training.export import export_pipeline, load_network, read_history
+from unirender.training.export import export_pipeline, read_history
 from unirender.training.live import live_report
-from unirender.training.presets import PRESETS, OptimizerConfig, TrainConfig, get_preset
-from unirender.training.run import Train
+from unirender.training.presets import PRESETS, LossConfig, OptimizerConfig, TrainConfig, get_preset
 from unirender.training.source import ShardSource
 from unirender.training.trainer import RunConfig, Trainer, learning_rate
 from unirender.training.validation import Validate
@@ -274,11 +280,11 @@ def test_a_resume_says_where_another_number_of_passes_changes_it(tmp_path: Path)
     fit(tmp_path, 1, parallel=2)
     state = load_state(tmp_path)
     assert state is not None
-    assert state["parallel"] == 2
+    assert state["parts"] == 2
     assert json.loads((tmp_path / "config.json").read_text())["run"]["parallel"] == 2
-    assert not [line for line in fit(tmp_path, 2, parallel=2) if "parallel" in line]
-    (line,) = (line for line in fit(tmp_path, 3) if "parallel" in line)
-    assert line["parallel"].startswith("2 -> 1")
+    assert not [line for line in fit(tmp_path, 2, parallel=2) if "parts" in line]
+    (line,) = (line for line in fit(tmp_path, 3) if "parts" in line)
+    assert line["parts"].startswith("2 -> 1")
     assert line in [json.loads(text) for text in (tmp_path / "log.jsonl").read_text().splitlines()]
 
 
@@ -287,8 +293,28 @@ def test_a_state_without_the_number_of_passes_resumes(tmp_path: Path) -> None:
     fit(tmp_path, 1)
     state = load_state(tmp_path)
     assert state is not None
-    save_state(tmp_path, {name: value for name, value in state.items() if name != "parallel"})
+    save_state(tmp_path, {name: value for name, value in state.items() if name not in ("parts", "unlogged")})
     assert [line["step"] for line in fit(tmp_path, 2)] == [2]
+
+
+def test_a_state_of_an_older_version_resumes_with_defaults_for_what_it_did_not_know(tmp_path: Path) -> None:
+    run_for(tmp_path, 1)
+    state = load_state(tmp_path)
+    assert state is not None
+    config = state["config"]
+    assert config["map_dropout"] != TrainConfig().map_dropout
+    assert TRAIN.loss.composite == LossConfig().composite
+    del config["loss"]["composite"], config["timestep_rule"]
+    save_state(tmp_path, state)
+    assert run_for(tmp_path, 2)
+    config["steps"] += 1  # a run may be prolonged
+    assert differences(config, TRAIN) == []
+    del config["map_dropout"]  # the twin: here the default is not what the run has now
+    assert differences(config, TRAIN) == ["map_dropout 0.0 instead of 0.1"]
+    config["loss"]["invention"] = 1.0  # of a later version: it trained on something that this one does not know
+    save_state(tmp_path, state)
+    with pytest.raises(UnirenderError, match=r"loss\.invention 1\.0 instead of None, map_dropout 0\.0 instead of 0\.1"):
+        run_for(tmp_path, 2)
 
 
 def test_radiance_above_the_curves_is_trained_on_and_counted(tmp_path: Path) -> None:
@@ -390,7 +416,7 @@ def test_a_pipeline_tells_the_runs_that_it_continues(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         trainer = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
         if folders:
-            trainer.start_from(load_network(folders[-1]), read_history(folders[-1]))
+            trainer.start_from(UniRenderPipeline.from_pretrained(folders[-1]).dual_stream, read_history(folders[-1]))
         trainer.fit(SyntheticSource())
         again = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
         again.resume(SyntheticSource())
@@ -431,14 +457,15 @@ def test_the_augmentation_of_a_config_reaches_the_batches(tmp_path: Path) -> Non
     assert not torch.equal(batches[1]["image"], stored["image"])
 
 
-def test_many_passes_keep_the_weight_of_every_loss(tmp_path: Path) -> None:
-    """More passes than rendering samples: each pass still has a sample of each kind, and the shares add to one."""
-    config = dataclasses.replace(TRAIN, batch_size=8, p_render=0.25)
-    trainer = Trainer(config, RunConfig(tmp_path, steps=2, parallel=6), CPU, torch.float32)
-    passes = list(trainer.gradient._passes(make_batch(8)))
-    assert len(passes) == 2  # rendering samples
-    assert sum(part.share for part in passes) == pytest.approx(1.0)
-    assert all({"image", "albedo"} <= part.terms().keys() for part in passes)
+def test_a_process_reads_its_own_rows(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", size=32)
+    whole = ShardSource(data, 5, 0, workers=0)
+    parts = [ShardSource(data, 5, 0, workers=0, rows=slice(rank, None, 2)) for rank in range(2)]
+    for _ in range(3):  # across the end of an epoch
+        batch = whole.next()
+        for rank, part in enumerate(parts):
+            assert torch.equal(part.next()["image"], batch["image"][rank::2])
+    assert whole.state_dict() == parts[0].state_dict() == parts[1].state_dict()
 
 
 def test_data_of_another_size_is_refused(tmp_path: Path) -> None:
@@ -489,9 +516,3 @@ def test_a_folder_is_there_before_and_after_its_replacement(tmp_path: Path) -> N
     assert (best / "file").read_text() == "two"
     replace_folder(best, finished("three"))
     assert [path.name for path in tmp_path.iterdir()] == ["best"]
-
-
-@pytest.mark.parametrize("preset", ["sd15", "paper"])
-def test_presets_on_latents_say_that_they_cannot_be_trained_yet(preset: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="Stable Diffusion's autoencoder"):
-        Train(data=tmp_path, preset=preset).check()

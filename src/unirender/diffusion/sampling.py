@@ -1,11 +1,17 @@
 """Sampling: from pure noise at T to x0, in one step or in many.
 
 Two named modes. `mean` is one step from T: with zero terminal SNR and x0-prediction the network's output there is
-E[x0 | condition], the best PSNR and no spread. `sample` is the paper's: several DDIM steps, several samples; standard
-deviations come from it only. Any diffusers scheduler that predicts samples does.
+E[x0 | condition], the best PSNR and no spread. `sample` is the paper's: several steps, several samples; standard
+deviations come from it only.
+
+Two named samplers of diffusers, both without noise of their own: `ddim`, of first order, and `unipc`, a multistep
+predictor and corrector of second order. Both end with a jump from the last timestep, 1/n of the way up, to E[x0 | x_t]:
+this part of the error is of first order in either, and what is left of the spread in it is lost. At T the signal is
+zero and log-SNR, UniPC's variable, is minus infinity; diffusers puts alpha_bar = 2^-24 there, which moves a result by
+2^-12 at most. DDIM steps by 1000 // n timesteps: where n does not divide 1000 it is off by less than one timestep.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import torch
@@ -14,15 +20,19 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.schedule import NUM_TIMESTEPS, last_timestep
+from unirender.diffusion.schedule import last_timestep
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.priors import Maps
 
 Mode = Literal["mean", "sample"]
 SAMPLE_STEPS = 20  # the paper's
 NUM_SAMPLES = 5
+MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timestep 0, where nothing is left to do
+
+Generators = torch.Generator | Sequence[torch.Generator] | None
+Cameras = Camera | Sequence[Camera] | None
 
 Predict = Callable[[Float[Tensor, "b c h w"], Int[Tensor, " b"]], Float[Tensor, "b c h w"]]
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -32,12 +42,12 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
     """Number of steps of a mode: always 1 for `mean`; for `sample` as asked, or the paper's 20.
 
     Raises:
-        UnirenderError: unknown mode, a number of steps outside [1, 1000], or several steps in mode `mean`.
+        UnirenderError: unknown mode, a number of steps outside [1, 500], or several steps in mode `mean`.
     """
     if mode not in ("mean", "sample"):
         raise UnirenderError(f"mode: got {mode!r}, expected 'mean' (one step, E[x0 | condition]) or 'sample'")
-    if num_inference_steps is not None and not 1 <= num_inference_steps <= NUM_TIMESTEPS:
-        raise UnirenderError(f"num_inference_steps: got {num_inference_steps}, expected 1 to {NUM_TIMESTEPS}")
+    if num_inference_steps is not None and not 1 <= num_inference_steps <= MOST_STEPS:
+        raise UnirenderError(f"num_inference_steps: got {num_inference_steps}, expected 1 to {MOST_STEPS}")
     if mode == "mean":
         if num_inference_steps not in (None, 1):
             raise UnirenderError(f"mode mean takes 1 step, got num_inference_steps {num_inference_steps}; use 'sample'")
@@ -45,12 +55,37 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
     return num_inference_steps or SAMPLE_STEPS
 
 
+def make_sampler(name: str, scheduler: Any) -> Any:
+    """The named scheduler of diffusers on the same noise schedule.
+
+    Args:
+        name: `ddim` or `unipc`.
+        scheduler: any diffusers scheduler with that noise schedule in its config.
+
+    Raises:
+        UnirenderError: another name.
+    """
+    if name == "ddim":
+        return DDIMScheduler.from_config(scheduler.config)
+    if name == "unipc":
+        # Here, since it takes scipy along.
+        from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
+
+        return UniPCMultistepScheduler.from_config(scheduler.config)
+    raise UnirenderError(f"sampler: got {name!r}, expected 'ddim' or 'unipc'")
+
+
+def sampler_name(scheduler: Any) -> str:
+    """`ddim`, `unipc`, or the class of another scheduler."""
+    known = {"DDIMScheduler": "ddim", "UniPCMultistepScheduler": "unipc"}
+    return known.get(type(scheduler).__name__, type(scheduler).__name__)
+
+
 def denoise(
     predict: Predict,
     noise: Float[Tensor, "b c h w"],
     scheduler: Any,
     steps: int,
-    generator: torch.Generator | None = None,
     progress: Progress = iter,
 ) -> Float[Tensor, "b c h w"]:
     """Runs `steps` scheduler steps from T down to clean.
@@ -58,32 +93,40 @@ def denoise(
     Args:
         predict: (x_t, t) -> x0.
         noise: x_T.
-        scheduler: a diffusers scheduler with `prediction_type="sample"`; its timesteps are set here.
+        scheduler: a diffusers scheduler with `prediction_type="sample"` that draws no noise; its timesteps are set
+            here.
         steps: 1 returns the prediction at T itself.
-        generator: for schedulers that draw noise; DDIM at eta 0 does not.
         progress: wraps the iteration over timesteps.
     """
     if steps == 1:
         t = torch.full((len(noise),), last_timestep(scheduler), device=noise.device)
         return predict(noise, t)
     scheduler.set_timesteps(steps, device=noise.device)
-    extra: dict[str, Any] = {"generator": generator} if type(scheduler) is DDIMScheduler else {}
     x_t = noise * scheduler.init_noise_sigma
     for t in progress(scheduler.timesteps):
         x_0 = predict(x_t, t.expand(len(x_t)))
-        x_t = scheduler.step(x_0, t, x_t, return_dict=False, **extra)[0]
+        x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
     return x_t
 
 
-def draw_noise(
-    shape: tuple[int, ...], like: Tensor, generator: torch.Generator | None = None
-) -> Float[Tensor, "b c h w"]:
+def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = None) -> Float[Tensor, "b c h w"]:
     """Gaussian noise of dtype and device of `like`, drawn on the generator's device (CPU without one), row by row:
     a row's noise does not depend on how many follow it.
+
+    Args:
+        shape: of the noise; its first number is that of rows.
+        like: a tensor of the right dtype and device.
+        generator: one for all rows, or several, each for an equal share of the rows, in order.
     """
-    device = generator.device if generator is not None else torch.device("cpu")
-    rows = [torch.randn(shape[1:], generator=generator, device=device) for _ in range(shape[0])]
-    return torch.stack(rows).to(like)
+    generators = generator if isinstance(generator, Sequence) else [generator]
+    if not generators or shape[0] % len(generators):
+        raise ValueError(f"{len(generators)} generators for {shape[0]} rows, expected the same number of rows for each")
+    rows = [
+        torch.randn(shape[1:], generator=own, device=own.device if own is not None else "cpu")
+        for own in generators
+        for _ in range(shape[0] // len(generators))
+    ]
+    return torch.stack([row.to(like) for row in rows])
 
 
 @torch.no_grad()
@@ -95,8 +138,8 @@ def infer_attributes(
     mask: Float[Tensor, "b 1 H W"],
     *,
     steps: int = 1,
-    generator: torch.Generator | None = None,
-    camera: Camera | None = None,
+    generator: Generators = None,
+    camera: Cameras = None,
     progress: Progress = iter,
 ) -> Maps:
     """Inverse rendering: p(attributes | image).
@@ -104,23 +147,25 @@ def infer_attributes(
     Args:
         image_linear: premultiplied, linear; clipped to [0, 1] as a camera does.
         mask: coverage.
+        steps: of the scheduler.
+        generator: of the noise; see `draw_noise`.
+        camera: of all rows, or one for each.
+        progress: wraps the iteration over timesteps.
 
     Returns:
         Maps as `Packing.unpack` gives them: float32, in physical units.
     """
     image = conditioning.encode_image(image_linear).to(model.dtype)
     given = torch.zeros(len(image), len(TRIPLETS), dtype=torch.bool, device=image.device)
-    extras = conditioning.extras(mask, given, camera=camera)
+    extras = extras_by_camera(conditioning, mask, given, None, camera)
+    extra_a, extra_i = extras.attributes.to(image), extras.image.to(image)
     clean = torch.zeros(len(image), dtype=torch.long, device=image.device)
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
-        output = model(
-            x_t.to(image), image, t, clean, extras.attributes.to(image), extras.image.to(image), image_rows=None
-        )
-        return output.attributes.to(x_t)
+        return model(x_t.to(image), image, t, clean, extra_a, extra_i, image_rows=None).attributes.to(x_t)
 
     noise = draw_noise((len(image), conditioning.attribute_channels, *image.shape[-2:]), image_linear, generator)
-    return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, generator, progress).float())
+    return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress).float())
 
 
 @torch.no_grad()
@@ -132,8 +177,8 @@ def infer_image(
     given: Bool[Tensor, "b 6"],
     *,
     steps: int = 1,
-    generator: torch.Generator | None = None,
-    camera: Camera | None = None,
+    generator: Generators = None,
+    camera: Cameras = None,
     progress: Progress = iter,
 ) -> Float[Tensor, "b 3 H W"]:
     """Rendering: p(image | attributes).
@@ -141,14 +186,22 @@ def infer_image(
     Args:
         maps: all maps; those not `given` may hold anything and are replaced by noise.
         given: which of the six pictures are known; the mask in `maps` always is.
+        steps: of the scheduler.
+        generator: of the noise; see `draw_noise`.
+        camera: of all rows, or one for each.
+        progress: wraps the iteration over timesteps.
 
     Returns:
         Premultiplied linear image in [0, 1].
     """
     latents = conditioning.encode_attributes(maps)
-    noise = draw_noise(tuple(latents.shape), latents, generator)
-    attributes = torch.where(conditioning.by_triplet(given), latents, noise).to(model.dtype)
-    extras = conditioning.extras(maps["mask"], given, maps, camera)
+    # Both noises of a row at once: neither depends on how many rows follow.
+    channels = (latents.shape[1], conditioning.codec.channels)
+    noise = draw_noise((len(latents), sum(channels), *latents.shape[-2:]), latents, generator)
+    unknown, x_T = noise.split(channels, dim=1)
+    attributes = torch.where(conditioning.by_triplet(given), latents, unknown).to(model.dtype)
+    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera)
+    extra_a, extra_i = extras.attributes.to(attributes), extras.image.to(attributes)
     clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
@@ -157,12 +210,42 @@ def infer_image(
             x_t.to(attributes),
             clean,
             t,
-            extras.attributes.to(attributes),
-            extras.image.to(attributes),
+            extra_a,
+            extra_i,
             image_prior=extras.prior,  # float32 whatever the weights are: the sum keeps the composite's precision
             attribute_rows=None,
         )
         return output.image.to(x_t)
 
-    noise = draw_noise((len(latents), conditioning.codec.channels, *latents.shape[-2:]), latents, generator)
-    return conditioning.decode_image(denoise(predict, noise, scheduler, steps, generator, progress).float())
+    return conditioning.decode_image(denoise(predict, x_T, scheduler, steps, progress).float())
+
+
+def extras_by_camera(
+    conditioning: Conditioning,
+    mask: Float[Tensor, "b 1 H W"],
+    given: Bool[Tensor, "b 6"],
+    maps: Maps | None,
+    camera: Cameras,
+) -> Extras:
+    """The extra inputs of rows that are seen through one camera, or each through its own."""
+    if camera is None or isinstance(camera, Camera):
+        return conditioning.extras(mask, given, maps, camera)
+    if len(camera) != len(mask):
+        raise ValueError(f"{len(camera)} cameras for {len(mask)} rows, expected one each")
+    if len(set(camera)) == 1:
+        return conditioning.extras(mask, given, maps, camera[0])
+    rows = [
+        conditioning.extras(
+            mask[i : i + 1],
+            given[i : i + 1],
+            None if maps is None else {name: value[i : i + 1] for name, value in maps.items()},
+            own,
+        )
+        for i, own in enumerate(camera)
+    ]
+    priors = [row.prior for row in rows if row.prior is not None]
+    return Extras(
+        torch.cat([row.attributes for row in rows]),
+        torch.cat([row.image for row in rows]),
+        torch.cat(priors) if priors else None,
+    )

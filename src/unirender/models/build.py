@@ -5,7 +5,8 @@ from torch import nn
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import HDR_CURVES, Conditioning
 from unirender.models.dual_stream import DualStreamModel
-from unirender.training.presets import ModelConfig
+from unirender.models.split_streams import SplitDualStreamModel
+from unirender.training.presets import ENVIRONMENT_SIZE, ModelConfig
 
 
 def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[DualStreamModel, Conditioning]:
@@ -16,12 +17,13 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
     codec = make_codec(config.codec, config.patch, vae)
     recorded = {
         "hdr_curves": HDR_CURVES,
-        "environment_size": (16, 32),
+        "environment_size": ENVIRONMENT_SIZE,
         "physics_prior": config.physics_prior,
     }
     conditioning = Conditioning.of(recorded, codec)
     extra_attributes, extra_image = conditioning.extra_channels
-    model = DualStreamModel(
+    network = DualStreamModel if config.unified else SplitDualStreamModel
+    model = network(
         sample_size=config.resolution // codec.factor,
         attribute_channels=conditioning.attribute_channels,
         image_channels=codec.channels,
@@ -34,6 +36,7 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         cross_attention_dim=config.cross_attention_dim,
         prompt_tokens=config.prompt_tokens,
         norm_num_groups=config.norm_num_groups,
+        linear_projection=config.linear_projection,
         codec=config.codec,
         patch=config.patch,
         **recorded,

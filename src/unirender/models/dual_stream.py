@@ -81,11 +81,12 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         image_extra_channels: int = 0,  # mask, rays, composite
         block_out_channels: Sequence[int] = (64, 96, 128),  # widths from the finest level down
         layers_per_block: int = 1,  # residual blocks per level of each encoder
-        attention_levels: Sequence[int] = (2,),  # levels with attention; the lowest must be among them
+        attention_levels: Sequence[int] = (2,),  # levels with attention; the mid block has it always
         attention_head_dim: int | Sequence[int] = 32,  # channels of a head; a sequence: number of heads by level
         cross_attention_dim: int = 16,  # width of the prompt embedding
         prompt_tokens: int = 1,  # length of the stored empty-prompt embedding
         norm_num_groups: int = 16,
+        linear_projection: bool = False,  # attention's projections are linear layers, not 1x1 convolutions
         codec: str = "pixel",  # "pixel" (space to depth) or "kl" (an AutoencoderKL beside the network)
         patch: int = 2,  # image pixels per latent pixel, one way
         environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
@@ -93,13 +94,14 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
     ):
         super().__init__()
-        if len(block_out_channels) - 1 not in attention_levels:
+        if not set(attention_levels) <= set(range(len(block_out_channels))):
             raise ValueError(
-                f"attention_levels {tuple(attention_levels)} leave out the lowest level {len(block_out_channels) - 1}: "
-                "the environment is not pixel-aligned and reaches all pixels only through attention there"
+                f"attention_levels {tuple(attention_levels)}: expected levels from 0, the finest, to "
+                f"{len(block_out_channels) - 1}, the lowest"
             )
-        common = _unet_config(block_out_channels, layers_per_block, attention_levels, attention_head_dim)
+        common = unet_config(block_out_channels, layers_per_block, attention_levels, attention_head_dim)
         common |= {"cross_attention_dim": cross_attention_dim, "norm_num_groups": norm_num_groups}
+        common |= {"use_linear_projection": linear_projection}
         self.attribute_unet = UNet2DConditionModel(
             sample_size=sample_size, in_channels=attribute_channels, out_channels=attribute_channels, **common
         )
@@ -201,13 +203,19 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         return unet.conv_out(hidden)
 
 
-def _unet_config(widths: Sequence[int], layers: int, attention: Sequence[int], head_dim: int | Sequence[int]) -> dict:
-    """The part of a `UNet2DConditionModel` config that both streams share."""
+def unet_config(widths: Sequence[int], layers: int, attention: Sequence[int], head_dim: int | Sequence[int]) -> dict:
+    """The part of a `UNet2DConditionModel` config that both streams share.
+
+    The mid block is diffusers' default, which attends over all its pixels: the environment, which is not aligned with
+    the picture's, reaches every one of them there, whichever levels have attention besides.
+    """
     levels = range(len(widths))
+    attending = {*attention, len(widths) - 1}  # the mid block has the lowest level's width and heads
     heads = [width // head_dim for width in widths] if isinstance(head_dim, int) else list(head_dim)
-    if isinstance(head_dim, int) and any(width % head_dim for level, width in enumerate(widths) if level in attention):
+    if isinstance(head_dim, int) and any(width % head_dim for level, width in enumerate(widths) if level in attending):
         raise ValueError(
-            f"block_out_channels {tuple(widths)}: attention levels must be multiples of head size {head_dim}"
+            f"block_out_channels {tuple(widths)}: levels with attention, and the lowest, whose width is the mid "
+            f"block's, must be multiples of head size {head_dim}"
         )
     return {
         "block_out_channels": tuple(widths),

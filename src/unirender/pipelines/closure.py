@@ -11,8 +11,6 @@ Where a channel of the picture is clipped the ratio is only a lower bound, and t
 Notation: I the picture, R the rendering of the maps; both linear and premultiplied.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
 
@@ -22,20 +20,20 @@ MAX_GAIN = 4.0  # G
 FLOOR = 0.01  # e: radiance below which the ratio says nothing
 CLIPPED = 0.99  # linear value from which a picture's channel counts as clipped
 
-Render = Callable[[Intrinsics], Float[np.ndarray, "h w 3"]]
 
-
-def close_decomposition(intrinsics: Intrinsics, image_linear: Float[np.ndarray, "h w 3"], render: Render) -> Intrinsics:
-    """The intrinsics with albedo, specular and diffuse changed so that `render` gives the picture, within bounds.
+def close_decomposition(
+    intrinsics: Intrinsics, image_linear: Float[np.ndarray, "h w 3"], rendered: Float[np.ndarray, "h w 3"]
+) -> Intrinsics:
+    """The intrinsics with albedo, specular and diffuse changed so that their rendering is the picture, within bounds.
 
     Args:
         intrinsics: with albedo, specular, diffuse and mask.
         image_linear: the picture, linear, premultiplied.
-        render: intrinsics -> premultiplied linear image of the same size.
+        rendered: the rendering of the intrinsics; linear, premultiplied.
     """
     maps = intrinsics.require("albedo", "specular", "diffuse", "mask")
     mask = maps.pop("mask")
-    gain = np.clip((image_linear + FLOOR) / (render(intrinsics) + FLOOR), 1 / MAX_GAIN, MAX_GAIN)
+    gain = np.clip((image_linear + FLOOR) / (rendered + FLOOR), 1 / MAX_GAIN, MAX_GAIN)
     gain = np.where(image_linear >= CLIPPED * mask, np.maximum(gain, 1), gain)
     root = np.where(mask > 0, np.sqrt(gain), 1).astype(np.float32)
     closed = {name: value * root for name, value in maps.items()}

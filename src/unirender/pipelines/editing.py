@@ -4,7 +4,7 @@ Notation: s specular light, I the input, R_0 and R_1 the renders of the decompos
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
@@ -12,6 +12,9 @@ from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
+LOBE_WIDTH = (
+    4 * 0.6436
+)  # radians by alpha: where GGX has fallen to half, to both sides; a reflection turns twice as far
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
@@ -38,6 +41,22 @@ def specular_for_roughness(
     inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
     held = float((ratio != bounded)[inside].mean()) if inside.any() else 0.0
     return (maps["specular"] * bounded).astype(np.float32), held
+
+
+def too_coarse(before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w 1"]:
+    """Where the light of a decomposition is too coarse to say what a new roughness shows.
+
+    There a texel of the light is wider than the sharper of the two lobes, the old or the new one: what they reflect
+    differs in detail that the light does not have, and s hardly changes.
+
+    Args:
+        before: with roughness, environment and mask.
+        roughness: the new one; where it is the old one there is nothing to say.
+    """
+    maps = before.require("roughness", "environment", "mask")
+    texel = np.pi / (maps["environment"].shape[0] - 1)
+    width = LOBE_WIDTH * np.square(np.minimum(maps["roughness"], roughness))
+    return (maps["mask"] > 0) & (maps["roughness"] != roughness) & (width < texel)
 
 
 def anchor(

@@ -1,6 +1,6 @@
-"""The network as a function of numpy arrays: `[s s c]` at the model's own size s, in both directions."""
+"""The network as a function of numpy arrays: `[s s c]` at one size s, in both directions, several at once."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,6 @@ from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.priors import Maps
 from unirender.pipelines.settings import Sampling
 
 
@@ -45,7 +44,7 @@ class Network:
         model: the two streams.
         conditioning: maps <-> latents.
         scheduler: of diffusers, with `prediction_type="sample"`.
-        size: pixels along each side.
+        size: s, pixels along each side: the model's own, or another multiple of what it needs.
         progress: wraps the iteration over timesteps.
     """
 
@@ -56,38 +55,52 @@ class Network:
     progress: Callable[[Iterable[Any]], Iterable[Any]]
 
     def attributes(
-        self, image_linear: Float[np.ndarray, "s s 3"], mask: Float[np.ndarray, "s s 1"], camera: Camera, how: Sampling
-    ) -> list[dict[str, np.ndarray]]:
-        """Inverse rendering of a premultiplied linear image: the maps of each sample, in physical units."""
+        self,
+        images: Sequence[Float[np.ndarray, "s s 3"]],
+        masks: Sequence[Float[np.ndarray, "s s 1"]],
+        cameras: Sequence[Camera],
+        how: Sampling,
+    ) -> list[list[dict[str, np.ndarray]]]:
+        """Inverse rendering of premultiplied linear images, all in one batch.
+
+        Returns:
+            For each image the maps of each sample, in physical units.
+        """
         maps = infer_attributes(
             self.model,
             self.conditioning,
             self.scheduler,
-            self._tensor(image_linear).expand(how.count, -1, -1, -1),
-            self._tensor(mask).expand(how.count, -1, -1, -1),
+            self._batch(images, how.count),
+            self._batch(masks, how.count),
             steps=how.steps,
-            generator=how.generator,
-            camera=camera,
+            generator=how.generators(len(images)),
+            camera=_repeat(cameras, how.count),
             progress=self.progress,
         )
         arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
-        return [{name: value[i] for name, value in arrays.items()} for i in range(how.count)]
+        rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(images) * how.count)]
+        return [rows[i * how.count : (i + 1) * how.count] for i in range(len(images))]
 
-    def image(self, intrinsics: Intrinsics, how: Sampling) -> Float[np.ndarray, "s s 3"]:
-        """Rendering: the premultiplied linear image in [0, 1], samples averaged in linear light."""
-        maps, given = self._maps(intrinsics)
+    def images(self, scenes: Sequence[Intrinsics], how: Sampling) -> list[Float[np.ndarray, "s s 3"]]:
+        """Rendering, all scenes in one batch: premultiplied linear images in [0, 1], samples averaged in linear light.
+
+        Args:
+            scenes: at the network's size.
+            how: steps, samples and noise.
+        """
         image = infer_image(
             self.model,
             self.conditioning,
             self.scheduler,
-            {name: value.expand(how.count, -1, -1, -1) for name, value in maps.items()},
-            given.expand(how.count, -1),
+            {name: self._batch([self._map(scene, name) for scene in scenes], how.count) for name in MAPS},
+            torch.tensor(_repeat([_given(scene) for scene in scenes], how.count), device=self.model.device),
             steps=how.steps,
-            generator=how.generator,
-            camera=intrinsics.camera,
+            generator=how.generators(len(scenes)),
+            camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
         )
-        return image.mean(dim=0).permute(1, 2, 0).float().cpu().numpy()
+        means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
+        return list(means.permute(0, 2, 3, 1).float().cpu().numpy())
 
     def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """The HDR maps that exceed the curve through which they enter the network, by name; {}: none does."""
@@ -98,18 +111,26 @@ class Network:
                 found[name] = Overflow(count, count / value.size, curve.x_max)
         return found
 
-    def _maps(self, intrinsics: Intrinsics) -> tuple[Maps, torch.Tensor]:
-        """Tensors of all maps (zeros for the unknown) and which of the six pictures are given."""
-        size = (self.size, self.size)
-        shapes = {"environment": (*self.conditioning.packing.environment_size, 3)}
-        maps: Maps = {}
-        for name, channels in MAPS.items():
-            value = getattr(intrinsics, name)
-            unknown = np.zeros(shapes.get(name, (*size, channels)), np.float32)
-            maps[name] = self._tensor(unknown if value is None else value)
-        given = [name == "material" or getattr(intrinsics, name) is not None for name in TRIPLETS]
-        return maps, torch.tensor([given], device=self.model.device)
+    def _map(self, scene: Intrinsics, name: str) -> Float[np.ndarray, "h w c"]:
+        """A map of a scene; zeros for an unknown one."""
+        value = getattr(scene, name)
+        if value is not None:
+            return value
+        rows, columns = self.conditioning.packing.environment_size if name == "environment" else (self.size, self.size)
+        return np.zeros((rows, columns, MAPS[name]), np.float32)
 
-    def _tensor(self, array: Float[np.ndarray, "h w c"]) -> torch.Tensor:
-        copy = np.array(np.moveaxis(array, -1, 0), dtype=np.float32, order="C")  # torch takes no read-only memory
-        return torch.from_numpy(copy)[None].to(self.model.device)
+    def _batch(self, arrays: Sequence[Float[np.ndarray, "h w c"]], count: int) -> Float[torch.Tensor, "b c h w"]:
+        """Each array `count` times in a row, on the model's device."""
+        stack = np.stack([np.moveaxis(array, -1, 0) for array in arrays])
+        tensor = torch.from_numpy(np.ascontiguousarray(stack, dtype=np.float32)).to(self.model.device)
+        return tensor.repeat_interleave(count, dim=0)
+
+
+def _given(scene: Intrinsics) -> list[bool]:
+    """Which of the six pictures are known."""
+    return [name == "material" or getattr(scene, name) is not None for name in TRIPLETS]
+
+
+def _repeat(values: Sequence[Any], count: int) -> list[Any]:
+    """Each value `count` times in a row."""
+    return [value for value in values for _ in range(count)]

@@ -1,6 +1,6 @@
 """Rendering intrinsics of any size with a network that knows one size."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -23,22 +23,33 @@ def enter(network: Network, intrinsics: Intrinsics) -> tuple[Frame, Intrinsics]:
 
 def render_any_size(
     network: Network,
-    intrinsics: Intrinsics,
+    scenes: Sequence[Intrinsics],
     how: Sampling,
     watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
-) -> Float[np.ndarray, "h w 3"]:
-    """The premultiplied linear image in [0, 1] at the intrinsics' size.
+) -> list[Float[np.ndarray, "h w 3"]]:
+    """The premultiplied linear images in [0, 1] at the sizes of the intrinsics; one batch of the network.
 
     Args:
         network: that renders.
-        intrinsics: normal, roughness and metallic are needed; see `UniRenderPipeline.render`.
+        scenes: normal, roughness and metallic are needed; see `UniRenderPipeline.render`.
         how: steps, samples and noise.
         watch: is told which HDR maps exceed the network's range.
     """
-    intrinsics = ready_to_render(intrinsics)
-    frame, small = enter(network, intrinsics)
-    watch(network.overflow(small))
-    rendered = network.image(small, how)
+    ready = [ready_to_render(scene) for scene in scenes]
+    entered = [enter(network, scene) for scene in ready]
+    for _, small in entered:
+        watch(network.overflow(small))
+    rendered = network.images([small for _, small in entered], how)
+    return [
+        _leave(network, scene, frame, small, image)
+        for scene, (frame, small), image in zip(ready, entered, rendered, strict=True)
+    ]
+
+
+def _leave(
+    network: Network, intrinsics: Intrinsics, frame: Frame, small: Intrinsics, rendered: Float[np.ndarray, "s s 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    """What the network rendered of the `small` intrinsics, at the size of the intrinsics."""
     mask = intrinsics.require("mask")["mask"]
     if frame.identity:
         return rendered * (mask > 0)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
@@ -41,12 +41,22 @@ class EditResult:
         intrinsics: the edited maps.
         decomposition: of the input.
         bounded: share of the specular values whose change was bounded: there the predicted light is too coarse to say.
+        coarse: where its texels are wider than the lobe, so that s shows no sharper reflection than before
+            (`unirender.pipelines.editing.too_coarse`); None where the roughness was not edited.
     """
 
     image_linear: Float[np.ndarray, "h w 3"]
     intrinsics: Intrinsics
     decomposition: Decomposition
     bounded: float = 0.0
+    coarse: Bool[np.ndarray, "h w 1"] | None = None
+
+    @property
+    def coarse_share(self) -> float:
+        """Share of the object's pixels where the predicted light is too coarse."""
+        if self.coarse is None:
+            return 0.0
+        return float(self.coarse[self.intrinsics.require("mask")["mask"] > 0].mean())
 
 
 def predicted_intrinsics(

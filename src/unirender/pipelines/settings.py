@@ -1,11 +1,14 @@
 """How the network is asked: the mode, and what follows from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 
-from unirender.diffusion.sampling import NUM_SAMPLES, steps_of
+from unirender.diffusion.sampling import NUM_SAMPLES, Generators, steps_of
 from unirender.errors import UnirenderError
+
+FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
 
 @dataclass(frozen=True)
@@ -13,14 +16,17 @@ class Sampling:
     """Steps, samples and noise of one call.
 
     Attributes:
+        mode: `mean` or `sample`.
         steps: of the scheduler; 1 in mode `mean`.
         count: samples.
-        generator: of the noise, on the CPU; None: torch's global state.
+        generator: of the noise, on the CPU: one, or one for each picture of a batch. None: a fixed noise in mode
+            `mean`, torch's global state in mode `sample`.
     """
 
+    mode: str
     steps: int
     count: int
-    generator: torch.Generator | None
+    generator: Generators
 
     @classmethod
     def of(
@@ -28,20 +34,44 @@ class Sampling:
         mode: str = "mean",
         num_inference_steps: int | None = None,
         num_samples: int | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> "Sampling":
-        """Resolves the arguments of a call: an expectation depends on no draw, so mode `mean` has a fixed noise.
+        """Resolves the arguments of a call.
 
         Raises:
             UnirenderError: an unknown mode, or numbers that do not go with it.
         """
-        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
-        return cls(steps, count, generator or (torch.Generator().manual_seed(0) if mode == "mean" else None))
+        return cls(mode, steps_of(mode, num_inference_steps), _sample_count(mode, num_samples), generator)
+
+    def generators(self, pictures: int) -> Generators:
+        """The noise of a batch: a picture with a generator of its own, or in mode `mean` without any, gets in it what
+        it would get alone; of one generator all draw in turn, as in diffusers.
+
+        Raises:
+            UnirenderError: several generators, but not one for each picture.
+        """
+        if isinstance(self.generator, Sequence) and len(self.generator) != pictures:
+            raise UnirenderError(
+                f"generator: got {len(self.generator)} for {pictures} pictures, expected one, or one for each picture"
+            )
+        if self.generator is None and self.mode == "mean":
+            return same_noise(FIXED_SEED, pictures)
+        return self.generator
 
     def draw_seed(self) -> int:
-        """A seed from the generator's state, which moves on."""
-        device = self.generator.device if self.generator is not None else "cpu"
-        return int(torch.randint(0, 2**62, (), generator=self.generator, device=device))
+        """A seed from the generator's state, which moves on.
+
+        Raises:
+            UnirenderError: several generators, but it is asked for one picture.
+        """
+        own = self.generators(1)
+        own = own[0] if isinstance(own, Sequence) else own
+        return int(torch.randint(0, 2**62, (), generator=own, device=own.device if own is not None else "cpu"))
+
+
+def same_noise(seed: int, count: int) -> list[torch.Generator]:
+    """Generators that all draw the same."""
+    return [torch.Generator().manual_seed(seed) for _ in range(count)]
 
 
 def _sample_count(mode: str, num_samples: int | None) -> int:

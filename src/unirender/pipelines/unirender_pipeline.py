@@ -3,37 +3,39 @@
 It is a diffusers pipeline (`from_pretrained`, `save_pretrained`, `to`, `torch_dtype`, progress bars) whose public
 arrays are numpy. A *picture* is straight display values like a PNG's, with its mask beside it; a *linear image* that
 comes back is premultiplied. Any size: pictures are brought to the model's square and results back
-(`unirender.pipelines.framing`).
+(`unirender.pipelines.framing`); `size` runs the network at another multiple of `size_multiple`, `tile` adds the detail
+of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` component, or named in a call.
 """
 
 import logging
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, overload
 
 import numpy as np
 import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
+from unirender.diffusion.sampling import Generators, make_sampler
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
-from unirender.pipelines.closure import close_decomposition
-from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, under_light
-from unirender.pipelines.framing import Frame
+from unirender.pipelines.decomposing import View, decompose_views
+from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, unit_value
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
-from unirender.pipelines.results import Decomposition, EditResult, combine, predicted_intrinsics
-from unirender.pipelines.settings import Sampling
+from unirender.pipelines.results import Decomposition, EditResult
+from unirender.pipelines.settings import Sampling, same_noise
 
 SHIPPED_CHECKPOINT = Path(__file__).parent.parent / "checkpoints" / "tiny"
 
@@ -47,7 +49,7 @@ class UniRenderPipeline(DiffusionPipeline):
 
     Args:
         dual_stream: the network.
-        scheduler: with zero terminal SNR and `prediction_type="sample"`.
+        scheduler: with zero terminal SNR and `prediction_type="sample"`, without noise of its own: DDIM or UniPC.
         vae: for models with the KL codec.
         material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
     """
@@ -58,7 +60,7 @@ class UniRenderPipeline(DiffusionPipeline):
     def __init__(
         self,
         dual_stream: DualStreamModel,
-        scheduler: DDIMScheduler,
+        scheduler: SchedulerMixin,
         vae: AutoencoderKL | None = None,
         material: str = "scalar",
     ) -> None:
@@ -66,7 +68,7 @@ class UniRenderPipeline(DiffusionPipeline):
         self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
         self.register_to_config(material=material)
         self.dual_stream: DualStreamModel
-        self.scheduler: DDIMScheduler
+        self.scheduler: SchedulerMixin
         codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
         self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
         self.size = dual_stream.config["sample_size"] * codec.factor
@@ -91,10 +93,21 @@ class UniRenderPipeline(DiffusionPipeline):
             )
         old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
-        return super().from_pretrained(str(path), **kwargs)
+        pipeline = super().from_pretrained(str(path), **kwargs)
+        # Faster on a CPU, most so in batches.
+        pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
+        return pipeline
 
-    def __call__(self, image: Any, mask: Any = None, **kwargs: Any) -> Decomposition:
-        """The same as `decompose`."""
+    @overload
+    def __call__(self, image: list | tuple, mask: Any = None, **kwargs: Any) -> list[Decomposition]: ...
+
+    @overload
+    def __call__(self, image: Picture, mask: Any = None, **kwargs: Any) -> Decomposition: ...
+
+    def __call__(self, image: Any, mask: Any = None, **kwargs: Any) -> Decomposition | list[Decomposition]:
+        """The same as `decompose`; of a list of pictures, the same as `decompose_batch`."""
+        if isinstance(image, list | tuple):
+            return self.decompose_batch(image, mask, **kwargs)
         return self.decompose(image, mask, **kwargs)
 
     def decompose(
@@ -107,6 +120,9 @@ class UniRenderPipeline(DiffusionPipeline):
         num_inference_steps: int | None = None,
         num_samples: int | None = None,
         generator: torch.Generator | None = None,
+        sampler: str | None = None,
+        size: int | None = None,
+        tile: bool = False,
         material: str | None = None,
         closed: bool = True,
     ) -> Decomposition:
@@ -121,6 +137,9 @@ class UniRenderPipeline(DiffusionPipeline):
             num_samples: of `sample`; 5 if None.
             generator: a CPU generator for the noise; None: a fixed noise in mode `mean` (an expectation depends on no
                 draw), torch's global state in mode `sample`.
+            sampler: of `sample`: `ddim` or `unipc`; None: the pipeline's scheduler.
+            size: side of the square at which the network runs, a multiple of `size_multiple`; None: the model's own.
+            tile: add the detail of tiles to albedo and normal where the picture is larger than that square.
             material: one number per object or maps; None: as the checkpoint was trained.
             closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`); False
                 gives what the network predicts.
@@ -128,21 +147,75 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
         """
-        picture, cover = as_picture(image_srgb, mask)
-        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
-        camera, material = camera or Camera(), material or self.config["material"]
+        (result,) = self.decompose_batch(
+            [image_srgb],
+            [mask],
+            cameras=camera,
+            mode=mode,
+            num_inference_steps=num_inference_steps,
+            num_samples=num_samples,
+            generator=generator,
+            sampler=sampler,
+            size=size,
+            tile=tile,
+            material=material,
+            closed=closed,
+        )
+        return result
+
+    def decompose_batch(
+        self,
+        images_srgb: Sequence[Picture],
+        masks: Sequence[Picture | None] | None = None,
+        *,
+        cameras: Camera | Sequence[Camera] | None = None,
+        mode: str = "mean",
+        num_inference_steps: int | None = None,
+        num_samples: int | None = None,
+        generator: Generators = None,
+        sampler: str | None = None,
+        size: int | None = None,
+        tile: bool = False,
+        material: str | None = None,
+        closed: bool = True,
+    ) -> list[Decomposition]:
+        """Inverse rendering of several pictures of any sizes in one batch of the network (and one more to close them).
+
+        Args:
+            images_srgb: as for `decompose`.
+            masks: one for each picture, as for `decompose`.
+            cameras: one for all, or one for each.
+            mode: as for `decompose`, like the other settings.
+            num_inference_steps: of `sample`.
+            num_samples: of `sample`.
+            generator: one for each picture (whose noise is then what it would be alone), or one from which all draw in
+                turn; None: as for `decompose`.
+            sampler: of `sample`.
+            size: side of the network's square.
+            tile: add the detail of tiles.
+            material: one number per object or maps.
+            closed: change albedo, s and d so that their rendering is the picture.
+
+        Raises:
+            UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
+        """
+        masks = [None] * len(images_srgb) if masks is None else masks
+        cameras = [cameras or Camera()] * len(images_srgb) if not isinstance(cameras, Sequence) else cameras
+        if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
+            raise UnirenderError(
+                f"decompose: got {len(images_srgb)} pictures, {len(masks)} masks and {len(cameras)} cameras, expected "
+                "at least one picture, and one of each for every picture"
+            )
+        material = material or self.config["material"]
         if material not in ("scalar", "map"):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
-        frame, image_linear = Frame(picture.shape[0], picture.shape[1], self.size), srgb_decode(picture) * cover
-        found = self._network.attributes(frame.enter(image_linear), frame.enter(cover), frame.camera(camera), how)
-        samples = [predicted_intrinsics(maps, frame, cover, camera, material) for maps in found]
-        if closed:
-
-            def render(maps: Intrinsics) -> Float[np.ndarray, "h w 3"]:
-                return render_any_size(self._network, maps, Sampling.of())
-
-            samples = [close_decomposition(sample, image_linear, render) for sample in samples]
-        return combine(tuple(samples))
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
+        network = self._network(mode, sampler, size)
+        views = []
+        for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
+            picture, cover = as_picture(image, mask)
+            views.append(View(srgb_decode(picture) * cover, cover, camera))
+        return decompose_views(network, views, how, material=material, closed=closed, tile=tile)
 
     def render(
         self,
@@ -152,6 +225,8 @@ class UniRenderPipeline(DiffusionPipeline):
         num_inference_steps: int | None = None,
         num_samples: int | None = None,
         generator: torch.Generator | None = None,
+        sampler: str | None = None,
+        size: int | None = None,
     ) -> Float[np.ndarray, "h w 3"]:
         """Rendering; several samples are averaged in linear light.
 
@@ -159,6 +234,12 @@ class UniRenderPipeline(DiffusionPipeline):
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
                 missing, and a missing mask is the whole frame. Missing s and d are derived from the environment
                 (without shadows) where it is given.
+            mode: as for `decompose`, like the other settings.
+            num_inference_steps: of `sample`.
+            num_samples: of `sample`.
+            generator: of the noise.
+            sampler: of `sample`.
+            size: side of the network's square.
 
         Returns:
             Premultiplied linear image at the intrinsics' size, in [0, 1].
@@ -167,7 +248,7 @@ class UniRenderPipeline(DiffusionPipeline):
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
-        return render_any_size(self._network, intrinsics, how, self._report_overflow)
+        return render_any_size(self._network(mode, sampler, size), [intrinsics], how, self._report_overflow)[0]
 
     def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
@@ -177,7 +258,7 @@ class UniRenderPipeline(DiffusionPipeline):
         Returns:
             By name of the map; {} where nothing does.
         """
-        network = self._network
+        network = self._network()
         return network.overflow(enter(network, ready_to_render(intrinsics))[1])
 
     def edit(
@@ -200,7 +281,8 @@ class UniRenderPipeline(DiffusionPipeline):
             metallic: new value or map, [0, 1]; None: unchanged.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture, if it is at hand.
-            **sampling: camera, mode, num_inference_steps, num_samples, generator, as for `decompose`.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, tile, material and
+                closed, as for `decompose`.
 
         Raises:
             UnirenderError: as `decompose`; or nothing to change; or a value outside [0, 1].
@@ -210,15 +292,16 @@ class UniRenderPipeline(DiffusionPipeline):
         picture, cover = as_picture(image_srgb, mask)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
         before = decomposition.intrinsics
-        edited, bounded = before, 0.0
+        edited, bounded, coarse = before, 0.0, None
         if metallic is not None:
             edited = edited.replace(metallic=constant_map(unit_value("metallic", metallic), cover))
         if roughness is not None:
             target = constant_map(unit_value("roughness", roughness), cover)
             specular, bounded = specular_for_roughness(before, target)
+            coarse = too_coarse(before, target)
             edited = edited.replace(roughness=target, specular=specular)
         image = self._rerender(picture, cover, before, edited, anchored, sampling)
-        return EditResult(image, edited, decomposition, bounded)
+        return EditResult(image, edited, decomposition, bounded, coarse)
 
     def relight(
         self,
@@ -277,17 +360,44 @@ class UniRenderPipeline(DiffusionPipeline):
     ) -> Float[np.ndarray, "h w 3"]:
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
+        network = self._network(sampling.get("mode", "mean"), sampling.get("sampler"), sampling.get("size"))
         # Both renders see the same noise, so that it cancels in what changes.
         seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
-        after = self.render(edited, generator=torch.Generator().manual_seed(seed), **settings)
+        first, second = (Sampling.of(**settings, generator=own) for own in same_noise(seed, 2))
+        (after,) = render_any_size(network, [edited], first, self._report_overflow)
         if not anchored:
             return after
-        again = Sampling.of(**settings, generator=torch.Generator().manual_seed(seed))
-        return anchor(srgb_decode(picture) * cover, render_any_size(self._network, before, again), after)
+        return anchor(srgb_decode(picture) * cover, render_any_size(network, [before], second)[0], after)
 
     @property
-    def _network(self) -> Network:
-        return Network(self.dual_stream, self.conditioning, self.scheduler, self.size, self._progress)
+    def size_multiple(self) -> int:
+        """What the side of the network's square must be a multiple of: so that the codec and the levels of the U-Nets
+        halve it without a rest, and the light's rows and columns fall on whole pixels.
+        """
+        levels = len(self.dual_stream.config["block_out_channels"])
+        return math.lcm(self.conditioning.codec.factor * 2 ** (levels - 1), *self.conditioning.packing.environment_size)
+
+    def check_size(self, size: int) -> None:
+        """Looks at a side of the network's square.
+
+        Raises:
+            UnirenderError: it is no multiple of `size_multiple`.
+        """
+        if size < 1 or size % self.size_multiple:
+            raise UnirenderError(f"size: got {size}, expected a multiple of {self.size_multiple}, like {self.size}")
+
+    def _network(self, mode: str = "mean", sampler: str | None = None, size: int | None = None) -> Network:
+        """The network as a call asks for it.
+
+        Raises:
+            UnirenderError: no such sampler or size; or a sampler in mode `mean`, which takes one step.
+        """
+        if sampler is not None and mode == "mean":
+            raise UnirenderError(f"sampler {sampler}: mode mean takes one step and no sampler; use mode 'sample'")
+        if size is not None:
+            self.check_size(size)
+        scheduler = self.scheduler if sampler is None else make_sampler(sampler, self.scheduler)
+        return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
         return self.progress_bar(steps)  # pyright: ignore[reportReturnType, reportCallIssue, reportArgumentType] - tqdm

@@ -1,15 +1,20 @@
 """The training state on disk: one file, written aside, synced and renamed, so that a killed run loses nothing older."""
 
+import dataclasses
+import json
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from unirender.errors import UnirenderError
+from unirender.training.presets import TrainConfig
 
 STATE_FILE = "state.pt"
+PROLONGABLE = "steps"  # a resumed run may be given another length
 
 
 def save_state(folder: Path, state: dict[str, Any]) -> Path:
@@ -39,6 +44,40 @@ def load_state(folder: Path) -> dict[str, Any] | None:
         raise UnirenderError(
             f"{path}: cannot be read as a training state ({error}); move it away to start anew"
         ) from error
+
+
+def plain(config: TrainConfig) -> dict[str, Any]:
+    """The config as a state holds it: what JSON knows."""
+    return json.loads(json.dumps(dataclasses.asdict(config)))
+
+
+def with_defaults(stored: dict[str, Any]) -> dict[str, Any]:
+    """The plain config of a state; entries that its version did not know yet have their defaults."""
+    return _merged(plain(TrainConfig()), stored)
+
+
+def differences(stored: dict[str, Any], config: TrainConfig) -> list[str]:
+    """What a state's plain config has instead of `config`, by dotted names; the length of a run is no difference."""
+    theirs, own = (dict(_leaves(tree)) for tree in (with_defaults(stored), plain(config)))
+    names = sorted((theirs.keys() | own.keys()) - {PROLONGABLE})
+    return [f"{n} {theirs.get(n)!r} instead of {own.get(n)!r}" for n in names if theirs.get(n) != own.get(n)]
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """`above`, and what only `below` has, in all depths."""
+    merged = dict(below)
+    for name, value in above.items():
+        other = below.get(name)
+        merged[name] = _merged(other, value) if isinstance(other, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _leaves(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
 
 
 def replace_folder(folder: Path, partial: Path) -> Path:

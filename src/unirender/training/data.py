@@ -39,6 +39,8 @@ from unirender.training.presets import Augmentation
 
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
 
+ALL_ROWS = slice(None)
+
 Batch = dict[str, Float[Tensor, "b c h w"]]
 
 
@@ -176,13 +178,15 @@ class GroupDataset:
         return np.random.default_rng([seed, 0, epoch]).permutation(len(self))
 
 
-def make_batch(dataset: GroupDataset, first: int, size: int, seed: int, augmentation: Augmentation) -> Batch:
-    """Samples `first` to `first + size` of the stream as float32 tensors."""
-    samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)]
+def make_batch(
+    dataset: GroupDataset, first: int, size: int, seed: int, augmentation: Augmentation, rows: slice = ALL_ROWS
+) -> Batch:
+    """Samples `first` to `first + size` of the stream as float32 tensors; `rows`: these of them only."""
+    samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)[rows]]
     batch: Batch = {}
     for name in BATCH_MAPS:
         height, width, channels = samples[0][name].shape
-        stacked = np.empty((size, channels, height, width), dtype=np.float32)
+        stacked = np.empty((len(samples), channels, height, width), dtype=np.float32)
         for i, sample in enumerate(samples):
             stacked[i] = np.moveaxis(sample[name], -1, 0)
         batch[name] = torch.from_numpy(stacked)
@@ -196,6 +200,7 @@ def iterate_batches(
     start_sample: int = 0,
     workers: int = 1,
     augmentation: Augmentation = DEFAULT_AUGMENTATION,
+    rows: slice = ALL_ROWS,
 ) -> Iterator[Batch]:
     """Endless batches; the k-th holds samples `start_sample + k * batch_size` onwards.
 
@@ -206,6 +211,7 @@ def iterate_batches(
         start_sample: samples consumed before; an interrupted run continues exactly where it was.
         workers: background threads that prepare batches ahead, one each; 0: prepare when asked. It changes no value.
         augmentation: what is drawn; `NO_AUGMENTATION` for pictures as they are stored.
+        rows: of each batch; the others are not read.
 
     Yields:
         image (linear, premultiplied), albedo, normal, specular, diffuse `[b 3 h w]` (linear, not premultiplied),
@@ -217,22 +223,22 @@ def iterate_batches(
             "expected at least 1, 0 and 0"
         )
     dataset = folder if isinstance(folder, GroupDataset) else GroupDataset(folder)
-    return _batches(dataset, batch_size, seed, start_sample, workers, augmentation)
+    return _batches(dataset, batch_size, seed, start_sample, workers, augmentation, rows)
 
 
 def _batches(
-    dataset: GroupDataset, size: int, seed: int, first: int, workers: int, augmentation: Augmentation
+    dataset: GroupDataset, size: int, seed: int, first: int, workers: int, augmentation: Augmentation, rows: slice
 ) -> Iterator[Batch]:
     if workers == 0:
         while True:
-            yield make_batch(dataset, first, size, seed, augmentation)
+            yield make_batch(dataset, first, size, seed, augmentation, rows)
             first += size
     executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="unirender-data")
     pending: deque[Future[Batch]] = deque()
     try:
         while True:
             while len(pending) <= workers:  # one ready beside each in the making
-                pending.append(executor.submit(make_batch, dataset, first, size, seed, augmentation))
+                pending.append(executor.submit(make_batch, dataset, first, size, seed, augmentation, rows))
                 first += size
             yield pending.popleft().result()
     finally:

@@ -12,24 +12,30 @@ from torch import nn
 
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
-from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.training.card import CARD_FILE, card_text
 from unirender.training.checkpoint import replace_folder
+from unirender.training.facts import training_facts
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
 
-TRAINING_FILE = "training.json"
+TRAINING_FILE, SCORES_FILE = "training.json", "validation.json"
 
 
 def averaged_pipeline(
     trainer: "Trainer", dtype: torch.dtype = torch.float32, device: torch.device | None = None
 ) -> UniRenderPipeline:
-    """A pipeline of the averaged weights as they are now, a copy; on the trainer's device without another one."""
-    model, _ = build_model(trainer.config.model)
+    """A pipeline of the averaged weights as they are now, a copy; on the trainer's device without another one.
+
+    An autoencoder is the trainer's own, in float32.
+    """
+    model, _ = build_model(trainer.config.model, trainer.vae)
     trainer.ema.copy_to(model)
+    for own, trained in zip(model.buffers(), trainer.model.buffers(), strict=True):  # the prompt embedding
+        own.copy_(trained)
     nn.Module.to(model.eval(), device or trainer.device, dtype)  # in place
-    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler)
+    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler, vae=trainer.vae)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
 
@@ -50,24 +56,15 @@ def read_history(folder: Path) -> list[dict[str, Any]]:
         raise UnirenderError(f"{path}: cannot be read as the record of a training ({error})") from error
 
 
-def load_network(folder: Path) -> DualStreamModel:
-    """The network of a pipeline folder, in float32.
-
-    Raises:
-        UnirenderError: no such folder, or no pipeline in it.
-    """
-    return UniRenderPipeline.from_pretrained(folder).dual_stream
-
-
 def export_pipeline(
     trainer: "Trainer",
     folder: Path,
     dtype: torch.dtype = torch.float16,
     beside: Mapping[str, str] = MappingProxyType({}),
 ) -> Path:
-    """Writes the averaged weights as a pipeline with `training.json` beside it: steps, samples, minutes and preset.
+    """Writes the averaged weights as a pipeline with what is known of the run beside it.
 
-    The same of the runs that it continues stands there too.
+    That is `training.json`, with the same of the runs that it continues, and a model card, `README.md`.
 
     Other files, by name, stand in `beside`. The folder is moved into place when it is complete. Weights are stored as
     `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
@@ -78,16 +75,10 @@ def export_pipeline(
     pipeline.save_pretrained(partial, safe_serialization=True)
     for path in partial.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
         path.chmod(0o644)
-    facts = {
-        "steps": trainer.step,
-        "samples": trainer.step * trainer.config.batch_size,
-        "minutes": round(trainer.seconds / 60, 2),
-        "device": str(trainer.device),
-        "autocast": str(trainer.dtype).removeprefix("torch."),
-        "train": trainer.state_dict()["config"],
-        "continues": trainer.continues,
-    }
+    facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}
     (partial / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
     for name, text in beside.items():
         (partial / name).write_text(text)
+    chosen = json.loads(beside[SCORES_FILE]) if SCORES_FILE in beside else None
+    (partial / CARD_FILE).write_text(card_text(folder.name, facts, chosen), encoding="utf-8")
     return replace_folder(folder, partial)

@@ -1,31 +1,109 @@
-"""One batch's gradient: forward passes by direction, cut into parts that run side by side on a CPU.
+"""One batch's gradient, however the batch is cut: over processes, over CPU threads, over time.
+
+Process r of R holds the rows r, r + R, r + 2R, ... of a batch, and cuts them into k parts in the same way: part j takes
+every k-th of them. Part p = r + R j is then every (R k)-th row of the batch from p on, whoever computes it. Under the
+conditional rule a batch is sorted (rows that render; inverse rows that are rendered again; other inverse rows), so that
+every part has its share of each kind. Timesteps of the whole batch and a seed for each part are drawn by every process
+alike. Hence the loss depends on the number of parts alone, and on that through the noise alone:
+
+    term = sum over parts p of  mass_p / mass * term_p,      mass_p = weight of the part's rows in the term's mean
 
 On a CPU that others use too, two passes on one thread each are far faster than one pass on two threads, which wait for
-each other at every operation (measured: 10 against 0.5 samples/s under load).
+each other at every operation (measured: 10 against 0.5 samples/s under load): hence parts side by side. On a GPU parts
+one after the other save memory.
 """
 
-import functools
+import dataclasses
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
+from unirender.errors import UnirenderError
 from unirender.models.priors import Maps
-from unirender.training.losses import LossFunction, LossTerms
+from unirender.training.loss_terms import Errors, LossTerms
+from unirender.training.losses import LossFunction
 from unirender.training.presets import TrainConfig
+from unirender.training.processes import ALONE, Processes
+
+OWN_ROWS = (
+    "image",
+    "environment",
+    "composite",
+    "cycle",
+)  # terms that are means over rows, or with weights, of their own
+
+Gradients = list[Tensor | None]  # by parameter; None: it took no part
+ByName = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Pass:
-    """A forward pass: its share of the batch, and the function that gives its loss terms."""
+class Split:
+    """How a batch is cut.
 
-    share: float
-    terms: Callable[[], LossTerms]
+    Attributes:
+        batch_size: rows of the batch, over all processes.
+        processes: that share it.
+        parallel: parts that a process computes side by side, at most.
+        accumulate: how many times it does so, one after the other, at most.
+    """
+
+    batch_size: int
+    processes: Processes = ALONE
+    parallel: int = 1
+    accumulate: int = 1
+
+    def __post_init__(self) -> None:
+        if self.batch_size < self.processes.size:
+            raise UnirenderError(
+                f"training: a batch of {self.batch_size} for {self.processes.size} processes, expected at least one "
+                "sample for each; pass a larger --batch-size, or torchrun a smaller --nproc-per-node"
+            )
+
+    @property
+    def own(self) -> slice:
+        """The rows of this process."""
+        return slice(self.processes.rank, None, self.processes.size)
+
+    @property
+    def parts(self) -> int:
+        """Parts of each process; none is empty."""
+        return min(self.parallel * self.accumulate, self.batch_size // self.processes.size)
+
+    @property
+    def all_parts(self) -> int:
+        """Parts of the batch."""
+        return self.processes.size * self.parts
+
+    @property
+    def at_once(self) -> int:
+        """Parts that a process computes side by side."""
+        return -(-self.parts // self.accumulate)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What one forward pass computes.
+
+    Attributes:
+        rows: of the batch that this process holds.
+        timesteps: of these rows.
+        seed: of noise and dropped maps.
+        cycle_share: share of its inverse rows, from the first on, that are rendered again.
+        mass: weight of its rows in the mean of each term of `OWN_ROWS`, and of the others ("attributes").
+    """
+
+    rows: slice
+    timesteps: Timesteps
+    seed: int
+    cycle_share: float
+    mass: ByName
 
 
 class BatchGradient:
@@ -33,56 +111,129 @@ class BatchGradient:
 
     Args:
         loss: of the model.
-        config: batch and timestep rule.
-        parallel: parts that run side by side, at most; none is without a row of each kind that the batch has.
-        generator: on the CPU; of timesteps, noise and dropped maps.
+        config: timestep rule.
+        split: of the batch.
+        generator: on the CPU, in the same state on every process; of timesteps, noise and dropped maps.
         dtype: of the autocast; float32: none.
     """
 
     def __init__(
-        self, loss: LossFunction, config: TrainConfig, parallel: int, generator: torch.Generator, dtype: torch.dtype
+        self, loss: LossFunction, config: TrainConfig, split: Split, generator: torch.Generator, dtype: torch.dtype
     ) -> None:
-        self.loss, self.config, self.parallel, self.generator, self.dtype = loss, config, parallel, generator, dtype
-        self.pool = ThreadPoolExecutor(parallel, "unirender-pass") if parallel > 1 else None
+        self.loss, self.config, self.split, self.generator, self.dtype = loss, config, split, generator, dtype
+        self.pool = ThreadPoolExecutor(split.at_once, "unirender-pass") if split.at_once > 1 else None
 
     def __call__(self, batch: Maps) -> dict[str, float]:
-        """Runs the passes of a batch on the model's device; sums their gradients and averages their loss terms."""
+        """Runs the passes of a batch on the model's device and sums their gradients.
+
+        Args:
+            batch: this process's rows.
+
+        Returns:
+            The loss terms of the whole batch.
+        """
         model: nn.Module = self.loss.model
-        parameters, device = list(model.parameters()), batch["image"].device
+        parameters = list(model.parameters())
+        parts = self.parts(batch)
+        mass = _sum(self.split.processes.gather(_sum(part.mass for part in parts)))
 
-        def run(part: Pass) -> tuple[tuple[Tensor | None, ...], dict[str, Tensor]]:
-            with torch.autocast(device.type, self.dtype, enabled=self.dtype != torch.float32):
-                terms = part.terms()
-            loss = part.share * self.loss.total(terms)
-            return torch.autograd.grad(loss, parameters, allow_unused=True), terms
+        def run(part: Part) -> tuple[Sequence[Tensor | None], ByName]:
+            with torch.autocast(batch["image"].device.type, self.dtype, enabled=self.dtype != torch.float32):
+                means = self.terms(part, batch)
+            shares = {name: part.mass[kind_of(name)] / mass[kind_of(name)] for name in means}
+            terms = {name: shares[name] * mean for name, mean in means.items()}
+            if not terms:  # Algorithm 1 may leave both streams of a row clean
+                return [None] * len(parameters), {}
+            gradients = torch.autograd.grad(self.loss.total(terms), parameters, allow_unused=True)
+            return gradients, {name: float(term.detach()) for name, term in terms.items()}
 
-        passes = list(self._passes(batch))
-        results = list(self.pool.map(run, passes)) if self.pool else [run(part) for part in passes]
-        for p, *gradients in zip(parameters, *(grads for grads, _ in results), strict=True):
-            known = [g for g in gradients if g is not None]
-            p.grad = sum(known[1:], start=known[0]) if known else None
-        weighted: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        for part, (_, terms) in zip(passes, results, strict=True):
-            for name, value in terms.items():
-                weighted[name].append((part.share, float(value.detach())))
-        return {name: sum(w * v for w, v in pairs) / sum(w for w, _ in pairs) for name, pairs in weighted.items()}
+        gradients: Gradients = [None] * len(parameters)
+        values: list[ByName] = []
+        for first in range(0, len(parts), self.split.at_once):
+            some = parts[first : first + self.split.at_once]
+            for more, terms in self.pool.map(run, some) if self.pool else map(run, some):
+                gradients = [_plus(a, b) for a, b in zip(gradients, more, strict=True)]
+                values.append(terms)
+        gradients = self._over_processes(parameters, gradients)
+        for p, gradient in zip(parameters, gradients, strict=True):
+            p.grad = gradient
+        return _sum(self.split.processes.gather(_sum(values)))
 
-    def _passes(self, batch: Maps) -> Iterator[Pass]:
-        size, c = len(batch["image"]), self.config
+    def parts(self, batch: Maps) -> list[Part]:
+        """Draws the random numbers of a batch; what this process is to compute of it.
+
+        Raises:
+            UnirenderError: the batch does not hold this process's rows.
+        """
+        split, c = self.split, self.config
+        expected = len(range(split.batch_size)[split.own])
+        if len(batch["image"]) != expected:
+            raise UnirenderError(
+                f"training: got {len(batch['image'])} rows, expected {expected} (process {split.processes.rank} of "
+                f"{split.processes.size}, batch of {split.batch_size})"
+            )
         last = last_timestep(self.loss.scheduler)
-        drawn = draw_timesteps(c.timestep_rule, size, last, c.p_render, c.p_t, self.generator)
-        if c.timestep_rule == "conditional":  # rendering samples come first; every part gets its share of both kinds
-            count = int((drawn.attributes == 0).sum())
-            kinds = [rows for rows in (torch.arange(count), torch.arange(count, size)) if len(rows)]
-        else:
-            kinds = [torch.arange(size)]
-        number = min(self.parallel, *map(len, kinds))  # a part without a kind would drop its share of that kind's loss
-        parts = [torch.cat(rows) for rows in zip(*(rows.tensor_split(number) for rows in kinds), strict=True)]
-        terms = self.loss.terms if c.timestep_rule == "conditional" else self.loss.joint_terms
-        for rows in parts:
-            part = {name: value[rows] for name, value in batch.items()}
-            device = batch["image"].device
-            t = Timesteps(drawn.attributes[rows].to(device), drawn.image[rows].to(device))
-            seed = int(torch.randint(0, 2**62, (), generator=self.generator))
-            generator = torch.Generator().manual_seed(seed)
-            yield Pass(len(rows) / size, functools.partial(terms, part, t, generator))
+        drawn = draw_timesteps(c.timestep_rule, split.batch_size, last, c.p_render, c.p_t, self.generator)
+        seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
+        inverse = (drawn.attributes > 0) & (drawn.image == 0)
+        again = inverse & (inverse.cumsum(0) <= round(self.loss.config.cycle_share * int(inverse.sum())))
+        weight = self._row_weights(batch["mask"])
+        parts: list[Part] = []
+        for j in range(split.parts):
+            rows = slice(j, None, split.parts)
+            a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
+            w = weight[rows]
+            mass = {"image": w[i > 0], "attributes": w[a > 0], "environment": a > 0, "composite": w[x], "cycle": w[y]}
+            seed = seeds[split.processes.rank + split.processes.size * j]
+            share = int(y.sum()) / max(1, int(x.sum()))
+            parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))
+        return parts
+
+    def terms(self, part: Part, batch: Maps) -> LossTerms:
+        """The loss terms of a part, each a mean over the part's rows."""
+        device = batch["image"].device
+        rows = {name: value[part.rows] for name, value in batch.items()}
+        t = Timesteps(part.timesteps.attributes.to(device), part.timesteps.image.to(device))
+        # The cycle has a share of the batch's inverse rows. Of the part's own, if there is but one, it would have none.
+        config = dataclasses.replace(self.loss.config, cycle_share=part.cycle_share)
+        loss = dataclasses.replace(self.loss, config=config)
+        return loss.terms(rows, t, torch.Generator().manual_seed(part.seed))
+
+    def _row_weights(self, mask: Tensor) -> Float[Tensor, " b"]:
+        """Weight of each row in a mean over pixels, on the CPU."""
+        errors = Errors(self.loss.conditioning, self.loss.config.background)
+        return errors.pixel_weights(mask.double()).sum(dim=(1, 2, 3)).cpu()
+
+    def _over_processes(self, parameters: Sequence[Tensor], gradients: Gradients) -> Gradients:
+        """Sums over the processes. A parameter that took no part in any of them keeps None as its gradient."""
+        processes = self.split.processes
+        here = [gradient is not None for gradient in gradients]
+        used = [any(flags) for flags in zip(*processes.gather(here), strict=True)]
+        held = [
+            torch.zeros_like(p) if gradient is None else gradient
+            for p, gradient, is_used in zip(parameters, gradients, used, strict=True)
+            if is_used
+        ]
+        summed = iter(processes.sum(held))
+        return [next(summed) if is_used else None for is_used in used]
+
+
+def kind_of(term: str) -> str:
+    """The name under which `Part.mass` has the weights of a loss term's mean."""
+    return term if term in OWN_ROWS else "attributes"
+
+
+def _plus(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    """Not in place: autograd may give two parameters one tensor."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a + b
+
+
+def _sum(terms: Iterable[ByName]) -> ByName:
+    """Name by name."""
+    sums: defaultdict[str, float] = defaultdict(float)
+    for one in terms:
+        for name, value in one.items():
+            sums[name] += value
+    return dict(sums)

@@ -9,6 +9,8 @@ from typing import Literal
 
 from unirender.errors import UnirenderError
 
+ENVIRONMENT_SIZE = (16, 32)  # rows, columns of the light that every model predicts; whole pixels make up a texel
+
 
 @dataclass(frozen=True)
 class ModelConfig:
@@ -19,13 +21,15 @@ class ModelConfig:
     patch: int = 2  # pixel codec: image pixels per latent pixel, one way
     block_out_channels: tuple[int, ...] = (64, 64, 96, 128)  # widths from the finest level down
     layers_per_block: int = 1
-    attention_levels: tuple[int, ...] = (3,)  # the lowest must be among them
+    attention_levels: tuple[int, ...] = (3,)  # the mid block, below the lowest level, has attention always
     attention_head_dim: int | tuple[int, ...] = 32  # channels of a head; a tuple: number of heads by level
     cross_attention_dim: int = 16
     prompt_tokens: int = 1
     norm_num_groups: int = 16
+    linear_projection: bool = False  # attention's projections are linear layers, not 1x1 convolutions
     # the closed-form image to which the image stream adds what it leaves out
     physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
+    unified: bool = True  # False: a network for each direction, and the widths are those of each
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,11 @@ class LossConfig:
     cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
+    cycle_steps: int = 1  # 1: what is rendered again is the step's own prediction; more: a sample of so many steps
+    composite: float = 0.0  # weight of the closed-form image of the predicted maps; 0: none
+    # how the squared error of x0 counts by its timestep; see `unirender.training.loss_terms.timestep_weights`
+    timestep_weight: Literal["none", "v", "min_snr"] = "none"
+    snr_bound: float = 5.0  # of min_snr
 
 
 @dataclass(frozen=True)
@@ -84,6 +93,7 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     augmentation: Augmentation = field(default_factory=Augmentation)
     batch_size: int = 16
+    group_size: int = 1  # pictures side by side in a batch that differ in one thing only; 1: they may differ in all
     steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
     p_render: float = 0.5  # share of rendering; the paper's p_direction
@@ -102,13 +112,17 @@ _TINY = TrainConfig(
     p_t=0.15,
     map_dropout=0.03,
 )
+# Two of these have as many weights as `tiny`: each has two encoders and the decoder of its own direction.
+_HALF_TINY = dataclasses.replace(
+    _TINY.model, unified=False, block_out_channels=(56, 64, 80, 104), attention_head_dim=(4, 4, 4, 4), norm_num_groups=8
+)
 _SD_MODEL = ModelConfig(
     resolution=512,
     codec="kl",
     patch=8,
     block_out_channels=(320, 640, 1280, 1280),
     layers_per_block=2,
-    attention_levels=(0, 1, 2, 3),
+    attention_levels=(0, 1, 2),
     attention_head_dim=(8, 8, 8, 8),
     cross_attention_dim=768,
     prompt_tokens=77,
@@ -132,12 +146,24 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_cycle_into_renderer": dataclasses.replace(
         _TINY, loss=dataclasses.replace(_TINY.loss, cycle_into_renderer=True)
     ),
+    "tiny_cycle_sampled": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle_steps=2)),
+    "tiny_composite_loss": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, composite=1.0)),
+    "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
+    "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
+    "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
+    "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": dataclasses.replace(
         _TINY,
         model=ModelConfig(resolution=128, block_out_channels=(96, 128, 192, 256), layers_per_block=2),
         optimizer=OptimizerConfig(learning_rate=5e-4, ema_decay=0.9995),
     ),
     "sd15": _SD,
+    "sd21": dataclasses.replace(
+        _SD,
+        model=dataclasses.replace(
+            _SD_MODEL, attention_head_dim=(5, 10, 20, 20), cross_attention_dim=1024, linear_projection=True
+        ),
+    ),
     "paper": dataclasses.replace(_SD, loss=LossConfig(cycle_warmup=0.0, background=1.0)),
 }
 

@@ -1,6 +1,8 @@
 """`unirender train`: its options, and the run that they describe. Torch is imported only when training begins."""
 
 import dataclasses
+import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, DType, usage
 from unirender.paths import cache_dir
-from unirender.training.presets import TrainConfig, get_preset
+from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 
 if TYPE_CHECKING:
     from unirender.training.validation import Validate
@@ -27,6 +29,11 @@ class Train:
     """Row of `unirender.training.presets.PRESETS`."""
     init: Path | None = None
     """Begin with the weights of this pipeline folder instead of random ones; its network must be the preset's."""
+    init_from: Path | None = None
+    """Begin with the weights of this Stable Diffusion folder (version 1 or 2, diffusers format) and work on the latents
+    of its autoencoder; for the presets sd15, sd21 and paper."""
+    resolution: int | None = None
+    """Size of the training pictures, one way, instead of the preset's; the data must have it."""
     learning_rate: float | None = None
     """Peak learning rate, instead of the preset's."""
     out: Path | None = None
@@ -45,6 +52,14 @@ class Train:
     """Of the weights, the data order and the noise."""
     parallel: int | None = None
     """Parts of a batch that run side by side on a CPU, one thread each. None: PyTorch's thread count."""
+    accumulate: int = 1
+    """Pieces in which a batch is computed, one after the other: more of them need less memory."""
+    gradient_checkpointing: bool = False
+    """Compute activations again where they are needed for gradients: less memory, for about one more forward pass."""
+    log_every: int = 20
+    """Steps between two lines of losses."""
+    save_minutes: float = 3.0
+    """Minutes between two saves of the state from which the run resumes."""
     refresh_minutes: float | None = None
     """Look for new shards this often, in a data folder that is still being written. None: never."""
     validate: int = 0
@@ -55,6 +70,14 @@ class Train:
     keep_best: str | None = None
     """Keep in `best/` the pipeline that had the best of these scores, such as albedo.psnr. It was then chosen by scenes
     of that suite: its scores there flatter it."""
+    track: tuple[str, ...] = ()
+    """Send every line of the log to these experiment trackers, such as tensorboard or wandb: those of accelerate that
+    are installed."""
+
+    @property
+    def scored_on(self) -> str | None:
+        """In words: what `validate` measures on."""
+        return f"{self.validate} scenes of the suite {Path(self.validate_suite).stem}" if self.validate else None
 
     def check(self) -> TrainConfig:
         """Looks at the values; the resolved configuration.
@@ -62,7 +85,8 @@ class Train:
         Raises:
             UsageError: an unknown preset, a value outside its range, or options that contradict each other.
         """
-        for name in ("minutes", "steps", "batch_size", "learning_rate", "parallel", "refresh_minutes"):
+        positive = ("minutes", "steps", "batch_size", "learning_rate", "parallel", "accumulate", "log_every")
+        for name in (*positive, "save_minutes", "refresh_minutes"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise UsageError(f"--{name.replace('_', '-')} {value}: expected more than 0")
@@ -70,6 +94,10 @@ class Train:
             raise UsageError(f"--validate {self.validate}: expected a number of scenes, or 0 for none")
         if self.keep_best is not None and not self.validate:
             raise UsageError(f"--keep-best {self.keep_best}: nothing is scored, expected --validate beside it")
+        if self.track:
+            from unirender.training.trackers import check_trackers
+
+            check_trackers(self.track)
         with usage():
             config = dataclasses.replace(get_preset(self.preset), seed=self.seed)
         if self.batch_size is not None:
@@ -77,15 +105,36 @@ class Train:
         if self.learning_rate is not None:
             optimizer = dataclasses.replace(config.optimizer, learning_rate=self.learning_rate)
             config = dataclasses.replace(config, optimizer=optimizer)
-        if config.model.codec == "kl":
-            raise UsageError(
-                f"--preset {self.preset}: its network works on latents of Stable Diffusion's autoencoder, which this "
-                "command cannot load yet; choose a preset with the pixel codec, such as tiny or small"
-            )
+        if self.resolution is not None:
+            least = math.lcm(*ENVIRONMENT_SIZE, config.model.patch)
+            if self.resolution < 1 or self.resolution % least:
+                raise UsageError(
+                    f"--resolution {self.resolution}: expected a multiple of {least}, so that the network's latents "
+                    "and the light's texels cover whole pixels"
+                )
+            config = dataclasses.replace(config, model=dataclasses.replace(config.model, resolution=self.resolution))
+        self._check_start(config)
         return config
 
+    def _check_start(self, config: TrainConfig) -> None:
+        if self.init is not None and self.init_from is not None:
+            raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
+        if config.model.codec == "pixel" and self.init_from is not None:
+            raise UsageError(
+                f"--preset {self.preset}: its network works on pixels and cannot begin with Stable Diffusion's "
+                "weights; leave out --init-from, or choose sd15, sd21 or paper"
+            )
+        if config.model.codec == "kl" and self.init is None and self.init_from is None:
+            raise UsageError(
+                f"--preset {self.preset}: its network works on latents of Stable Diffusion's autoencoder, which it "
+                "needs; pass --init-from with a Stable Diffusion folder (or --init with a pipeline of this preset)"
+            )
+
     def run(self, make_validation: MakeValidation) -> int:
-        """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status."""
+        """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status.
+
+        Under torchrun this is one of several processes, of which the first one writes and speaks.
+        """
         config = self.check()
         if not self.data.is_dir():
             raise UnirenderError(
@@ -93,23 +142,29 @@ class Train:
             )
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
         pipeline = train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
-        print(f"{pipeline}: use it with --checkpoint {pipeline}")
+        if pipeline is not None:
+            print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
 
 
-def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path:
-    """Runs the training; returns the folder with the trained pipeline."""
+def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path | None:
+    """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
     import torch
     from rich.console import Console
 
     from unirender.models.precision import resolve_device, resolve_dtype
-    from unirender.training.export import export_pipeline, load_network, read_history
+    from unirender.training.checkpoint import STATE_FILE
+    from unirender.training.export import export_pipeline
     from unirender.training.groups import list_shards
     from unirender.training.live import live_report
+    from unirender.training.memory import training_bytes
+    from unirender.training.processes import join_processes
     from unirender.training.source import ShardSource
+    from unirender.training.start import read_start
+    from unirender.training.trackers import make_trackers, tracking
     from unirender.training.trainer import RunConfig, Trainer
 
-    device = resolve_device(options.device)
+    processes, device = join_processes(resolve_device(options.device))
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
@@ -118,27 +173,46 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         out,
         steps=config.steps if options.steps is None and options.minutes is None else options.steps,
         minutes=options.minutes,
+        log_every=options.log_every,
+        save_minutes=options.save_minutes,
         refresh_minutes=options.refresh_minutes,
         parallel=parallel,
+        accumulate=options.accumulate,
         keep_best=options.keep_best,
+        preset=options.preset,
+        scored_on=options.scored_on,
     )
+    trackers = make_trackers(options.track, out) if processes.is_main else ()
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
-    trainer = Trainer(config, run, device, dtype)
-    if options.init is not None:
-        trainer.start_from(load_network(options.init), read_history(options.init))
+    start = read_start(config.model, options.init, options.init_from)
+    trainer = Trainer(config, run, device, dtype, processes, start.vae)
+    start.apply(trainer)
+    del start  # Stable Diffusion's U-Net is no longer needed
+    if options.gradient_checkpointing:
+        trainer.model.enable_gradient_checkpointing()
     source = ShardSource(
-        options.data, config.batch_size, config.seed, augmentation=config.augmentation, size=config.model.resolution
+        options.data,
+        config.batch_size,
+        config.seed,
+        augmentation=config.augmentation,
+        size=config.model.resolution,
+        rows=trainer.split.own,
+        group_size=config.group_size,
     )
     source.open()
-    console = Console()
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
-    console.print(
-        f"{out}: {parameters:.2f} M parameters, {device}, {dtype}, {parallel} passes side by side",
-        soft_wrap=True,
-        highlight=False,
-        markup=False,
-    )
-    with live_report(run.steps, run.minutes, console) as report:
+    place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""
+    say = functools.partial(Console().print, soft_wrap=True, highlight=False, markup=False)
+    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {trainer.split.at_once} passes side by side")
+    if processes.is_main:
+        say(f"memory: {training_bytes(trainer.model)}")
+    resumed = (out / STATE_FILE).is_file()
+    with (
+        live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,
+        tracking(trackers, config, resumed, show) as report,
+    ):
         trainer.fit(source, report, validate)
+    pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
     source.close()
-    return export_pipeline(trainer, out / "pipeline")
+    processes.close()
+    return pipeline

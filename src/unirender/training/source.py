@@ -6,7 +6,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from unirender.errors import UnirenderError
 from unirender.training.augment import DEFAULT_AUGMENTATION
-from unirender.training.data import Batch, GroupDataset, iterate_batches
+from unirender.training.contrasts import ContrastDataset
+from unirender.training.data import ALL_ROWS, Batch, GroupDataset, iterate_batches
 from unirender.training.presets import Augmentation
 
 
@@ -15,7 +16,7 @@ class BatchSource(Protocol):
     """An endless source of batches whose place can be saved."""
 
     def next(self) -> Batch:
-        """The next batch."""
+        """The next batch: of several processes, the rows `Split.own` of it."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -36,6 +37,19 @@ class ShardSource:
 
     The stream is a function of (shards, seed, samples consumed); the shards in use are part of the state, so that a
     resumed run sees the same samples. `refresh` is the one place where the shards change, and it says so.
+
+    Args:
+        folder: of the shards.
+        batch_size: samples of a batch, over all processes.
+        seed: of order and augmentation.
+        workers: background threads.
+        augmentation: what is drawn.
+        size: of the pictures, one way; None: whatever they have.
+        rows: of each batch, those of this process; the others are not read.
+        group_size: a batch is made of runs of so many pictures that differ in one thing; 1: of pictures in any order.
+
+    Raises:
+        UnirenderError: a batch does not hold whole runs.
     """
 
     def __init__(
@@ -46,17 +60,24 @@ class ShardSource:
         workers: int = 1,
         augmentation: Augmentation = DEFAULT_AUGMENTATION,
         size: int | None = None,
+        rows: slice = ALL_ROWS,
+        group_size: int = 1,
     ) -> None:
+        if group_size < 1 or batch_size % group_size:
+            raise UnirenderError(
+                f"training: got batches of {batch_size}, expected a multiple of {group_size}, the pictures of a run "
+                "that differ in one thing; pass another --batch-size, or choose a preset without group_size"
+            )
         self.folder, self.batch_size, self.seed, self.workers = Path(folder), batch_size, seed, workers
-        self.augmentation, self.size = augmentation, size
-        self.consumed = 0
+        self.augmentation, self.size, self.rows, self.group_size = augmentation, size, rows, group_size
+        self.consumed = 0  # samples, over all processes
         self.dataset: GroupDataset | None = None
         self._batches: Iterator[Batch] | None = None
 
     def next(self) -> Batch:
         if self._batches is None:
             self._batches = iterate_batches(
-                self.open(), self.batch_size, self.seed, self.consumed, self.workers, self.augmentation
+                self.open(), self.batch_size, self.seed, self.consumed, self.workers, self.augmentation, self.rows
             )
         self.consumed += self.batch_size
         return next(self._batches)
@@ -71,7 +92,10 @@ class ShardSource:
         return self.dataset
 
     def _open(self, shards: tuple[str, ...] | None = None) -> GroupDataset:
-        dataset = GroupDataset(self.folder, shards)
+        if self.group_size == 1:
+            dataset = GroupDataset(self.folder, shards)
+        else:
+            dataset = ContrastDataset(self.folder, shards, run_length=self.group_size)
         height, width = dataset.resolution
         if self.size is not None and (height, width) != (self.size, self.size):
             raise UnirenderError(

@@ -4,6 +4,9 @@ A run is a folder: `config.json`, `state.pt` (everything that the next step depe
 at the end `pipeline/` with the averaged weights. Running the same command again resumes. With a length in steps the
 losses after a resume are those of an uninterrupted run, bit for bit; with a length in minutes the learning rate follows
 the clock.
+
+Several processes run the same loop, each with its rows of every batch. Process 0 alone writes, speaks and looks at the
+clock; weights, optimiser and random state are alike on all.
 """
 
 import contextlib
@@ -11,12 +14,12 @@ import dataclasses
 import json
 import math
 import time
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import nn
 
 from unirender.diffusion.schedule import make_scheduler
@@ -24,17 +27,18 @@ from unirender.errors import UnirenderError
 from unirender.models.build import build_model, restart_from_prior
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.priors import Maps
-from unirender.training.checkpoint import load_state, save_state
+from unirender.models.stable_diffusion import StableDiffusion
+from unirender.training.checkpoint import differences, load_state, plain, save_state
 from unirender.training.ema import Ema
 from unirender.training.live import Report
 from unirender.training.losses import LossFunction
-from unirender.training.passes import BatchGradient
+from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
+from unirender.training.processes import ALONE, Processes
+from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource
 from unirender.training.validation import Validate, Validation
-
-OVERFLOW = "above_x_max_"  # prefix of log entries
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +53,10 @@ class RunConfig:
     picture_minutes: float = 5.0
     refresh_minutes: float | None = None  # look for new shards; None: never
     parallel: int = 1  # parts of a batch that run side by side, each on one CPU thread; changes the noise drawn
+    accumulate: int = 1  # times that they do so for one step, to save memory; changes the noise drawn
     keep_best: str | None = None  # the score by which a validated run keeps its best pipeline in `best/`; None: none
+    preset: str | None = None  # the row that the config began as, for the model card
+    scored_on: str | None = None  # in words: what the validation measures on, for the model card
 
 
 def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
@@ -62,12 +69,24 @@ def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
 class Trainer:
     """One run: model, optimiser, average, random state and place in the data."""
 
-    def __init__(self, config: TrainConfig, run: RunConfig, device: torch.device, dtype: torch.dtype) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        run: RunConfig,
+        device: torch.device,
+        dtype: torch.dtype,
+        processes: Processes = ALONE,
+        vae: AutoencoderKL | None = None,  # of a network on its latents; it is not trained
+    ) -> None:
         if run.steps is None and run.minutes is None:
             raise UnirenderError("training: no length given, expected steps or minutes (or both)")
-        self.config, self.run, self.device, self.dtype = config, run, device, dtype
+        self.config, self.run, self.device, self.dtype, self.processes = config, run, device, dtype, processes
+        self.split = Split(config.batch_size, processes, run.parallel, run.accumulate)
         torch.manual_seed(config.seed)  # initial weights; everything later draws from self.generator
-        model, conditioning = build_model(config.model)
+        self.vae = None if vae is None else vae.eval().requires_grad_(False)
+        if self.vae is not None:
+            nn.Module.to(self.vae, device)
+        model, conditioning = build_model(config.model, self.vae)
         nn.Module.to(model, device)  # in place; ModelMixin hides the signature of its own `to`
         for p in model.parameters():
             if p.dim() == 4:
@@ -80,10 +99,12 @@ class Trainer:
             self.model.parameters(), o.learning_rate, betas=(o.beta1, o.beta2), weight_decay=o.weight_decay
         )
         self.ema = Ema(self.model, o.ema_decay)
-        self.gradient = BatchGradient(self.loss, config, run.parallel, self.generator, dtype)
+        self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
+        self.log = RunLog(run.out, processes)
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
         self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
+        self.source: BatchSource | None = None  # of the batches, once it trains
 
     @property
     def progress(self) -> float:
@@ -118,8 +139,18 @@ class Trainer:
         self.ema = Ema(self.model, self.config.optimizer.ema_decay)
         self.continues = list(history)
 
+    def start_from_diffusion(self, weights: StableDiffusion) -> None:
+        """Begins with Stable Diffusion's weights, the average too. A state in the run's folder goes before.
+
+        Raises:
+            UnirenderError: the network is of another shape.
+        """
+        weights.initialise(self.model)
+        self.ema = Ema(self.model, self.config.optimizer.ema_decay)
+        self.continues = [{"stable_diffusion": weights.folder.resolve().name}]
+
     def train_step(self, batch: Maps) -> dict[str, float]:
-        """One optimiser step; returns the loss terms."""
+        """One optimiser step, on this process's rows of a batch; returns the loss terms of the whole batch."""
         batch = {name: value.to(self.device) for name, value in batch.items()}
         rate = learning_rate(self.config.optimizer, self.step, self.progress)
         for group in self.optimizer.param_groups:
@@ -140,25 +171,25 @@ class Trainer:
         """Trains to the end of the run, resuming where the folder's state stands.
 
         Args:
-            source: of the batches.
+            source: of this process's rows of the batches.
             report: is told every line of the log.
             validate: scores a pipeline of the averaged weights, at the start, with every picture and at the end.
         """
+        self.source = source
         self.resume(source, report)
+        self._start_alike(source)
+        main = self.processes.is_main
         self._write_config()
         validation = Validation(validate, self.run.keep_best) if validate else None
         fixed: Maps | None = None
-        sums: dict[str, list[float]] = defaultdict(list)
-
-        def tell(line: dict[str, Any]) -> None:
-            self._log(line)
-            report(line)
 
         def look() -> None:
+            if not main:
+                return
             if fixed is not None:
                 self.picture(fixed)
             if validation is not None:
-                tell(validation.run(self))
+                self.log.tell(validation.run(self), report)
 
         def due(name: str, minutes: float | None) -> bool:
             if minutes is None or time.monotonic() - clock[name] < 60 * minutes:
@@ -168,30 +199,57 @@ class Trainer:
 
         look()
         clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
+        logged = self.step
         while self.progress < 1:
             clock["step"] = time.monotonic()  # pictures, validation and saves are no training
             batch = source.next()
             fixed = batch if fixed is None else fixed
-            for name, value in (self.train_step(batch) | self.overflow(batch)).items():
-                sums[name].append(value)
+            self.log.add(self.train_step(batch) | self.overflow(batch))
             now = time.monotonic()
-            self.seconds += now - clock["step"]
+            self.seconds, refreshing = self.processes.share(
+                (self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes))
+            )
             if self.step % self.run.log_every == 0 or self.progress >= 1:
-                means = {name: sum(values) / len(values) for name, values in sums.items()}
-                count = max(len(values) for values in sums.values())
-                speed = count * self.config.batch_size / (now - clock["log"])
-                clock["log"] = now
-                sums.clear()
-                known = {name: mean for name, mean in means.items() if mean or not name.startswith(OVERFLOW)}
-                tell({"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed, **known})
-            if due("save", self.run.save_minutes):
+                speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
+                clock["log"], logged = now, self.step
+                rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
+                self.log.tell(rates | self.log.means(), report)
+            if main and due("save", self.run.save_minutes):
                 self.save(source)
-            if due("picture", self.run.picture_minutes):
+            if main and due("picture", self.run.picture_minutes):
                 look()
-            if due("refresh", self.run.refresh_minutes) and (news := source.refresh()):
-                tell({"step": self.step, "data": news})
-        self.save(source)
+            if refreshing:
+                self._refresh(source, report)
+        if main:
+            self.save(source)
         look()
+
+    def _start_alike(self, source: BatchSource) -> None:
+        """Gives all processes the weights, and the data, of process 0.
+
+        Raises:
+            UnirenderError: they do not see the same run folder.
+        """
+        steps = self.processes.gather(self.step)
+        if len(set(steps)) > 1:
+            raise UnirenderError(
+                f"{self.run.out}: the processes begin at the steps {', '.join(map(str, steps))}, expected one; pass an "
+                "--out that all machines share"
+            )
+        self.processes.copy_from_main(list(self.model.state_dict().values()))
+        self._follow_main(source)
+
+    def _follow_main(self, source: BatchSource) -> None:
+        """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it."""
+        state = self.processes.share(source.state_dict())
+        if not self.processes.is_main:
+            source.load_state_dict(state)
+
+    def _refresh(self, source: BatchSource, report: Report) -> None:
+        news = source.refresh() if self.processes.is_main else None
+        if news := self.processes.share(news):
+            self._follow_main(source)
+            self.log.tell({"step": self.step, "data": news}, report)
 
     def overflow(self, batch: Maps) -> dict[str, float]:
         """Share of each HDR map's values above the brightest that its curve is made for; they are trained on as they
@@ -225,14 +283,15 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         return {
-            "config": json.loads(json.dumps(dataclasses.asdict(self.config))),
+            "config": plain(self.config),
             "step": self.step,
             "seconds": self.seconds,
             "model": self.model.state_dict(),
             "ema": self.ema.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
-            "parallel": self.run.parallel,
+            "parts": self.split.all_parts,
+            "unlogged": dict(self.log.waiting),
             "continues": self.continues,
         }
 
@@ -245,12 +304,10 @@ class Trainer:
         state = load_state(self.run.out)
         if state is None:
             return False
-        config = self.state_dict()["config"]
-        differing = sorted(key for key in config if key != "steps" and state["config"].get(key) != config[key])
-        if differing:
-            held = ", ".join(f"{key} {state['config'].get(key)!r} instead of {config[key]!r}" for key in differing)
+        if differing := differences(state["config"], self.config):
             raise UnirenderError(
-                f"{self.run.out}: holds a run with {held}; repeat the options of that run, or pass another --out"
+                f"{self.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
+                "another --out"
             )
         self.step, self.seconds = state["step"], state["seconds"]
         self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
@@ -258,35 +315,21 @@ class Trainer:
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"])
+        self.log.waiting.update(state.get("unlogged", {}))
         source.load_state_dict(state["source"])
-        self._forget_newer()
-        parallel = state.get("parallel", self.run.parallel)  # states of version 0.1.0 do not say
-        if parallel != self.run.parallel:
-            news = f"{parallel} -> {self.run.parallel}: from here on other noise is drawn than without the change"
-            line = {"step": self.step, "parallel": news}
-            self._log(line)
-            report(line)
+        self.log.forget_after(self.step)
+        parts = state.get("parts", state.get("parallel", self.split.all_parts))  # older states: parallel, or nothing
+        if parts != self.split.all_parts:
+            news = f"{parts} -> {self.split.all_parts}: from here on other noise is drawn than without the change"
+            self.log.tell({"step": self.step, "parts": news}, report)
         return True
 
     def _write_config(self) -> None:
+        own = {"device": str(self.device), "dtype": str(self.dtype), "threads": torch.get_num_threads()}
+        hardware = self.processes.gather(own)  # by process
+        if not self.processes.is_main:
+            return
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
-        hardware = {"device": str(self.device), "dtype": str(self.dtype), "threads": torch.get_num_threads()}
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
         self.run.out.mkdir(parents=True, exist_ok=True)
         (self.run.out / "config.json").write_text(text + "\n")
-
-    def _forget_newer(self) -> None:
-        """Drops the lines of the log that a killed run wrote after its last state: their steps come again."""
-        path = self.run.out / "log.jsonl"
-        if not path.is_file():
-            return
-        lines = path.read_text().splitlines(keepends=True)
-        kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= self.step]
-        partial = path.with_name(f"{path.name}.partial")
-        partial.write_text("".join(kept))
-        partial.replace(path)
-
-    def _log(self, line: dict[str, Any]) -> None:
-        self.run.out.mkdir(parents=True, exist_ok=True)
-        with (self.run.out / "log.jsonl").open("a") as file:
-            file.write(json.dumps(line) + "\n")

@@ -17,14 +17,14 @@ from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.training.checkpoint import restore_folder
-from unirender.training.export import averaged_pipeline, export_pipeline
+from unirender.training.export import SCORES_FILE, averaged_pipeline, export_pipeline
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
 
 Validate = Callable[[UniRenderPipeline], Mapping[str, Score]]
 
-BEST_FOLDER, SCORES_FILE = "best", "validation.json"
+BEST_FOLDER = "best"
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Validation:
         before = best_score(folder, self.keep_best)
         better = before is None or scores[self.keep_best].better_than(before)
         if better:
-            _replace_best(trainer, folder, scores)
+            _replace_best(trainer, folder, scores, self.keep_best)
         return line | {"best": better}
 
 
@@ -73,6 +73,7 @@ def best_score(folder: Path, name: str) -> Score | None:
     return None if stored is None else Score(**stored)
 
 
-def _replace_best(trainer: "Trainer", folder: Path, scores: Mapping[str, Score]) -> None:
-    record = {"step": trainer.step, "scores": {name: dataclasses.asdict(score) for name, score in scores.items()}}
+def _replace_best(trainer: "Trainer", folder: Path, scores: Mapping[str, Score], chosen_by: str) -> None:
+    values = {name: dataclasses.asdict(score) for name, score in scores.items()}
+    record = {"step": trainer.step, "chosen_by": chosen_by, "scores": values}
     export_pipeline(trainer, folder, beside={SCORES_FILE: json.dumps(record, indent=2) + "\n"})

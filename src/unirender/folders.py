@@ -1,0 +1,217 @@
+"""Decompositions on disk: one result folder, or a folder of pictures with a result folder for each.
+
+Each picture of a folder is decomposed as if alone: with the same noise, into a result folder that bears the picture's
+whole file name (so `a.png` and `a.jpg` stay apart) and appears complete or not at all. What is there already with the
+same settings is kept, so a run that was stopped goes on when it is started again. A picture that cannot be used is
+listed, and the others are done. Light to import.
+"""
+
+import hashlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.files import META_FILE, new_folder, write_png, write_result
+from unirender.pictures import Picture
+
+if TYPE_CHECKING:
+    from unirender.pipelines.results import Decomposition
+
+SUMMARY_FILE = "summary.json"
+SUFFIXES = (".bmp", ".exr", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+FIGURES = ("roughness_mean", "metallic_mean", "clipped", "std_max")  # of `meta.json`, for the summary
+ELSEWHERE = ("device", "input")  # of `meta.json`: another machine or another path to the picture is no other setting
+AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # pictures of one batch of the network, and their pixels
+
+Read = Callable[[Path, Path | None], Picture]
+Decompose = Callable[[list[Picture]], "list[Decomposition]"]
+
+
+@dataclass
+class FolderResult:
+    """What became of a folder of pictures.
+
+    Attributes:
+        figures: of each picture that is done, by file name.
+        kept: how many of them were there already.
+        failed: why the others are not, by file name.
+    """
+
+    figures: dict[str, dict[str, Any]] = field(default_factory=dict)
+    kept: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """The pictures that lie in a folder, not in folders inside it, in natural order: `f2.png` before `f10.png`.
+
+    Raises:
+        UnirenderError: there is none.
+    """
+    found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and p.is_file()]
+    if not found:
+        raise UnirenderError(f"{folder}: has no pictures, expected files that end in {', '.join(SUFFIXES)}")
+    return sorted(found, key=lambda path: (natural_order(path.name), path.name))
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """A key that sorts numbers in a text by their value."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def write_decomposition(folder: Path, result: "Decomposition", meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes a result folder, with a picture of the spread of each map where there are several samples.
+
+    Returns:
+        `meta` and the figures of the result, as they stand in `meta.json`.
+    """
+    meta = dict(meta) | {"roughness_mean": result.roughness, "metallic_mean": result.metallic}
+    if result.std is not None:
+        meta["std_max"] = {name: float(spread.max()) for name, spread in result.std.items()}
+    write_result(folder, result.intrinsics, meta)
+    for name, spread in (result.std or {}).items():
+        write_png(folder / f"{name}.std.png", spread / max(float(spread.max()), 1e-6))
+    return meta
+
+
+def decompose_folder(
+    pictures: list[Path],
+    output: Path,
+    *,
+    read: Read,
+    decompose: Decompose,
+    settings: Mapping[str, Any],
+    masks: Path | None = None,
+    overwrite: bool = False,
+) -> FolderResult:
+    """Decomposes pictures into `output/<file name>`.
+
+    Args:
+        pictures: files.
+        output: folder; made where it is missing.
+        read: (picture file, mask file or None) -> the picture with a mask.
+        decompose: a few pictures at once.
+        settings: all that decides a result beside the picture, for its `meta.json`.
+        masks: the mask file of all pictures, or the folder of their masks.
+        overwrite: do those again that are there already.
+
+    Raises:
+        UsageError: `output` is the folder of the pictures.
+        UnirenderError: `output` cannot be made.
+    """
+    if any(output.resolve() == path.resolve().parent for path in pictures):
+        raise UsageError(f"{output}: is the folder of the pictures, expected another one for the results")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
+    done = FolderResult()
+
+    def wanted() -> Iterator[tuple[Path, Picture, dict[str, Any]]]:
+        for path in pictures:
+            try:
+                mask = mask_of(path, masks)
+                meta = {**settings, "input": path, "input_sha256": input_sha256(path, mask)}
+                if not overwrite and (figures := figures_of(output / path.name, meta)) is not None:
+                    done.figures[path.name] = figures
+                    done.kept += 1
+                    continue
+                picture = read(path, mask)
+            except UnirenderError as error:
+                done.failed[path.name] = str(error)
+                continue
+            yield path, picture, meta | {"clipped": picture.clipped}
+
+    for batch in batches(wanted()):
+        results = decompose([picture for _, picture, _ in batch])
+        for (path, _, meta), result in zip(batch, results, strict=True):
+            try:
+                with new_folder(output / path.name, overwrite=overwrite) as folder:
+                    written = write_decomposition(folder, result, meta)
+            except UnirenderError as error:
+                done.failed[path.name] = str(error)
+            else:
+                done.figures[path.name] = {name: written[name] for name in FIGURES if name in written}
+    return done
+
+
+def batches(
+    items: Iterable[tuple[Path, Picture, dict[str, Any]]],
+) -> Iterator[list[tuple[Path, Picture, dict[str, Any]]]]:
+    """Groups of at most `AT_ONCE` pictures and about `PIXELS_AT_ONCE` pixels, in order."""
+    batch: list[tuple[Path, Picture, dict[str, Any]]] = []
+    pixels = 0
+    for item in items:
+        height, width = item[1].image_srgb.shape[:2]
+        if batch and (len(batch) == AT_ONCE or pixels + height * width > PIXELS_AT_ONCE):
+            yield batch
+            batch, pixels = [], 0
+        batch.append(item)
+        pixels += height * width
+    if batch:
+        yield batch
+
+
+def mask_of(path: Path, masks: Path | None) -> Path | None:
+    """The mask file of a picture: `masks` itself, or the picture in that folder with the same stem.
+
+    Raises:
+        UnirenderError: there is none in that folder, or more than one.
+    """
+    if masks is None or not masks.is_dir():
+        return masks
+    found = [p for p in masks.iterdir() if p.stem == path.stem and p.suffix.lower() in SUFFIXES]
+    if len(found) != 1:
+        raise UnirenderError(f"{masks}: has {len(found)} masks for {path.name}, expected one picture {path.stem}.*")
+    return found[0]
+
+
+def input_sha256(path: Path, mask: Path | None) -> str:
+    """sha256 over a picture file, and over its mask file if it has one.
+
+    Raises:
+        UnirenderError: a file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for file in filter(None, (path, mask)):
+        try:
+            digest.update(file.read_bytes())
+        except OSError as error:
+            raise UnirenderError(f"{file}: cannot be read ({error.strerror})") from error
+    return digest.hexdigest()
+
+
+def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The figures of an earlier result; None where there is none.
+
+    Raises:
+        UnirenderError: there is one of another picture or of other settings.
+    """
+    try:
+        stored = json.loads((folder / META_FILE).read_text())
+    except (OSError, ValueError):
+        return None
+    now = json.loads(json.dumps(dict(meta), default=str))
+    differing = [name for name, value in now.items() if name not in ELSEWHERE and stored.get(name) != value]
+    if differing:
+        raise UnirenderError(
+            f"{folder}: is a result with another {', '.join(differing)}; choose another folder or pass --overwrite"
+        )
+    return {name: stored[name] for name in FIGURES if name in stored}
+
+
+def write_summary(output: Path, result: FolderResult, facts: Mapping[str, Any]) -> None:
+    """Writes `summary.json`, whole: what was asked for, the figures of each picture, and why others failed."""
+    record = {**facts, "pictures": result.figures, "failed": result.failed}
+    handle, temporary = tempfile.mkstemp(prefix=f".{SUMMARY_FILE}.", dir=output)
+    with os.fdopen(handle, "w") as file:
+        file.write(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
+    os.chmod(temporary, 0o644)
+    os.replace(temporary, output / SUMMARY_FILE)

@@ -1,0 +1,86 @@
+"""Decomposing pictures of any size with a network that knows one size: all of them in one batch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.pipelines.closure import close_decomposition
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.network import Network
+from unirender.pipelines.rendering import render_any_size
+from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics
+from unirender.pipelines.settings import Sampling, same_noise
+from unirender.pipelines.tiling import add_detail, blend_tiles
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture that was checked.
+
+    Attributes:
+        image_linear: premultiplied, linear.
+        mask: coverage.
+        camera: that took it.
+    """
+
+    image_linear: Float[np.ndarray, "h w 3"]
+    mask: Float[np.ndarray, "h w 1"]
+    camera: Camera
+
+    def frame(self, size: int) -> Frame:
+        """How it sits in a network's square."""
+        return Frame(self.mask.shape[0], self.mask.shape[1], size)
+
+
+def decompose_views(
+    network: Network, views: Sequence[View], how: Sampling, *, material: str, closed: bool, tile: bool
+) -> list[Decomposition]:
+    """Inverse rendering.
+
+    Args:
+        network: whose size the pictures are brought to.
+        views: any sizes and cameras.
+        how: steps, samples and noise.
+        material: `scalar` or `map`.
+        closed: whether albedo, s and d are changed so that their rendering is the picture; one more batch.
+        tile: whether pictures larger than the network's square get the detail of tiles; a batch for every few tiles.
+    """
+    frames = [view.frame(network.size) for view in views]
+    found = network.attributes(
+        [frame.enter(view.image_linear) for view, frame in zip(views, frames, strict=True)],
+        [frame.enter(view.mask) for view, frame in zip(views, frames, strict=True)],
+        [frame.camera(view.camera) for view, frame in zip(views, frames, strict=True)],
+        how,
+    )
+    samples = [
+        [predicted_intrinsics(maps, frame, view.mask, view.camera, material) for maps in own]
+        for view, frame, own in zip(views, frames, found, strict=True)
+    ]
+    for i, (view, frame) in enumerate(zip(views, frames, strict=True)):
+        if tile and frame.side > network.size:
+            blended = _tiled(network, view, how, _one(how, i).draw_seed())
+            samples[i] = [add_detail(whole, fine, frame) for whole, fine in zip(samples[i], blended, strict=True)]
+    if closed:
+        rendered = iter(render_any_size(network, [sample for own in samples for sample in own], Sampling.of()))
+        samples = [
+            [close_decomposition(sample, view.image_linear, next(rendered)) for sample in own]
+            for view, own in zip(views, samples, strict=True)
+        ]
+    return [combine(tuple(own)) for own in samples]
+
+
+def _one(how: Sampling, picture: int) -> Sampling:
+    """The settings of one picture of a batch."""
+    return replace(how, generator=how.generator[picture]) if isinstance(how.generator, Sequence) else how
+
+
+def _tiled(network: Network, view: View, how: Sampling, seed: int) -> list[dict[str, np.ndarray]]:
+    """The picture's maps from tiles of the network's size; every tile sees the same noise, so that none differs."""
+
+    def predict(images: Sequence[np.ndarray], masks: Sequence[np.ndarray], cameras: Sequence[Camera]) -> list:
+        return network.attributes(images, masks, cameras, replace(how, generator=same_noise(seed, len(images))))
+
+    return blend_tiles(view.image_linear, view.mask, view.camera, network.size, predict)

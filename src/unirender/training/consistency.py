@@ -1,0 +1,126 @@
+"""The losses that compare what the predicted attributes look like with the true image, on inverse rows.
+
+`cycle` (paper Sec. 3.2, "cycle-consistent constraint"): the network renders them again, from pure noise in one step.
+`composite` (ours): their closed-form image; no network takes part, so nothing can learn to accept wrong maps, but
+shadowed highlights and interreflection are then explained by the maps.
+
+Both ask one answer to look like the picture. The prediction at much noise is a mean of answers, which need not.
+`cycle_steps` > 1 renders a few-step sample of the inverse direction instead: an answer, at that many passes more.
+"""
+
+import contextlib
+from dataclasses import dataclass
+
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from jaxtyping import Float
+from torch import Tensor
+
+from unirender.camera import Camera
+from unirender.diffusion.sampling import denoise, make_sampler
+from unirender.diffusion.schedule import last_timestep
+from unirender.diffusion.timesteps import Timesteps
+from unirender.models.conditioning import TRIPLETS, Conditioning, srgb_encode
+from unirender.models.dual_stream import DualStreamModel
+from unirender.models.priors import PRIORS
+from unirender.training.loss_terms import Errors, noise_like, predict, weighted_mean
+from unirender.training.presets import LossConfig
+
+ALL = slice(None)
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Both losses of a model under a config; predicted latents come in float32."""
+
+    model: DualStreamModel
+    conditioning: Conditioning
+    scheduler: DDIMScheduler
+    config: LossConfig
+    errors: Errors
+
+    def cycle(
+        self,
+        predicted: Float[Tensor, "b nc h w"],
+        clean_i: Float[Tensor, "b c h w"],
+        mask: Float[Tensor, "b 1 H W"],
+        generator: torch.Generator,
+    ) -> Float[Tensor, ""]:
+        """Error of the image rendered from predicted attributes.
+
+        Without `cycle_into_renderer` the gradient reaches the attributes, and through them the pass that predicted
+        them, but not the weights of the rendering pass.
+
+        Args:
+            predicted: of the training step; with `cycle_steps` > 1 a sample is drawn instead.
+            clean_i: latents of the true image.
+            mask: coverage.
+            generator: CPU generator of the noise.
+        """
+        rows = predicted if self.config.cycle_steps == 1 else self.sample(clean_i, mask, generator)
+        if self.config.cycle_into_renderer:
+            return self._rendered(rows, clean_i, mask, generator)
+        leaf = rows.detach().requires_grad_()
+        error = self._rendered(leaf, clean_i, mask, generator)
+        return _with_gradient(error.detach(), rows, torch.autograd.grad(error, leaf)[0])
+
+    def composite(
+        self,
+        predicted: Float[Tensor, "b nc h w"],
+        image_linear: Float[Tensor, "b 3 H W"],
+        mask: Float[Tensor, "b 1 H W"],
+    ) -> Float[Tensor, ""]:
+        """Error of the closed-form image of predicted attributes: the model's physics prior, else the split sum.
+
+        Display values in [-1, 1], as the cycle's. Nothing is clipped but where the picture is: a surface that is
+        predicted too bright has a gradient, and one that is brighter than white where the picture is white no error.
+
+        Args:
+            predicted: latents of the six pictures.
+            image_linear: the true image, premultiplied.
+            mask: coverage.
+        """
+        prior = self.conditioning.physics_prior or PRIORS["split_sum"]
+        maps = self.conditioning.decode_attributes(predicted)
+        shown = srgb_encode(prior.radiance(maps, Camera()) * mask)
+        shown = torch.where(image_linear >= 1, shown.clamp(max=1), shown)
+        error = (2 * shown - 2 * srgb_encode(image_linear.clamp(0, 1))).square()
+        return weighted_mean(error, self.errors.pixel_weights(mask).expand_as(error))
+
+    def sample(
+        self, clean_i: Float[Tensor, "b c h w"], mask: Float[Tensor, "b 1 H W"], generator: torch.Generator
+    ) -> Float[Tensor, "b nc h w"]:
+        """Attributes by `cycle_steps` steps of DDIM from pure noise; only the last step has a gradient."""
+        scheduler = make_sampler("ddim", self.scheduler)  # its own: passes run side by side
+        given = torch.zeros(len(clean_i), len(TRIPLETS), dtype=torch.bool, device=clean_i.device)
+        extras = self.conditioning.extras(mask, given)
+
+        def step(x_t: Tensor, t: Tensor) -> Tensor:
+            clean = torch.zeros_like(t)
+            with contextlib.nullcontext() if t[0] == scheduler.timesteps[-1] else torch.no_grad():
+                output = predict(self.model, x_t, clean_i, Timesteps(t, clean), extras, ALL, None)
+            assert output.attributes is not None
+            return output.attributes.float()
+
+        shape = (len(clean_i), self.conditioning.attribute_channels, *clean_i.shape[-2:])
+        noise = noise_like(clean_i.new_empty(shape), generator)
+        return denoise(step, noise, scheduler, self.config.cycle_steps)
+
+    def _rendered(
+        self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        # maps are made of latents only where a prior is made of maps: a KL codec decodes slowly
+        maps = self.conditioning.decode_attributes(attributes) if self.conditioning.physics_prior else None
+        given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
+        extras = self.conditioning.extras(mask, given, maps)
+        t = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)
+        timesteps = Timesteps(torch.zeros_like(t), t)
+        output = predict(self.model, attributes, noise_like(clean_i, generator), timesteps, extras, None, ALL)
+        assert output.image is not None
+        return self.errors.image(output.image, clean_i, mask)
+
+
+def _with_gradient(value: Tensor, x: Tensor, gradient: Tensor) -> Float[Tensor, ""]:
+    """A scalar that has this value, and this gradient with respect to `x`: nothing upstream of x but x is reached."""
+    linear = (gradient * x).sum()
+    return value + linear - linear.detach()

@@ -1,0 +1,96 @@
+"""What is known of a training run: the content of `training.json`, and what its model card is written from.
+
+A fact that is not known is left out.
+"""
+
+import json
+import platform
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import diffusers
+import torch
+
+import unirender
+from unirender.training.source import BatchSource, ShardSource
+
+if TYPE_CHECKING:
+    from unirender.training.trainer import Trainer
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+def training_facts(trainer: "Trainer") -> dict[str, Any]:
+    """Length, hardware, software, data, losses and configuration of a run as it stands; plain data, no paths.
+
+    The scores are those of the validation at the present step, if the log has one.
+    """
+    run, log = trainer.run, _Log(trainer.run.out, trainer.step)
+    scores = log.latest("validation")
+    facts = {
+        "preset": run.preset,
+        "parameters": sum(p.numel() for p in trainer.model.parameters()),
+        "steps": trainer.step,
+        "samples": trainer.step * trainer.config.batch_size,
+        "minutes": round(trainer.seconds / 60, 2),
+        "device": str(trainer.device),
+        "autocast": str(trainer.dtype).removeprefix("torch."),
+        "hardware": _hardware(trainer),
+        "software": {
+            "unirender": unirender.__version__,
+            "torch": torch.__version__,
+            "diffusers": diffusers.__version__,
+        },
+        "data": data_facts(trainer.source),
+        "losses": log.latest("samples_per_s"),
+        "scores": scores["validation"] if scores and scores["step"] == trainer.step else None,
+        "scored_on": run.scored_on,
+        "train": trainer.state_dict()["config"],
+        "continues": trainer.continues,
+    }
+    return {name: value for name, value in facts.items() if value is not None}
+
+
+def data_facts(source: BatchSource | None) -> dict[str, Any] | None:
+    """Name, fingerprint and size of an open data folder; None for a source that is none."""
+    if not isinstance(source, ShardSource) or source.dataset is None:
+        return None
+    dataset = source.dataset
+    return {
+        "folder": source.folder.resolve().name,
+        "fingerprint": dataset.fingerprint,
+        "shards": len(dataset.shard_names),
+        "groups": len(dataset.keys),
+        "pairs": dataset.num_pairs,
+    }
+
+
+def processor_name(device: torch.device) -> str | None:
+    """What computes: the name of the GPU, or of the CPU."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    if CPU_INFO.is_file():
+        names = [line.partition(":")[2].strip() for line in CPU_INFO.read_text().splitlines() if "model name" in line]
+        if names:
+            return names[0]
+    return platform.processor() or platform.machine() or None
+
+
+def _hardware(trainer: "Trainer") -> dict[str, Any]:
+    """Processor, and threads that computed side by side in each of the processes."""
+    facts: dict[str, Any] = {"processor": processor_name(trainer.device), "processes": trainer.processes.size}
+    if trainer.device.type == "cpu":
+        facts["threads"] = trainer.run.parallel * torch.get_num_threads()
+    return {name: value for name, value in facts.items() if value is not None}
+
+
+class _Log:
+    """The lines of a run's log up to a step; the newest of a kind is the one with an entry of a name."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        path = folder / "log.jsonl"
+        lines = path.read_text().splitlines() if path.is_file() else []
+        self.lines = [line for line in map(json.loads, lines) if line["step"] <= step]
+
+    def latest(self, name: str) -> dict[str, Any] | None:
+        return next((line for line in reversed(self.lines) if name in line), None)

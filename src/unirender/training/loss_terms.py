@@ -1,0 +1,118 @@
+"""What the losses are made of: one pass through both streams, and squared errors weighted by pixel and by timestep.
+
+Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unirender.diffusion.schedule import signal_to_noise
+from unirender.diffusion.timesteps import Timesteps
+from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
+from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
+
+LossTerms = dict[str, Float[Tensor, ""]]
+
+
+def predict(
+    model: DualStreamModel,
+    attributes: Float[Tensor, "b nc h w"],
+    image: Float[Tensor, "b c h w"],
+    t: Timesteps,
+    extras: Extras,
+    rows_a: slice | None,
+    rows_i: slice | None,
+) -> DualStreamOutput:
+    """Clean latents of the rows that are asked for in each stream; None: of none."""
+    return model(
+        attributes,
+        image,
+        t.attributes,
+        t.image,
+        extras.attributes,
+        extras.image,
+        image_prior=extras.prior,
+        attribute_rows=rows_a,
+        image_rows=rows_i,
+    )
+
+
+def timestep_weights(
+    kind: Literal["none", "v", "min_snr"],
+    snr_bound: float,
+    scheduler: DDIMScheduler,
+    timestep: Int[Tensor, " b"],
+) -> Float[Tensor, " b"] | None:
+    """Weights of the squared x0 error at timesteps in [1, T]. None: all alike.
+
+        v         SNR + 1
+        min_snr   max(1, min(SNR, snr_bound))
+
+    The first makes it the squared error of v = sqrt(alpha_bar) eps - sqrt(1 - alpha_bar) x0. It has no bound: 1090 at
+    timestep 1. Min-SNR (Hang et al. 2023) weighs the x0 error by min(SNR, bound). At zero terminal SNR that is nothing
+    at T, the only timestep of one-step inference, which would never be trained. The floor of 1 (Salimans & Ho 2022,
+    "truncated SNR") gives it, and all timesteps with more noise than signal, the weight they have without weighting.
+    """
+    if kind == "none":
+        return None
+    snr = signal_to_noise(scheduler, timestep)
+    return snr + 1 if kind == "v" else snr.clamp(1, snr_bound)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Mean squared errors of latents.
+
+    Attributes:
+        conditioning: whose codec spreads the weights of pixels over latents.
+        background: weight of a pixel outside the mask, beside 1 inside.
+    """
+
+    conditioning: Conditioning
+    background: float
+
+    def pixel_weights(self, mask: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 1 H W"]:
+        return self.background + (1 - self.background) * mask
+
+    def image(
+        self,
+        predicted: Float[Tensor, "b c h w"],
+        clean: Float[Tensor, "b c h w"],
+        mask: Float[Tensor, "b 1 H W"],
+        rows: Float[Tensor, " b"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """Of the image; `rows` multiplies the error of each sample."""
+        weights = self.conditioning.codec.weights(self.pixel_weights(mask))
+        return weighted_mean(_by_row((predicted.float() - clean).square(), rows), weights)
+
+    def attributes(
+        self,
+        predicted: Float[Tensor, "b nc h w"],
+        clean: Float[Tensor, "b nc h w"],
+        mask: Float[Tensor, "b 1 H W"],
+        rows: Float[Tensor, " b"] | None = None,
+    ) -> LossTerms:
+        """Of each of the six pictures; the light's pixels all count alike."""
+        weights = self.conditioning.codec.weights(self.pixel_weights(mask))
+        error = _by_row((predicted.float() - clean).square(), rows).chunk(len(TRIPLETS), dim=1)
+        terms = dict(zip(TRIPLETS, error, strict=True))
+        lit = terms.pop("environment").mean()
+        return {name: weighted_mean(e, weights) for name, e in terms.items()} | {"environment": lit}
+
+
+def weighted_mean(error: Float[Tensor, "b c h w"], weights: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:
+    return (error * weights).sum() / weights.sum()
+
+
+def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
+    """Gaussian noise drawn on the CPU, so that a seed means the same on every device."""
+    return torch.randn(x.shape, generator=generator).to(x)
+
+
+def _by_row(error: Float[Tensor, "b c h w"], rows: Float[Tensor, " b"] | None) -> Float[Tensor, "b c h w"]:
+    return error if rows is None else error * rows[:, None, None, None]

@@ -1,0 +1,183 @@
+"""Folders of pictures: what is done, kept, refused and listed; and how much frames change."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.files import map_picture, write_result
+from unirender.folders import (
+    AT_ONCE,
+    FolderResult,
+    batches,
+    decompose_folder,
+    figures_of,
+    list_pictures,
+    mask_of,
+    write_summary,
+)
+from unirender.frames import Frame, temporal_difference
+from unirender.intrinsics import Intrinsics
+from unirender.options import read_input
+from unirender.pictures import Picture
+from unirender.pipelines.results import Decomposition
+
+SETTINGS = {"command": "decompose", "seed": 0}
+
+
+def save(path: Path, value: int = 100, size: tuple[int, int] = (12, 10)) -> Path:
+    Image.new("RGB", size, (value, value // 2, 9)).save(path)
+    return path
+
+
+def read(path: Path, mask: Path | None) -> Picture:
+    return read_input(path, mask)[0]
+
+
+def decompose(batch: list[Picture]) -> list[Decomposition]:
+    """A method in one line: the picture is its own albedo."""
+    found = []
+    for picture in batch:
+        assert picture.mask is not None
+        ones = np.ones_like(picture.mask)
+        maps: dict[str, Any] = {"albedo": picture.image_srgb, "roughness": 0.5 * ones, "metallic": 0 * ones}
+        found.append(Decomposition(Intrinsics(**maps, mask=picture.mask), 0.5, 0.0))
+    return found
+
+
+def run(pictures: list[Path], output: Path, **changes: Any) -> FolderResult:
+    settings = {"read": read, "decompose": decompose, "settings": SETTINGS} | changes
+    return decompose_folder(pictures, output, **settings)
+
+
+def test_pictures_in_natural_order(tmp_path: Path) -> None:
+    for name in ("f10.png", "f9.png", "F1.PNG", "b.jpg", ".hidden.png", "notes.txt", "summary.json"):
+        (tmp_path / name).write_text("")
+    (tmp_path / "folder.png").mkdir()
+    assert [path.name for path in list_pictures(tmp_path)] == ["b.jpg", "F1.PNG", "f9.png", "f10.png"]
+    with pytest.raises(UnirenderError, match="no pictures"):
+        list_pictures(tmp_path / "folder.png")
+
+
+def test_one_bad_picture_is_listed_and_the_others_are_done(tmp_path: Path) -> None:
+    good = [save(tmp_path / name) for name in ("a.png", "a.jpg", "c.png")]
+    (tmp_path / "b.png").write_text("no picture")
+    found = run([*good, tmp_path / "b.png"], tmp_path / "out")
+    assert set(found.figures) == {"a.png", "a.jpg", "c.png"}  # one stem, two results
+    assert found.figures["a.png"] == {"roughness_mean": 0.5, "metallic_mean": 0.0, "clipped": 0.0}
+    assert set(found.failed) == {"b.png"}
+    assert "not a readable picture" in found.failed["b.png"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.jpg", "a.png", "c.png"]
+    write_summary(tmp_path / "out", found, SETTINGS)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary == {**SETTINGS, "pictures": found.figures, "failed": found.failed}
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.jpg", "a.png", "c.png", "summary.json"]
+
+
+def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path) -> None:
+    pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
+
+    def stop_at_b(batch: list[Picture]) -> list[Decomposition]:
+        if any(picture.name == "b.png" for picture in batch):
+            raise KeyboardInterrupt
+        return decompose(batch)
+
+    run(pictures[:1], tmp_path / "out", decompose=stop_at_b)
+    with pytest.raises(KeyboardInterrupt):
+        run(pictures, tmp_path / "out", decompose=stop_at_b)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.png"]
+    assert run(pictures, tmp_path / "out").kept == 1
+    again = run(pictures, tmp_path / "out")
+    assert (again.kept, len(again.figures)) == (2, 2)
+    save(pictures[0], 30)
+    changed = run(pictures, tmp_path / "out")
+    assert "another input_sha256" in changed.failed["a.png"]
+    other = run(pictures, tmp_path / "out", settings=SETTINGS | {"seed": 1})
+    assert "another seed" in other.failed["b.png"]
+    fresh = run(pictures, tmp_path / "out", settings=SETTINGS | {"seed": 1}, overwrite=True)
+    assert (fresh.kept, len(fresh.figures), fresh.failed) == (0, 2, {})
+    assert figures_of(tmp_path / "out" / "c.png", SETTINGS) is None
+
+
+def test_a_folder_that_is_in_the_way_is_kept(tmp_path: Path) -> None:
+    pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
+    (tmp_path / "out" / "a.png").mkdir(parents=True)
+    (tmp_path / "out" / "a.png" / "precious").write_text("1")
+    found = run(pictures, tmp_path / "out")
+    assert list(found.figures) == ["b.png"]
+    assert "not empty" in found.failed["a.png"]
+    assert (tmp_path / "out" / "a.png" / "precious").exists()
+    with pytest.raises(UsageError, match="is the folder of the pictures"):
+        run(pictures, tmp_path)
+
+
+def test_masks_of_a_folder(tmp_path: Path) -> None:
+    pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
+    (tmp_path / "masks").mkdir()
+    values = np.zeros((10, 12), dtype=np.uint8)
+    values[:, :5] = 255
+    mask = tmp_path / "masks" / "a.bmp"
+    Image.fromarray(values).save(mask)
+    assert mask_of(pictures[0], tmp_path / "masks") == mask
+    assert mask_of(pictures[0], mask) == mask
+    found = run(pictures, tmp_path / "out", masks=tmp_path / "masks")
+    assert list(found.figures) == ["a.png"]
+    assert "has 0 masks for b.png" in found.failed["b.png"]
+    assert np.asarray(Image.open(tmp_path / "out" / "a.png" / "mask.png")).mean() == pytest.approx(255 * 5 / 12)
+
+
+def test_batches_are_bounded() -> None:
+    small = Picture(np.zeros((8, 8, 3), np.float32), None, "small")
+    large = dataclasses.replace(small, image_srgb=np.broadcast_to(np.float32(0), (2000, 1500, 3)))
+    items: list[Any] = [(Path("a"), picture, {}) for picture in [small] * (AT_ONCE + 1) + [large, large, small]]
+    assert [len(batch) for batch in batches(items)] == [AT_ONCE, 2, 2]
+    assert [item for batch in batches(items) for item in batch] == items
+
+
+def make_frame(folder: Path, picture: Path, albedo: float, wide: int = 6, roughness: float = 0.5) -> tuple[Path, Path]:
+    """A frame whose left `wide` columns are the object, of the picture's colour and this albedo."""
+    folder.mkdir()
+    mask = np.zeros((10, 12, 1), dtype=np.float32)
+    mask[:, :wide] = 1
+    environment = np.full((4, 8, 3), albedo, dtype=np.float32)
+    maps: dict[str, Any] = {"albedo": albedo * mask.repeat(3, axis=-1), "roughness": roughness * mask, "mask": mask}
+    write_result(folder, Intrinsics(**maps, environment=environment), {})
+    return picture, folder
+
+
+def test_temporal_difference_is_that_of_the_pictures_people_see(tmp_path: Path) -> None:
+    dark, light = save(tmp_path / "dark.png", 100), save(tmp_path / "light.png", 120)
+    first = make_frame(tmp_path / "1", dark, 0.25)
+    second = make_frame(tmp_path / "2", light, 0.5, wide=9, roughness=0.7)
+    found = temporal_difference([first, second])
+    shown = [map_picture("albedo", np.full((1, 1, 3), value, np.float32)) for value in (0.25, 0.5)]
+    expected = float(shown[1].mean() - shown[0].mean())  # where only one of them shows the object does not count
+    assert found["pairs"] == 1
+    assert found["albedo"] == pytest.approx(expected, abs=1e-3)
+    assert found["environment"] == pytest.approx(expected, abs=1e-3)
+    assert found["roughness"] == pytest.approx(0.2, abs=1e-3)
+    assert found["input"] == pytest.approx((20 + 10 + 0) / 3 / 255, abs=1e-5)
+    still = temporal_difference([first, first, first])
+    assert still.pop("pairs") == 2
+    assert set(still.values()) == {0.0}
+
+
+def test_frames_without_a_neighbour_are_left_out(tmp_path: Path) -> None:
+    picture = save(tmp_path / "a.png")
+    first = make_frame(tmp_path / "1", picture, 0.25)
+    second = make_frame(tmp_path / "2", picture, 0.5)
+    assert temporal_difference([first, None, second]) == {"pairs": 0}
+    assert temporal_difference([first]) == {"pairs": 0}
+    both = temporal_difference([first, second, None, second, second])
+    alone = temporal_difference([first, second])
+    assert both["pairs"] == 2
+    assert both["albedo"] == pytest.approx(alone["albedo"] / 2)
+    mask = np.zeros((10, 12, 1), dtype=np.float32)
+    mask[:, 8:] = 1
+    elsewhere = Frame(Frame.read(*first).shown, mask)
+    assert not elsewhere.comparable(Frame.read(*first))

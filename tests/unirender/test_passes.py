@@ -1,0 +1,125 @@
+"""The gradient of a batch does not depend on how the batch is cut. Noise does, and is switched off for that."""
+
+import dataclasses
+
+import pytest
+import torch
+from tiny_models import TRAIN, make_batch, make_model
+from torch import Tensor
+
+from unirender.diffusion.schedule import make_scheduler
+from unirender.diffusion.timesteps import Timesteps
+from unirender.errors import UnirenderError
+from unirender.training import consistency, losses, passes
+from unirender.training.losses import LossFunction
+from unirender.training.passes import BatchGradient, Split
+from unirender.training.presets import LossConfig, TrainConfig
+from unirender.training.processes import Processes
+
+BATCH = 8
+CONFIG = dataclasses.replace(
+    TRAIN,
+    loss=LossConfig(cycle_share=0.5, cycle_warmup=0.0, composite=0.5),
+    batch_size=BATCH,
+    map_dropout=0.0,
+    p_render=0.4,
+)
+
+
+@pytest.fixture
+def batch() -> dict[str, Tensor]:
+    """Objects of different coverage: a mean of means is no mean here."""
+    maps = make_batch(BATCH)
+    for i in range(BATCH):
+        maps["mask"][i, :, : 3 * i] = 0
+    return maps
+
+
+@pytest.fixture
+def without_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pure noise is zero: it is drawn for each part, and would differ with the parts."""
+    for module in (losses, consistency):
+        monkeypatch.setattr(module, "noise_like", lambda x, generator: torch.zeros_like(x))
+
+
+def gradient_of(config: TrainConfig = CONFIG, parallel: int = 1, accumulate: int = 1) -> BatchGradient:
+    model, conditioning = make_model()
+    loss = LossFunction(model, conditioning, make_scheduler(), config.loss, config.map_dropout)
+    split = Split(config.batch_size, parallel=parallel, accumulate=accumulate)
+    return BatchGradient(loss, config, split, torch.Generator().manual_seed(4), torch.float32)
+
+
+def run(gradient: BatchGradient, batch: dict[str, Tensor]) -> tuple[dict[str, float], Tensor]:
+    terms = gradient(batch)
+    return terms, torch.cat([p.grad.flatten() for p in gradient.loss.model.parameters() if p.grad is not None])
+
+
+@pytest.mark.parametrize("rule", ["conditional", "algorithm1"])
+def test_the_gradient_is_that_of_the_whole_batch(rule: str, batch: dict[str, Tensor], without_noise: None) -> None:
+    config = dataclasses.replace(CONFIG, timestep_rule=rule)
+    terms, whole = run(gradient_of(config), batch)
+    assert {"image", "albedo", "environment"} <= terms.keys()
+    assert rule == "algorithm1" or {"composite", "cycle"} <= terms.keys()
+    for parallel, accumulate in ((2, 1), (1, 3), (2, 4)):
+        parted, pieces = run(gradient_of(config, parallel, accumulate), batch)
+        assert parted == pytest.approx(terms, rel=1e-5)
+        torch.testing.assert_close(pieces, whole, rtol=0, atol=1e-5 * float(whole.abs().max()))
+
+
+def test_a_mean_of_the_parts_means_is_another(batch: dict[str, Tensor], without_noise: None) -> None:
+    """The failing twin: parts weighed by their number of rows."""
+    terms, _ = run(gradient_of(), batch)
+    gradient = gradient_of(parallel=2)
+    parts = [gradient.terms(part, batch) for part in gradient.parts(batch)]
+    for name in ("image", "albedo", "cycle"):
+        plain = sum(float(part[name].detach()) for part in parts) / len(parts)
+        assert plain != pytest.approx(terms[name], rel=1e-3), name
+
+
+def test_pieces_one_after_the_other_are_pieces_side_by_side(batch: dict[str, Tensor]) -> None:
+    side_by_side, first = run(gradient_of(parallel=2), batch)
+    one_by_one, second = run(gradient_of(accumulate=2), batch)
+    assert one_by_one == side_by_side
+    assert torch.equal(first, second)
+    other, _ = run(gradient_of(parallel=4), batch)
+    assert other != side_by_side  # the twin: other parts, other noise
+
+
+@pytest.mark.parametrize(("size", "parallel", "accumulate"), [(1, 1, 1), (2, 1, 1), (1, 3, 2), (2, 2, 1), (3, 1, 5)])
+def test_parts_are_rows_of_the_batch_whoever_computes_them(size: int, parallel: int, accumulate: int) -> None:
+    splits = [Split(11, Processes(rank, size), parallel, accumulate) for rank in range(size)]
+    found = {s.processes.rank + size * j: range(11)[s.own][j :: s.parts] for s in splits for j in range(s.parts)}
+    number = splits[0].all_parts
+    assert found == {p: range(11)[p::number] for p in range(number)}
+    assert all(found.values())
+    assert 1 <= splits[0].at_once <= parallel
+
+
+def test_the_cycle_has_its_share_of_the_batch_not_of_each_part(batch: dict[str, Tensor]) -> None:
+    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, cycle_share=0.25))
+    gradient = gradient_of(config, parallel=BATCH)
+    parts = gradient.parts(batch)
+    inverse = [part for part in parts if part.mass["environment"]]
+    rendered_again = [part for part in parts if "cycle" in gradient.terms(part, batch)]
+    assert len(inverse) > 2
+    assert len(rendered_again) == round(0.25 * len(inverse)) > 0  # of a single row a quarter is none
+    assert all(part.mass["cycle"] for part in rendered_again)
+
+
+def test_a_part_of_which_nothing_is_noisy_has_no_share(
+    batch: dict[str, Tensor], without_noise: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Algorithm 1 draws rows that are clean in both streams."""
+    clean = Timesteps(torch.tensor([0, 999] * 4), torch.zeros(BATCH, dtype=torch.long))
+    monkeypatch.setattr(passes, "draw_timesteps", lambda *arguments: clean)
+    whole, gradient = run(gradient_of(), batch)
+    halves, pieces = run(gradient_of(parallel=2), batch)  # the first half is the clean one
+    assert halves == pytest.approx(whole, rel=1e-5)
+    torch.testing.assert_close(pieces, gradient, rtol=0, atol=1e-5 * float(gradient.abs().max()))
+
+
+def test_a_batch_too_small_for_the_processes_is_refused(batch: dict[str, Tensor]) -> None:
+    with pytest.raises(UnirenderError, match="a batch of 2 for 3 processes, expected at least one sample"):
+        Split(2, Processes(0, 3))
+    with pytest.raises(UnirenderError, match="got 7 rows, expected 8"):
+        gradient_of()({name: value[:7] for name, value in batch.items()})

@@ -1,0 +1,174 @@
+"""Several processes train as one does: torchrun starts two on the CPU, and both must have run."""
+
+import dataclasses
+import json
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from synthetic_shards import write_dataset
+from tiny_models import TRAIN
+
+from unirender.errors import UnirenderError
+from unirender.training import processes
+from unirender.training.checkpoint import load_state
+from unirender.training.processes import ALONE, Processes, join_processes
+from unirender.training.run import Train, train
+
+SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
+CPU = torch.device("cpu")
+STEPS = 5
+LOSSES = ("image", "material", "albedo", "normal", "specular", "diffuse", "environment", "cycle", "grad_norm")
+
+BROKEN_DISK = """
+import os
+from unirender.errors import UnirenderError
+from unirender.training.source import ShardSource
+
+def next(self):
+    raise UnirenderError("the disk of process 1 is gone")
+
+if os.environ["RANK"] == "1":
+    ShardSource.next = next
+"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of two processes that has come to its end."""
+
+    out: Path
+    data: Path
+    printed: str
+
+
+def torchrun(data: Path, out: Path, *options: str, script: Path = SCRIPT) -> subprocess.CompletedProcess[str]:
+    """Trains a batch of five samples in two processes: three and two."""
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    command = ["train", "--preset", "test", "--data", str(data), "--out", str(out), "--batch-size", "5"]
+    common = ["--dtype", "float32", "--device", "cpu", "--log-every", "1"]
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [*launch, *command, *common, *options], env=env, capture_output=True, text=True, timeout=500, check=False
+    )
+
+
+def losses(out: Path) -> list[dict[str, float]]:
+    lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return [{name: line[name] for name in ("step", *LOSSES) if name in line} for line in lines]
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """What a training in this process does to torch's threads is undone."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("torchrun")
+    data = write_dataset(folder / "data", size=32)
+    ended = torchrun(data, folder / "run", "--steps", str(STEPS))
+    assert ended.returncode == 0, ended.stderr
+    return Run(folder / "run", data, ended.stdout)
+
+
+def one_process(run: Run, out: Path, seed: int) -> list[dict[str, float]]:
+    """The same run in this process, its batch cut into the same two parts."""
+    config = dataclasses.replace(TRAIN, batch_size=5, seed=seed)
+    options = Train(
+        data=run.data, out=out, steps=STEPS, seed=seed, device="cpu", dtype="float32", parallel=2, log_every=1
+    )
+    train(options, config, out)
+    return losses(out)
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads: None) -> None:
+    assert [f"process {rank} of 2" in run.printed for rank in range(3)] == [True, True, False]
+    assert len(json.loads((run.out / "config.json").read_text())["hardware"]) == 2
+    assert run.printed.count("use it with --checkpoint") == 1  # the first process alone speaks of it
+    two, one, other = losses(run.out), *(one_process(run, tmp_path / str(seed), seed) for seed in (0, 1))
+    assert [line["step"] for line in two] == list(range(1, STEPS + 1))
+    assert all(set(LOSSES) <= line.keys() for line in two)
+    for a, b, c in zip(two, one, other, strict=True):
+        assert a == pytest.approx(b, rel=1e-5)
+        assert a != pytest.approx(c, rel=1e-2)  # the twin: another seed
+
+
+@pytest.mark.slow
+def test_two_processes_resume_and_end_by_one_clock(run: Run) -> None:
+    """Each with a clock of its own, one of them would stop a step before the other, and the other wait for ever."""
+    state = load_state(run.out)
+    assert state is not None
+    assert (state["step"], state["parts"], state["source"]["consumed"]) == (STEPS, 2, 5 * STEPS)
+    ended = torchrun(run.data, run.out, "--steps", "100000", "--minutes", str(state["seconds"] / 60 + 0.03))
+    assert ended.returncode == 0, ended.stderr
+    steps = [int(line["step"]) for line in losses(run.out)]
+    assert STEPS < steps[-1] < 100000
+    assert steps == list(range(1, steps[-1] + 1))
+
+
+@pytest.mark.slow
+def test_an_error_of_one_process_ends_all_with_a_line(run: Run, tmp_path: Path) -> None:
+    script = tmp_path / "broken_disk.py"
+    script.write_text(f"{BROKEN_DISK}\nimport runpy, sys\nsys.path.insert(0, {str(SCRIPT.parent)!r})\n")
+    with script.open("a") as file:
+        file.write(f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')\n")
+    ended = torchrun(run.data, tmp_path / "run", "--steps", "2", script=script)
+    assert ended.returncode == 1
+    said = [line for line in ended.stderr.splitlines() if line.startswith("unirender: error:")]
+    assert "unirender: error: the disk of process 1 is gone" in said
+    assert all("the disk of process 1" in line or "process 0 of 2 stops: another process" in line for line in said)
+    assert load_state(tmp_path / "run") is None
+
+
+def test_alone_everything_is_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK"):
+        monkeypatch.delenv(name, raising=False)
+    assert join_processes(CPU) == (ALONE, CPU)
+    assert ALONE.is_main
+    assert (ALONE.gather(3), ALONE.share(3)) == ([3], 3)
+    tensors = [torch.ones(2), torch.zeros(1)]
+    assert all(a is b for a, b in zip(ALONE.sum(tensors), tensors, strict=True))
+    ALONE.close()
+    assert not Processes(1, 2).is_main
+
+
+@pytest.mark.parametrize(
+    ("variables", "device", "message"),
+    [
+        ({"WORLD_SIZE": "two"}, "cpu", "WORLD_SIZE='two', expected the number that torchrun sets"),
+        ({"WORLD_SIZE": "2", "RANK": "0"}, "cpu", "got LOCAL_RANK='', expected the number"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "0"}, "mps", "expected --device cpu or cuda"),
+        ({"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "999"}, "cuda", "has no GPU of its own"),
+        ({"WORLD_SIZE": "2", "RANK": "1", "LOCAL_RANK": "1"}, "cpu", "process 1 of 2 cannot reach the others"),
+    ],
+)
+def test_an_environment_that_torchrun_did_not_make_is_refused(
+    monkeypatch: pytest.MonkeyPatch, variables: dict[str, str], device: str, message: str
+) -> None:
+    for name in ("WORLD_SIZE", "RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(UnirenderError, match=message):
+        join_processes(torch.device(device))
+
+
+def test_gradients_travel_in_buckets_of_one_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processes, "BUCKET", 10)
+    sizes = (4, 5, 2, 30, 1, 3)
+    tensors = [torch.zeros(size, dtype=torch.float16 if size == 3 else torch.float32) for size in sizes]
+    buckets: list[Any] = list(processes._buckets(tensors))
+    assert [[t.numel() for t in bucket] for bucket in buckets] == [[4, 5], [2], [30], [1], [3]]
+    assert sum(t.numel() for bucket in buckets for t in bucket) == math.fsum(sizes)
