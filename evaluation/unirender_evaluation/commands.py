@@ -11,8 +11,12 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, at_least
+from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
+from unirender_evaluation.sampling_study_command import BenchSampling
+from unirender_evaluation.speed_study_command import BenchSpeed
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
+from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
 from unirender_evaluation.warm_start_command import BenchWarmStart
 
@@ -230,7 +234,7 @@ class BenchExport:
 
 @dataclass(frozen=True)
 class Bench:
-    """The benchmark: score methods, write the report again, check the truth, export inputs; study the optimiser."""
+    """The benchmark: score methods, write the report again, check the truth, export inputs; studies beside it."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[
@@ -239,8 +243,12 @@ class Bench:
             | Annotated[BenchExport, tyro.conf.subcommand("export")]
             | Annotated[BenchReport, tyro.conf.subcommand("report")]
             | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
+            | Annotated[BenchDerivedLight, tyro.conf.subcommand("derived-light")]
             | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
             | Annotated[BenchRace, tyro.conf.subcommand("race")]
+            | Annotated[BenchSampling, tyro.conf.subcommand("sampling")]
+            | Annotated[BenchSpeed, tyro.conf.subcommand("speed")]
+            | Annotated[BenchTraining, tyro.conf.subcommand("training")]
             | Annotated[BenchUnknownMesh, tyro.conf.subcommand("unknown-mesh")]
             | Annotated[BenchWarmStart, tyro.conf.subcommand("warm-start")],
             tyro.conf.arg(name=""),

@@ -63,7 +63,15 @@ PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
 OPTIMIZED = ("optimized_*",)
 VIEWS = ("light_metrics", "multiview_*")
 # Commands of their own, whose records hold `modules_version` of what measures.
-STUDIES = ("optimiser_study*", "unknown_mesh*", "warm_start*")
+STUDIES = (
+    "derived_light_study*",
+    "optimiser_study*",
+    "sampling_study*",
+    "speed_study*",
+    "training_study*",
+    "unknown_mesh*",
+    "warm_start*",
+)
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
     "adaptive*",

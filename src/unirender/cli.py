@@ -28,7 +28,10 @@ from unirender.models.lean_imports import lean_imports
 from unirender.options import notice
 from unirender.training.run import Train
 from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
+from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
+from unirender_evaluation.sampling_study_command import BenchSampling
+from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
 from unirender_evaluation.warm_start_command import BenchWarmStart
 from unirender_reference.commands import Dataset
@@ -98,8 +101,11 @@ RESUMABLE = (
     Train,
     BenchRun,
     BenchTruth,
+    BenchDerivedLight,
     BenchIngredients,
     BenchRace,
+    BenchSampling,
+    BenchTraining,
     BenchUnknownMesh,
     BenchWarmStart,
 )

@@ -1,0 +1,67 @@
+"""`unirender bench training`. Light to import."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from unirender.errors import UnirenderError
+from unirender.options import Device, at_least
+
+
+@dataclass(frozen=True)
+class BenchTraining:
+    """Train a small network several times, one choice changed each time, and score them all. A second run continues.
+
+    The same data, steps and seed for every row, and every row against the plain model, paired by scene. A row of 1000
+    steps takes about a quarter of an hour on two cores.
+    """
+
+    data: Path
+    """Folder that `unirender dataset` wrote."""
+    suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    out: Path = Path("results/training")
+    """Folder of tables, records and training runs."""
+    scenes: int = 24
+    """Scenes of the suite, evenly spaced, that every network is scored on."""
+    steps: int = 1000
+    """Of every training."""
+    choices: tuple[str, ...] = ()
+    """Rows by name, or by the question that they answer. None: all."""
+    batch_size: int | None = None
+    """Instead of the preset's."""
+    parallel: int | None = None
+    """As for `unirender train`."""
+    device: Device = "auto"
+    """As for `unirender train`."""
+    seed: int = 0
+    """Of weights, data order and noise."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        at_least(1, scenes=self.scenes, steps=self.steps, batch_size=self.batch_size, parallel=self.parallel)
+        at_least(0, seed=self.seed)
+
+    def run(self) -> int:
+        """Trains and scores what is missing, prints and writes `training.md` and `.json`; returns the exit status."""
+        self.check()
+        from unirender_evaluation.training_study import chosen, training_choices
+
+        rows = chosen(training_choices(self.seed, self.batch_size), self.choices)
+        if not self.data.is_dir():
+            raise UnirenderError(
+                f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
+            )
+        from rich.console import Console
+
+        from unirender_evaluation.rows import evenly
+        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.training_study_run import TrainingStudy, run
+
+        suite = load_suite(self.suite)
+        study = TrainingStudy(suite, self.data, self.out, self.steps, self.device, self.parallel)
+        run(study, rows, evenly(suite.scenes, self.scenes), Console())
+        return 0

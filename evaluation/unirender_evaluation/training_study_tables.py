@@ -1,0 +1,89 @@
+"""The table of training choices: means over scenes, and paired differences from the plain model."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
+from unirender_evaluation.comparisons import values_of
+from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
+from unirender_evaluation.optimiser_study_tables import Cell, cell_text
+from unirender_evaluation.records import Record
+from unirender_evaluation.specs import Column
+from unirender_evaluation.statistics import CONFIDENCE, paired_difference
+from unirender_evaluation.table_formats import header
+from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.training_study import PLAIN, QUESTIONS, Choice
+
+
+def _column(group: str, quantity: str, metric: str) -> Column:
+    return Column(group, quantity, METRICS[metric], published=False)
+
+
+COLUMNS = (
+    _column("albedo", "albedo", "psnr"),
+    _column("normal", "normal", "cosine"),
+    _column("roughness", "roughness", "mse"),
+    _column("metallic", "metallic", "mse"),
+    _column("render of true maps", "render", "psnr"),
+    _column("edit", "edit", "psnr"),
+    _column("own maps, own render", "again", "psnr"),
+    _column("own maps, Mitsuba", "again_mitsuba", "psnr"),
+)
+NOTE = (
+    f"Mean over scenes; in brackets the paired difference from the plain model, ± half of its {CONFIDENCE:.0%} "
+    "bootstrap interval over objects; **bold** where the interval excludes 0. Masked, sRGB. Own maps: the network's "
+    "decomposition (not closed), rendered by the network and shaded by Mitsuba, against the picture. The networks are "
+    "far from fully trained: the table says what helps early, at this size."
+)
+
+
+def cells(records: Sequence[Record], method: str) -> tuple[Cell, ...]:
+    """The cells of a row in the order of `COLUMNS`."""
+    clusters = {record.sample: record.object for record in records}
+    found = []
+    for column in COLUMNS:
+        key = column.key(DEFAULT_VARIANT)
+        own, plain = values_of(records, method, key), values_of(records, PLAIN, key)
+        difference = None if method == PLAIN else paired_difference(own, plain, clusters)
+        found.append(Cell(sum(own.values()) / len(own), len(own), difference))
+    return tuple(found)
+
+
+def table(rows: Sequence[Choice], records: Sequence[Record]) -> TextTable:
+    """A row for each choice, those that answer one question together."""
+    sections = []
+    for question, members in groupby(rows, key=lambda row: row.question):
+        lines = []
+        for row in members:
+            texts = [
+                cell_text(c, column.metric.decimals)
+                for c, column in zip(cells(records, row.name), COLUMNS, strict=True)
+            ]
+            lines.append((f"{QUESTIONS[question]}: {row.label}" if question else row.label, *texts))
+        sections.append(tuple(lines))
+    titles = ("training", *(f"{column.group} {header(column)}" for column in COLUMNS))
+    count = len({record.sample for record in records})
+    return TextTable(f"Choices of training: n = {count}", titles, tuple(sections), (NOTE,))
+
+
+def to_json(rows: Sequence[Choice], records: Sequence[Record], run: Mapping[str, Any]) -> str:
+    """Configurations, means, differences with their intervals, and every record."""
+    lines = {
+        row.name: {
+            "label": row.label,
+            "config": asdict(row.config),
+            "cells": {
+                c.key(DEFAULT_VARIANT): {"mean": cell.mean, "n": cell.n, "difference": _estimate(cell)}
+                for c, cell in zip(COLUMNS, cells(records, row.name), strict=True)
+            },
+        }
+        for row in rows
+    }
+    every = [json.loads(record.to_json()) for record in records]
+    return json.dumps({"run": dict(run), "rows": lines, "records": every}, indent=1, ensure_ascii=False) + "\n"
+
+
+def _estimate(cell: Cell) -> dict[str, float | int] | None:
+    return None if cell.difference is None else asdict(cell.difference)

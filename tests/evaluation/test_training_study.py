@@ -1,0 +1,125 @@
+"""`unirender bench training`: rows that differ in one thing, trained once, scored in pairs, continued."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from synthetic_shards import write_dataset
+from tiny_models import SIZE, TRAIN
+from tiny_suites import make_suite
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.training.presets import ModelConfig
+from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.records import Record
+from unirender_evaluation.training_study import PLAIN, Choice, chosen, training_choices
+from unirender_evaluation.training_study_command import BenchTraining
+from unirender_evaluation.training_study_run import TrainingStudy, run
+from unirender_evaluation.training_study_tables import COLUMNS, cells, table
+
+ROWS = (
+    Choice(PLAIN, "", "Plain model", TRAIN),
+    Choice("seed", "chance", "another seed", replace(TRAIN, seed=1)),
+)
+
+
+def silent(folder: Path) -> Console:
+    return Console(file=(folder / "console.txt").open("w"), width=200)
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> TrainingStudy:
+    """Two balls of 32 pixels, groups of the same size, two steps."""
+    suite = make_suite(tmp_path_factory.mktemp("suite"))
+    data = write_dataset(tmp_path_factory.mktemp("data"), shards=1, size=SIZE)
+    return TrainingStudy(suite, data, tmp_path_factory.mktemp("out"), steps=2, device="cpu", parallel=1)
+
+
+@pytest.fixture(scope="module")
+def records(study: TrainingStudy, tmp_path_factory: pytest.TempPathFactory) -> list[Record]:
+    return run(study, ROWS, study.suite.scenes, silent(tmp_path_factory.mktemp("console")))
+
+
+def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
+    """Each in one part of its configuration, and no two are the same."""
+    plain, *others = training_choices()
+    assert plain.name == PLAIN
+    assert not plain.question
+    assert plain.config.model.physics_prior == "none"
+    assert len({str(row.config) for row in (plain, *others)}) == len(others) + 1
+    for row in others:
+        own, base = asdict(row.config), asdict(plain.config)
+        assert len([name for name in base if own[name] != base[name]]) == 1, row.name
+    for row in others:
+        if row.name != "without-unified":
+            own, base = asdict(row.config.model), asdict(plain.config.model)
+            assert len([name for name in base if own[name] != base[name]]) <= 1, row.name
+    assert isinstance(plain.config.model, ModelConfig)
+
+
+def test_rows_are_chosen_by_name_or_by_question() -> None:
+    rows = training_choices()
+    assert [row.name for row in chosen(rows, ("patch-4",))] == [PLAIN, "patch-4"]
+    assert {row.question for row in chosen(rows, ("cycle",))} == {"", "cycle"}
+    assert chosen(rows, ()) == rows
+    with pytest.raises(UsageError, match="no-such: no such row, expected some of: plain"):
+        chosen(rows, ("no-such",))
+
+
+def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
+    """With all columns of the table."""
+    assert [(r.method, r.sample) for r in records] == [
+        (row.name, sample) for row in ROWS for sample in ("ball-0_l0", "ball-0_l1", "ball-1_l0", "ball-1_l1")
+    ]
+    for row in ROWS:
+        assert [cell.n for cell in cells(records, row.name)] == [4] * len(COLUMNS)
+    assert cells(records, PLAIN)[0].mean != cells(records, "seed")[0].mean
+
+
+def test_a_second_run_trains_nothing(
+    study: TrainingStudy, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stored records stand; with other steps they do not."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr("unirender.training.run.train", refuse)
+    again = run(study, ROWS, study.suite.scenes, silent(tmp_path))
+    assert again == records
+    with pytest.raises(AssertionError, match="trained again"):
+        run(replace(study, steps=3, out=tmp_path / "other"), ROWS, study.suite.scenes, silent(tmp_path))
+    assert replace(study, steps=3).folder(ROWS[0]) != study.folder(ROWS[0])
+
+
+def test_differences_are_paired_by_scene() -> None:
+    """Scenes differ by 10 dB, the rows by 1 dB in each: the interval has no width, and 0 lies outside."""
+
+    def record(method: str, sample: str, value: float) -> Record:
+        return Record("t", "p", method, sample, sample, {key: value for key in keys})
+
+    keys = [column.key(DEFAULT_VARIANT) for column in COLUMNS]
+    made = [record(PLAIN, s, 10.0 * i) for i, s in enumerate("abc")]
+    made += [record("seed", s, 10.0 * i + 1) for i, s in enumerate("abc")]
+    cell = cells(made, "seed")[0]
+    assert cell.difference is not None
+    assert cell.difference.mean == pytest.approx(1.0)
+    assert cell.decided
+    shifted = [record("seed", s, 10.0 * i + d) for (i, s), d in zip(enumerate("abc"), (1.0, -1.0, 0.5), strict=True)]
+    assert not cells(made[:3] + shifted, "seed")[0].decided, "a row that wins and loses"
+    text = table(ROWS, made).markdown()
+    assert "Chance: another seed" in text
+    assert "**+1.00" in text
+
+
+@pytest.mark.parametrize("option", [{"steps": 0}, {"scenes": 0}, {"batch_size": 0}, {"seed": -1}])
+def test_values_out_of_range_are_usage_errors(option: dict[str, int], tmp_path: Path) -> None:
+    name = next(iter(option)).replace("_", "-")
+    with pytest.raises(UsageError, match=f"--{name}"):
+        BenchTraining(data=tmp_path, **option).run()  # pyright: ignore[reportArgumentType] - all are integers
+
+
+def test_missing_data_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="no such data folder"):
+        BenchTraining(data=tmp_path / "none").run()
