@@ -15,7 +15,7 @@ class BenchDerivedLight:
     continues.
 
     A sphere and procedural objects under bundled lights; beside it the fast lookups that are usual instead. Takes about
-    5 minutes on 2 cores.
+    3 minutes on 2 cores.
     """
 
     out: Path = Path("results/derived-light")

@@ -13,7 +13,7 @@ class BenchSampling:
     """Score our model by steps and samples, and the spread of its samples against its error. A second run continues.
 
     Decompositions and renders of a picture of each scene in mode `mean` and with every number of steps and samples;
-    calibration of the samples' spread, map by map. Takes about 10 minutes on 2 cores.
+    calibration of the samples' spread, map by map. Takes about 4 minutes on 2 cores.
     """
 
     suite: str = "tiny"

@@ -22,7 +22,7 @@ class BenchSpeed:
 
     network: milliseconds by steps and batch. mitsuba: against Mitsuba to the same PSNR. start: cold start of the
     command line. With --data also training: samples/s against bare passes; overfit: minutes until one object is
-    reproduced. Takes about 10 minutes on 2 cores; other work on the machine spoils it.
+    reproduced. Takes about 5 minutes on 2 cores; other work on the machine spoils it.
     """
 
     out: Path = Path("results/speed")

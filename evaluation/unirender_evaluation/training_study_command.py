@@ -11,8 +11,7 @@ from unirender.options import Device, at_least
 class BenchTraining:
     """Train a small network several times, one choice changed each time, and score them all. A second run continues.
 
-    The same data, steps and seed for every row, and every row against the plain model, paired by scene. A row of 1000
-    steps takes about a quarter of an hour on two cores.
+    The same data, steps and seed for every row, and every row against the plain model, paired by scene.
     """
 
     data: Path
