@@ -19,7 +19,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
-exclude_patterns = ["_build", "_optimization_*.md", "jupyter_execute", "**.ipynb_checkpoints"]
+exclude_patterns = ["_build", "_*.md", "jupyter_execute", "**.ipynb_checkpoints"]
 templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"unirender {version}"

@@ -226,7 +226,7 @@ def prefiltered_light(
     """
     inside = np.any(normal != 0, axis=-1)
     v = Camera().view_directions(*normal.shape[:2])[inside]
-    n = facing_normal(normal[inside], v)
+    n = facing_normal(normal[inside].T, v.T).T
     mirrored = 2 * np.sum(n * v, axis=-1, keepdims=True) * n - v
     mirrored /= np.linalg.norm(mirrored, axis=-1, keepdims=True)
     rough, white = np.full(len(n), roughness, np.float32), np.ones((*SMALL_SHAPE, 3), np.float32)

@@ -29,11 +29,12 @@ class BenchIngredients:
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""
-        from unirender_evaluation.optimiser_study_ingredients import chosen, ingredients
+        from unirender_evaluation.optimiser_study_ingredients import ingredients
+        from unirender_evaluation.study_rows import chosen
 
         at_least(1, objects=self.objects)
         at_least(0, seed=self.seed)
-        chosen(ingredients(self.seed), self.variants)
+        chosen(ingredients(self.seed), self.variants, "--variants")
 
     def run(self) -> int:
         """Measures what is missing and prints the tables."""
@@ -42,12 +43,13 @@ class BenchIngredients:
 
         from unirender_evaluation import optimiser_study_tables as texts
         from unirender_evaluation.optimiser_study import Study, open_folder, write_files
-        from unirender_evaluation.optimiser_study_ingredients import chosen, ingredients
+        from unirender_evaluation.optimiser_study_ingredients import ingredients
         from unirender_evaluation.optimiser_study_measure import measure_all, rendered_protocol
+        from unirender_evaluation.study_rows import chosen
 
         console, folder = Console(), open_folder(self.out)
         study = Study.of(self.suite, self.objects, self.seed, "optimiser_study_measure")
-        rows = chosen(ingredients(self.seed), self.variants)
+        rows = chosen(ingredients(self.seed), self.variants, "--variants")
         records = measure_all(study, rows, folder, console)
         lines, protocol = texts.summarise(rows, records), rendered_protocol(study)
         write_files(

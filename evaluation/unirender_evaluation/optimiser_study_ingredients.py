@@ -5,11 +5,9 @@ the pictures' (root mean square over the map's texels, after the transport stage
 anchor, where the map is 0.05 away from its start, and the light's logarithm 0.3).
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from unirender.errors import UsageError
 from unirender_evaluation.multiview_methods import PLAIN_ITERATIONS, PLAIN_TEXTURE
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.refine_config import RefineConfig
@@ -104,25 +102,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         grey("plain", f"plain loop, {PLAIN_ITERATIONS} steps", plain),
         grey("nvdiffrec", "plain loop with NvDiffRec's loss and priors", replace(plain, **NVDIFFREC)),
     )
-
-
-def chosen(rows: Sequence[Ingredient], names: Sequence[str]) -> tuple[Ingredient, ...]:
-    """The rows with these names, or of these groups, in their order; the full method is always among them.
-
-    Args:
-        rows: to choose from.
-        names: none: all rows.
-
-    Raises:
-        UsageError: there is no such row or group.
-    """
-    known = [row.name for row in rows]
-    unknown = [name for name in names if name not in known and name not in GROUPS]
-    if unknown:
-        raise UsageError(
-            f"--variants {' '.join(unknown)}: expected some of {', '.join(known)}, or the groups {', '.join(GROUPS)}"
-        )
-    return tuple(row for row in rows if not names or row.name == FULL or {row.name, row.group} & set(names))
 
 
 def changes(row: OptimizeConfig, full: OptimizeConfig) -> dict[str, Any]:

@@ -139,6 +139,7 @@ class BarePasses:
                 extras.attributes,
                 extras.image,
                 image_prior=extras.prior,
+                light=extras.light,
                 attribute_rows=slice(rows.render, None) if rows.inverse else None,
                 image_rows=slice(0, rows.render) if rows.render else None,
             )
@@ -159,6 +160,7 @@ class BarePasses:
                 extras.attributes[again],
                 extras.image[again],
                 image_prior=None if extras.prior is None else extras.prior[again],
+                light=None if extras.light is None else extras.light[again],
                 attribute_rows=None,
             )
         assert out.image is not None

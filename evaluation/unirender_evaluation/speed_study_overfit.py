@@ -64,6 +64,9 @@ class FixedSource:
     def next(self) -> Maps:
         return self.batch
 
+    def read_ahead(self) -> None:
+        """There is nothing to read."""
+
     def state_dict(self) -> dict[str, Any]:
         return {}
 

@@ -68,7 +68,10 @@ def throughput(
 
         try:
             for _ in range(turns):
-                row = {"trained": block(lambda: trainer.train_step(source.next())), "bare": block(bare)}
+                row = {
+                    "trained": block(lambda: trainer.train_step(source.next(), source.read_ahead)),
+                    "bare": block(bare),
+                }
                 found.append(row | {"ratio": row["trained"] / row["bare"]})
         finally:
             bare.close()

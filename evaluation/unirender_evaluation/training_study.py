@@ -6,11 +6,10 @@ so that differences are paired by scene; the row `seed` differs in nothing but i
 """
 
 import dataclasses
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from unirender.errors import UsageError
 from unirender.training.presets import TrainConfig, get_preset
 
 PLAIN = "plain"
@@ -21,6 +20,7 @@ QUESTIONS = {
     "cycle": "Cycle consistency",
     "physics": "Physics",
     "weights": "Weights of the loss",
+    "batches": "Batches",
     "network": "Network",
 }
 
@@ -31,13 +31,13 @@ class Choice:
 
     Attributes:
         name: on the command line and in records.
-        question: key of `QUESTIONS`; empty for the plain model.
+        group: the question that it answers, key of `QUESTIONS`; empty for the plain model.
         label: what is different.
         config: of the training.
     """
 
     name: str
-    question: str
+    group: str
     label: str
     config: TrainConfig
 
@@ -52,16 +52,17 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
     base = replace(get_preset(BASE_PRESET), seed=seed)
     base = base if batch_size is None else replace(base, batch_size=batch_size)
 
-    def run(name: str, question: str, label: str, **changes: Any) -> Choice:
-        return Choice(name, question, label, replace(base, **changes))
+    def run(name: str, group: str, label: str, **changes: Any) -> Choice:
+        return Choice(name, group, label, replace(base, **changes))
 
-    def loss(name: str, question: str, label: str, **changes: Any) -> Choice:
-        return run(name, question, label, loss=replace(base.loss, **changes))
+    def loss(name: str, group: str, label: str, **changes: Any) -> Choice:
+        return run(name, group, label, loss=replace(base.loss, **changes))
 
-    def model(name: str, question: str, label: str, **changes: Any) -> Choice:
-        return run(name, question, label, model=replace(base.model, **changes))
+    def model(name: str, group: str, label: str, **changes: Any) -> Choice:
+        return run(name, group, label, model=replace(base.model, **changes))
 
     halves = get_preset("tiny_without_unified").model
+    side_by_side = math.gcd(get_preset("tiny_one_at_a_time").group_size, base.batch_size)
     return (
         Choice(PLAIN, "", "Plain model", base),
         run("seed", "chance", "another seed", seed=seed + 1),
@@ -76,6 +77,13 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
         model("split-sum-prior", "physics", "prior: split-sum", physics_prior="split_sum"),
         loss("min-snr", "weights", "min-SNR", timestep_weight="min_snr"),
         loss("v-weights", "weights", "those of v-prediction", timestep_weight="v"),
+        run(
+            "one-at-a-time",
+            "batches",
+            f"runs of {side_by_side} pictures differ in one thing only",
+            group_size=side_by_side,
+        ),
+        model("light-encoder", "network", "light through an encoder of its own", light="encoder"),
         model("patch-1", "network", "pixels as they are", patch=1),
         model("patch-4", "network", "4 x 4 pixels a latent", patch=4),
         model(
@@ -86,23 +94,3 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
             | {"physics_prior": base.model.physics_prior},
         ),
     )
-
-
-def chosen(rows: Sequence[Choice], names: Sequence[str]) -> tuple[Choice, ...]:
-    """The rows with these names, or that answer these questions, in their order; the plain model is always among them.
-
-    Args:
-        rows: to choose from.
-        names: none: all rows.
-
-    Raises:
-        UsageError: there is no such row or question.
-    """
-    known = [row.name for row in rows]
-    unknown = [name for name in names if name not in known and name not in QUESTIONS]
-    if unknown:
-        raise UsageError(
-            f"--choices {unknown[0]}: no such row, expected some of: {', '.join(known)}; or questions: "
-            f"{', '.join(QUESTIONS)}"
-        )
-    return tuple(row for row in rows if not names or row.name in (PLAIN, *names) or row.question in names)

@@ -47,9 +47,10 @@ class BenchTraining:
     def run(self) -> int:
         """Trains and scores what is missing, prints and writes `training.md` and `.json`; returns the exit status."""
         self.check()
-        from unirender_evaluation.training_study import chosen, training_choices
+        from unirender_evaluation.study_rows import chosen
+        from unirender_evaluation.training_study import training_choices
 
-        rows = chosen(training_choices(self.seed, self.batch_size), self.choices)
+        rows = chosen(training_choices(self.seed, self.batch_size), self.choices, "--choices")
         if not self.data.is_dir():
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"

@@ -164,7 +164,7 @@ def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], c
     for record, new in measure(study, rows, scenes):
         records.append(record)
         computed += new
-    table, about = tables.table(rows, records), description(study)
+    table, about = tables.table(rows, records), description(study, rows)
     text = table.markdown() + "\n" + ", ".join(f"{name} {value}" for name, value in about.items()) + ".\n"
     write_files(study.out, {f"{NAME}.md": text, f"{NAME}.json": tables.to_json(rows, records, about)})
     table.show(console)
@@ -172,7 +172,7 @@ def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], c
     return records
 
 
-def description(study: TrainingStudy) -> dict[str, str]:
+def description(study: TrainingStudy, rows: Sequence[Choice]) -> dict[str, str]:
     """What a reader must know to compare."""
     trained_on = study.trained_on
     return {
@@ -180,6 +180,7 @@ def description(study: TrainingStudy) -> dict[str, str]:
         "resolution": f"{study.suite.spec.resolution}",
         "data": f"{trained_on['data'][:12]} ({trained_on['groups']} groups)",
         "steps": f"{study.steps}",
+        "batch": f"{rows[0].config.batch_size}",
         "torch": str(installed_version("torch")),
         "mitsuba": str(installed_version("mitsuba")),
         "cores": str(os.cpu_count()),

@@ -54,14 +54,14 @@ def cells(records: Sequence[Record], method: str) -> tuple[Cell, ...]:
 def table(rows: Sequence[Choice], records: Sequence[Record]) -> TextTable:
     """A row for each choice, those that answer one question together."""
     sections = []
-    for question, members in groupby(rows, key=lambda row: row.question):
+    for group, members in groupby(rows, key=lambda row: row.group):
         lines = []
         for row in members:
             texts = [
                 cell_text(c, column.metric.decimals)
                 for c, column in zip(cells(records, row.name), COLUMNS, strict=True)
             ]
-            lines.append((f"{QUESTIONS[question]}: {row.label}" if question else row.label, *texts))
+            lines.append((f"{QUESTIONS[group]}: {row.label}" if group else row.label, *texts))
         sections.append(tuple(lines))
     titles = ("training", *(f"{column.group} {header(column)}" for column in COLUMNS))
     count = len({record.sample for record in records})

@@ -28,6 +28,7 @@ from unirender.surface_light import MIN_ALPHA
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
 COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced over [0, 1]
 LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
+LOBES = 4  # at a time: their samples stay in the processor's cache
 GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
 
 
@@ -107,33 +108,36 @@ def environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarra
     """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1; integrated at the first call."""
     n_v = np.maximum(np.linspace(0, 1, COSINES), GRAZING)
     alpha = np.maximum(np.square(np.linspace(0, 1, ROUGHNESSES)), MIN_ALPHA)
-    cells = [[_integrate_lobe(float(c), float(r)) for r in alpha] for c in n_v]
-    tables = np.array(cells)
-    return tables[..., 0], tables[..., 1]
+    blocks = [[_integrate_lobes(rows, float(r)) for r in alpha] for rows in np.split(n_v, COSINES // LOBES)]
+    a, b = np.array(blocks).transpose(2, 0, 3, 1).reshape(2, COSINES, ROUGHNESSES)
+    return a, b
 
 
-def _integrate_lobe(n_v: float, alpha: float) -> tuple[float, float]:
-    """A and B of one lobe: the midpoint rule over visible normals (Dupuy & Benyoub 2023), n = +z, v in the xz plane.
+def _integrate_lobes(
+    n_v: Float[np.ndarray, " n"], alpha: float
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """A and B of lobes: the midpoint rule over visible normals (Dupuy & Benyoub 2023), n = +z, v in the xz plane.
 
     A visible normal h is drawn with the density D G1(v) max(v.h, 0) / n.v, so that f n.l over the density of l is
     G1(l), Smith's shadowing of the light.
     """
-    v = np.array([np.sqrt(1 - n_v**2), 0.0, n_v])
-    stretched = v * np.array([alpha, alpha, 1.0])
-    stretched /= np.linalg.norm(stretched)
-    u, phi = np.meshgrid((np.arange(LOBE_SAMPLES[0]) + 0.5) / LOBE_SAMPLES[0], (np.arange(LOBE_SAMPLES[1]) + 0.5))
-    phi = np.pi * phi / LOBE_SAMPLES[1]  # the other half is its mirror image
-    z = (1 - u) * (1 + stretched[2]) - stretched[2]  # a point of the cap of the sphere that v sees, moved by v
-    radius = np.sqrt(np.maximum(1 - z**2, 0))
-    h = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1) + stretched
-    h *= np.array([alpha, alpha, 1.0])
-    h /= np.linalg.norm(h, axis=-1, keepdims=True)
-    v_h = h @ v
-    n_l = 2 * v_h * h[..., 2] - n_v
+    u = (np.arange(LOBE_SAMPLES[0]) + 0.5) / LOBE_SAMPLES[0]
+    cos_phi = np.cos(np.pi * (np.arange(LOBE_SAMPLES[1]) + 0.5) / LOBE_SAMPLES[1])[:, None]  # the rest: mirror images
+    v_z = n_v[:, None, None]
+    v_x = np.sqrt(1 - v_z**2)
+    length = np.sqrt((alpha * v_x) ** 2 + v_z**2)
+    x, z = alpha * v_x / length, v_z / length  # v stretched to the configuration of alpha 1
+    h_z = (1 - u) * (1 + z)  # a point of the cap of the sphere that v sees, moved by v; stretched back below
+    radius = np.sqrt(np.maximum(1 - (h_z - z) ** 2, 0))
+    h_x = radius * cos_phi + x
+    length = np.sqrt(alpha**2 * (h_x**2 + radius**2 * (1 - cos_phi**2)) + h_z**2)
+    v_h = (alpha * h_x * v_x + h_z * v_z) / length
+    n_l = 2 * v_h * h_z / length - v_z
     squared = np.square(np.maximum(n_l, 1e-6))
     g1 = np.where(n_l > 0, 2 / (1 + np.sqrt(1 + alpha**2 * (1 - squared) / squared)), 0)
-    schlick = np.clip(1 - v_h, 0, 1) ** 5
-    return float(np.mean((1 - schlick) * g1)), float(np.mean(schlick * g1))
+    away = np.clip(1 - v_h, 0, 1)
+    schlick = np.square(np.square(away)) * away  # the 5th power, five times as fast
+    return np.mean((1 - schlick) * g1, axis=(1, 2)), np.mean(schlick * g1, axis=(1, 2))
 
 
 def _maps(intrinsics: Intrinsics, *names: str) -> dict[str, np.ndarray]:

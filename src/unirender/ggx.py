@@ -1,6 +1,7 @@
 """The GGX lobe of a rough mirror: shadowing, frames, and normals drawn as a viewer sees them.
 
 Notation: n normal, v view direction, h half vector, alpha = roughness^2. In the *surface's frame* z is the normal.
+Arrays have the component of a vector first, so that each is contiguous.
 """
 
 import functools
@@ -9,57 +10,57 @@ import numpy as np
 from jaxtyping import Float
 
 
-def facing_normal(n: Float[np.ndarray, "p 3"], v: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+def dot(a: Float[np.ndarray, "3 ..."], b: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "..."]:
+    """Cosines, if the vectors are unit."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def unit(vectors: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "3 ..."]:
+    """The vectors at length 1."""
+    return vectors / np.sqrt(dot(vectors, vectors))
+
+
+def mirror_direction(n: Float[np.ndarray, "3 ..."], v: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "3 ..."]:
+    """Where a smooth mirror reflects the viewer's ray to, if both are unit."""
+    return 2 * dot(n, v) * n - v
+
+
+def facing_normal(n: Float[np.ndarray, "3 ..."], v: Float[np.ndarray, "3 ..."]) -> Float[np.ndarray, "3 ..."]:
     """Shading normals that point away from the viewer are bent to graze the view ray (predicted maps have them)."""
-    cosine = np.sum(n * v, axis=-1, keepdims=True)
-    bent = n + np.maximum(1e-2 - cosine, 0) * v
-    return bent / np.linalg.norm(bent, axis=-1, keepdims=True)
+    return unit(n + np.maximum(np.float32(1e-2) - dot(n, v), 0) * v)
 
 
 def smith_g1(cosine: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-    """Smith's shadowing of one direction by its cosine to the normal; the two broadcast."""
-    squared = np.square(cosine)
-    return 2 / (1 + np.sqrt(1 + np.square(alpha) * (1 - squared) / np.maximum(squared, 1e-8)))
+    """Smith's shadowing of one direction by its cosine to the normal, 0 below the horizon; the two broadcast."""
+    cosine, a2 = np.maximum(cosine, 0), np.square(alpha)
+    return 2 * cosine / (cosine + np.sqrt(a2 + (1 - a2) * np.square(cosine)))
 
 
 def visible_normals(
-    view: Float[np.ndarray, "m 3"],
-    alpha: Float[np.ndarray, " m"],
-    u1: Float[np.ndarray, " m"],
-    u2: Float[np.ndarray, " m"],
-) -> Float[np.ndarray, "m 3"]:
-    """GGX normals that a viewer sees, in the surface's frame, from two uniform numbers each (Heitz 2018)."""
-    stretched = unit(np.stack([alpha * view[:, 0], alpha * view[:, 1], view[:, 2]], axis=-1))
-    radius, angle = np.sqrt(u1), np.float32(2 * np.pi) * u2
-    t1 = radius * np.cos(angle)
-    blend = np.float32(0.5) * (1 + stretched[:, 2])
-    t2 = (1 - blend) * np.sqrt(np.maximum(1 - np.square(t1), 0)) + blend * radius * np.sin(angle)
-    t3 = np.sqrt(np.maximum(1 - np.square(t1) - np.square(t2), 0))
-    h = np.einsum("mk,mki->mi", np.stack([t1, t2, t3], axis=-1), _visible_disc(stretched))
-    return unit(np.stack([alpha * h[:, 0], alpha * h[:, 1], np.maximum(h[:, 2], np.float32(1e-6))], axis=-1))
+    view: Float[np.ndarray, "3 ..."],
+    alpha: Float[np.ndarray, "..."],
+    u1: Float[np.ndarray, "..."],
+    u2: Float[np.ndarray, "..."],
+) -> Float[np.ndarray, "3 ..."]:
+    """GGX normals that a viewer sees, in the surface's frame, from two uniform numbers each.
+
+    Stretched to a hemisphere, the directions in which it reflects the view are uniform over a spherical cap (Dupuy and
+    Benyoub 2023).
+    """
+    stretched = unit(np.stack([alpha * view[0], alpha * view[1], view[2]]))
+    z = 1 - u1 * (1 + stretched[2])
+    sine, angle = np.sqrt(np.maximum(1 - np.square(z), 0)), np.float32(2 * np.pi) * u2
+    x, y = sine * np.cos(angle) + stretched[0], sine * np.sin(angle) + stretched[1]
+    return unit(np.stack([alpha * x, alpha * y, np.maximum(z + stretched[2], np.float32(1e-6))]))
 
 
-def frames(z: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
-    """Rotation matrices whose rows are x, y, z of a right-handed frame (Duff et al. 2017)."""
-    sign = np.where(z[:, 2] >= 0, 1.0, -1.0).astype(z.dtype)
-    a = -1 / (sign + z[:, 2])
-    b = z[:, 0] * z[:, 1] * a
-    x = np.stack([1 + sign * np.square(z[:, 0]) * a, sign * b, -sign * z[:, 0]], axis=-1)
-    y = np.stack([b, sign + np.square(z[:, 1]) * a, -z[:, 1]], axis=-1)
-    return np.stack([x, y, z], axis=1)
-
-
-def _visible_disc(v: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3 3"]:
-    """Rows t1, t2, v of Heitz's frame around the stretched view direction; t1 lies in the surface."""
-    t1 = np.stack([-v[:, 1], v[:, 0], np.zeros_like(v[:, 0])], axis=-1)
-    length = np.linalg.norm(t1, axis=-1, keepdims=True)
-    t1 = np.where(length > 1e-6, t1 / np.maximum(length, 1e-6), np.array([1, 0, 0], v.dtype))
-    return np.stack([t1, np.cross(v, t1), v], axis=1)
-
-
-def unit(vectors: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """The vectors at length 1."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+def tangents(n: Float[np.ndarray, "3 ..."]) -> tuple[Float[np.ndarray, "3 ..."], Float[np.ndarray, "3 ..."]]:
+    """x and y of a right-handed frame whose z is the normal (Duff et al. 2017)."""
+    sign = np.where(n[2] >= 0, np.float32(1), np.float32(-1))
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    x = np.stack([1 + sign * np.square(n[0]) * a, sign * b, -sign * n[0]])
+    return x, np.stack([b, sign + np.square(n[1]) * a, -n[1]])
 
 
 @functools.lru_cache(maxsize=4)

@@ -29,7 +29,6 @@ from unirender_evaluation.optimiser_study_ingredients import (
     START,
     Ingredient,
     changes,
-    chosen,
     ingredients,
 )
 from unirender_evaluation.optimiser_study_measure import RECORDS, TABLE, Starts, measure, measure_all, rendered_protocol
@@ -82,16 +81,13 @@ def test_the_plain_row_is_the_plain_loop_of_the_multi_view_table() -> None:
     assert plain.config.refine == PlainLoop().settings
 
 
-def test_rows_are_chosen_by_name_and_group() -> None:
-    rows = ingredients()
-    assert chosen(rows, ()) == rows
-    assert [row.name for row in chosen(rows, ("log",))] == [FULL, "log"]
-    assert {row.group for row in chosen(rows, (GREY,))} == {"", GREY}
+def test_wrong_names_end_before_anything_is_made(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--variants colour: expected some of full, .*nvdiffrec, or the groups start"):
-        chosen(rows, ("log", "colour"))
+        BenchIngredients(out=tmp_path / "out", variants=("log", "colour")).run()
+    assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("options", [{"objects": 0}, {"seed": -1}, {"variants": ("no-such",)}])
+@pytest.mark.parametrize("options", [{"objects": 0}, {"seed": -1}])
 def test_wrong_usage_ends_before_anything_is_made(options: dict, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expected"):
         BenchIngredients(out=tmp_path / "out", **options).run()

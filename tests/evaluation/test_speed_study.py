@@ -247,13 +247,16 @@ def test_overfitting_gets_better_in_both_directions(shards: Path) -> None:
     assert len(pair["image"]) == 1
     config = overfit_config(PLAIN)
     assert config.model == PLAIN.model
-    points = overfit(pair, config, 0.08, CPU, torch.float32)
-    assert points[0].minutes == 0 == points[0].samples
-    assert points[-1].minutes >= 0.08
-    assert points[-1].samples > 0
-    for direction in ("render", "inverse", "albedo"):
-        assert points[-1].psnr[direction] > points[0].psnr[direction] + 1
-    table = overfit_table(points, 0.08)
+    for minutes in (0.08, 0.4, 2.0):  # it trains by the clock: on a busy machine a short time is a handful of steps
+        points = overfit(pair, config, minutes, CPU, torch.float32)
+        assert points[0].minutes == 0 == points[0].samples
+        assert points[-1].minutes >= minutes
+        assert points[-1].samples > 0
+        gains = [points[-1].psnr[name] - points[0].psnr[name] for name in ("render", "inverse", "albedo")]
+        if min(gains) > 1:
+            break
+    assert min(gains) > 1
+    table = overfit_table(points, minutes)
     assert len(table.sections[0]) == len(points)
     assert table.sections[0][-1][2] == f"{points[-1].psnr['render']:.2f}"
 

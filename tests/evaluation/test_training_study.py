@@ -13,7 +13,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.training.presets import ModelConfig
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
-from unirender_evaluation.training_study import PLAIN, Choice, chosen, training_choices
+from unirender_evaluation.training_study import PLAIN, Choice, training_choices
 from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.training_study_run import TrainingStudy, run
 from unirender_evaluation.training_study_tables import COLUMNS, cells, table
@@ -45,7 +45,7 @@ def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
     """Each in one part of its configuration, and no two are the same."""
     plain, *others = training_choices()
     assert plain.name == PLAIN
-    assert not plain.question
+    assert not plain.group
     assert plain.config.model.physics_prior == "none"
     assert len({str(row.config) for row in (plain, *others)}) == len(others) + 1
     for row in others:
@@ -58,13 +58,9 @@ def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
     assert isinstance(plain.config.model, ModelConfig)
 
 
-def test_rows_are_chosen_by_name_or_by_question() -> None:
-    rows = training_choices()
-    assert [row.name for row in chosen(rows, ("patch-4",))] == [PLAIN, "patch-4"]
-    assert {row.question for row in chosen(rows, ("cycle",))} == {"", "cycle"}
-    assert chosen(rows, ()) == rows
-    with pytest.raises(UsageError, match="no-such: no such row, expected some of: plain"):
-        chosen(rows, ("no-such",))
+def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
+        BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
 
 
 def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:

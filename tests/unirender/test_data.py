@@ -3,6 +3,7 @@
 import itertools
 import json
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +25,11 @@ from unirender.training.augment import (
     Draw,
     draw,
 )
-from unirender.training.data import BATCH_MAPS, GroupDataset, iterate_batches
+from unirender.training.data import BATCH_MAPS, GroupDataset
 from unirender.training.environments import turned_environments
 from unirender.training.groups import list_shards, read_groups
 from unirender.training.presets import Augmentation
+from unirender.training.reader import BatchReader
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def dataset(folder: Path) -> GroupDataset:
 
 def samples(dataset: GroupDataset, count: int, start: int = 0, size: int = 3, **options) -> list[torch.Tensor]:
     """`count` images and albedos of a stream."""
-    batches = iterate_batches(dataset, size, seed=5, start_sample=start, **options)
+    batches = BatchReader(dataset, size, seed=5, start_sample=start, **options)
     flat = itertools.chain.from_iterable(torch.cat([b["image"], b["albedo"], b["metallic"]], dim=1) for b in batches)
     return list(itertools.islice(flat, count))
 
@@ -58,8 +60,39 @@ def test_sample_depends_on_seed_and_index_only(dataset: GroupDataset) -> None:
     assert not torch.equal(whole[0], samples(dataset, 1, start=1, workers=0)[0])
 
 
+class Counting(GroupDataset):
+    """Counts the samples that are made."""
+
+    made = 0
+
+    def sample(self, index: int, seed: int, augmentation: Augmentation) -> dict[str, np.ndarray]:
+        self.made += 1
+        return super().sample(index, seed, augmentation)
+
+
+def test_batches_are_read_ahead_when_that_is_asked_for(folder: Path) -> None:
+    """And not before: the cores are busy then."""
+    dataset = Counting(folder)
+    reader = BatchReader(dataset, 2, seed=5, workers=1)
+    first = next(reader)
+    reader.read_ahead()
+    reader.read_ahead()  # of which there is enough already
+    second, third = next(reader), next(reader)
+    made = dataset.made
+    time.sleep(0.1)
+    assert made == dataset.made == 6
+    reader.read_ahead()
+    end = time.monotonic() + 60
+    while dataset.made < 10:
+        assert time.monotonic() < end, "nothing is read ahead"
+        time.sleep(0.01)
+    reader.close()
+    asked = BatchReader(dataset, 2, seed=5, workers=0)
+    assert all(torch.equal(a["image"], next(asked)["image"]) for a in (first, second, third))
+
+
 def test_another_seed_gives_another_stream(dataset: GroupDataset) -> None:
-    one, other = (next(iterate_batches(dataset, 4, seed=seed, workers=0)) for seed in (0, 1))
+    one, other = (next(BatchReader(dataset, 4, seed=seed, workers=0)) for seed in (0, 1))
     assert not torch.equal(one["image"], other["image"])
 
 
@@ -67,7 +100,7 @@ def test_each_epoch_is_a_permutation_of_the_items(dataset: GroupDataset) -> None
     orders = [dataset._order(0, epoch) for epoch in range(8)]
     assert all(sorted(order) == list(range(len(dataset))) for order in orders)
     assert len({tuple(order) for order in orders}) > 1
-    albedo = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))["albedo"]
+    albedo = next(BatchReader(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))["albedo"]
     assert len({a.numpy().tobytes() for a in albedo}) == len(dataset)  # every group once
 
 
@@ -93,7 +126,7 @@ def test_a_stored_pair_is_what_was_written(dataset: GroupDataset) -> None:
 
 
 def test_batch_shapes_and_ranges(dataset: GroupDataset) -> None:
-    batch = next(iterate_batches(dataset, 8, seed=0))
+    batch = next(BatchReader(dataset, 8, seed=0))
     assert tuple(batch) == BATCH_MAPS
     for name, tensor in batch.items():
         channels = 1 if name in ("roughness", "metallic", "mask") else 3
@@ -162,7 +195,7 @@ def test_other_groups_are_flattened_to_pairs(tmp_path: Path, vary: str) -> None:
     folder = write_dataset(tmp_path, vary=vary, shards=1, lights=2, roughness=(40, 70), metallic=(0, 30))
     dataset = GroupDataset(folder)
     assert len(dataset) == dataset.num_pairs == 2 * 2 * 2 * 2
-    batch = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
+    batch = next(BatchReader(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
     assert {round(float(m.max()), 2) for m in batch["metallic"]} == {0.0, 0.3}
     assert len({image.numpy().tobytes() for image in batch["image"]}) == len(dataset)
 
@@ -170,7 +203,7 @@ def test_other_groups_are_flattened_to_pairs(tmp_path: Path, vary: str) -> None:
 def test_no_augmentation_gives_stored_pictures(tmp_path: Path) -> None:
     dataset = GroupDataset(write_dataset(tmp_path, vary="paper", shards=1))
     stored = {dataset.stored(g, pair)[0].tobytes() for g in range(len(dataset.keys)) for pair in dataset.pairs(g)}
-    batch = next(iterate_batches(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
+    batch = next(BatchReader(dataset, len(dataset), 0, workers=0, augmentation=NO_AUGMENTATION))
     assert {image.permute(1, 2, 0).contiguous().numpy().tobytes() for image in batch["image"]} == stored
 
 
@@ -207,7 +240,7 @@ def test_augmentations_carry_the_maps_along(mapped: GroupDataset) -> None:
             else:
                 wrong = max(wrong, float(np.abs(maps["image"] - expected).max()))
     assert wrong > 5 * 6e-3
-    batch = next(iterate_batches(mapped, 6, seed=0, workers=0))
+    batch = next(BatchReader(mapped, 6, seed=0, workers=0))
     assert tuple(batch) == BATCH_MAPS
     assert batch["roughness"].shape == (6, 1, 16, 16)
 

@@ -13,7 +13,7 @@ from tiny_models import make_model
 from torch import Tensor
 
 from unirender.models.build import build_model
-from unirender.models.dual_stream import DualStreamModel, pyramid_channels
+from unirender.models.dual_stream import DualStreamModel, Encoded, pyramid_channels
 from unirender.training.presets import PRESETS
 
 
@@ -74,8 +74,9 @@ def test_exchange_happens_before_fusion() -> None:
         for p in bridge.parameters():
             p.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
     a, i, t_a, t_i = inputs(model)
-    e_a = model.encode(model.attribute_unet, a, t_a, None, None)
-    e_i = model.encode(model.image_unet, i, t_i, None, None)
+    context = model.context(a, i, None)
+    e_a = model.encode(model.attribute_unet, a, t_a, context, None, None)
+    e_i = model.encode(model.image_unet, i, t_i, context, None, None)
     assert [f.shape[1] for f in e_a.features] == pyramid_channels(model.attribute_unet)
     fused = [
         mine + conv(theirs)
@@ -105,6 +106,26 @@ def test_rows_are_decoded_where_asked_for() -> None:
     torch.testing.assert_close(part.attributes, whole.attributes[1:], rtol=0, atol=1e-5)
     torch.testing.assert_close(part.image, whole.image[:2], rtol=0, atol=1e-5)
     assert model(a, i, t, t, extra_a, extra_i, image_rows=None).image is None
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("unified", [True, False])
+def test_what_was_encoded_stands_for_its_rows_in_another_call(unified: bool) -> None:
+    model, _ = make_model(unified=unified, physics_prior="none")
+    generator = torch.Generator().manual_seed(0)
+    a, i = (torch.randn(3, c, 16, 16, generator=generator) for c in (72, 12))
+    extra, t, clean = torch.zeros(3, 12, 16, 16), torch.full((3,), 500), torch.zeros(3, dtype=torch.long)
+    first = model(a, i, t, clean, extra, extra, attribute_rows=slice(1, None), image_rows=None)
+    assert first.encoded_attributes is None
+    assert first.encoded_image.features[-1].shape[0] == 2
+    given = a[1:], t[1:], clean[1:], extra[1:]
+
+    def again(condition: Tensor | Encoded) -> Tensor:
+        return model(given[0], condition, *given[1:], extra[1:], image_rows=None).attributes
+
+    assert torch.equal(again(first.encoded_image), again(i[1:]))
+    torch.testing.assert_close(again(first.encoded_image), first.attributes)
+    assert not torch.equal(again(i[:2]), again(i[1:]))  # the twin
 
 
 @torch.no_grad()

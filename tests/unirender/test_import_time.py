@@ -1,5 +1,6 @@
 """The quick start of the command line: what `unirender decompose` must not import, and that deferring loses nothing."""
 
+import gc
 import json
 import os
 import subprocess
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unirender.cli import main
+
 # Each takes from 0.1 to 1.5 s to import, and decomposing a picture uses none of it.
 FORBIDDEN = (
     "diffusers.models.transformers.transformer_flux",
@@ -17,6 +20,7 @@ FORBIDDEN = (
     "mitsuba",
     "scipy.optimize",
     "scipy.stats._stats_py",
+    "torch._dynamo",
     "transformers",
 )
 REPORT = "import atexit, json, sys; atexit.register(lambda: print(json.dumps(sorted(sys.modules)), file=sys.stderr)); "
@@ -37,8 +41,10 @@ def test_decompose_does_without_what_it_does_not_use(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(picture).save(tmp_path / "picture.png")
     words = ["decompose", str(tmp_path / "picture.png"), "--output", str(tmp_path / "out"), "--no-progress"]
-    printed, imported = run_python("from unirender.cli import main; main()", *words)
+    frozen = "import atexit, gc; atexit.register(lambda: print('frozen', gc.get_freeze_count() > 100_000)); "
+    printed, imported = run_python(frozen + "from unirender.cli import main; main()", *words)
     assert "roughness" in printed
+    assert "frozen True" in printed
     assert "diffusers.models.unets.unet_2d_condition" in imported
     assert not imported & set(FORBIDDEN)
 
@@ -47,25 +53,78 @@ def test_decompose_does_without_what_it_does_not_use(tmp_path: Path) -> None:
 def test_a_library_import_has_all_of_diffusers() -> None:
     """The twin: without `lean_imports` the same model brings most of the list; inside a library nothing is hidden."""
     _, imported = run_python("import unirender.pipelines.unirender_pipeline")
-    assert {"scipy.optimize", "scipy.stats._stats_py"} <= imported
+    assert {"scipy.optimize", "scipy.stats._stats_py", "torch._dynamo"} <= imported
 
 
 @pytest.mark.slow
-def test_what_was_deferred_is_there_when_it_is_asked_for() -> None:
+def test_what_was_left_out_is_there_when_it_is_asked_for() -> None:
     code = """
-from unirender.models.lean_imports import lean_imports
-with lean_imports():
+import unirender.models.lean_imports as lean
+with lean.lean_imports():
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-    before = "diffusers.models.unets.unet_1d" in sys.modules
-import scipy.stats, torch
+    from diffusers.utils.torch_utils import is_compiled_module
+    import torch
+
+    def plain():
+        return torch.compiler.is_compiling()
+
+    left_alone = torch.compiler.disable()(torch.compiler.disable(plain, reason="a test"))
+    before = [name in sys.modules for name in ("diffusers.models.unets.unet_1d", "torch._dynamo")]
+    before += [left_alone(), is_compiled_module(torch.nn.Identity())]
+    assert torch.compiler.disable.__module__ == lean.__name__
+assert torch.compiler.disable.__module__ == "torch.compiler"
+import scipy.stats
 from diffusers.models.unets import UNet1DModel, UNet2DConditionModel as Again
 assert Again is UNet2DConditionModel
-compiled = torch.compile(lambda x: x + 1, backend="eager")
-print(before, UNet1DModel.__name__, scipy.stats.norm.cdf(0.0), float(compiled(torch.ones(()))))
+print(any(before), UNet1DModel.__name__, scipy.stats.norm.cdf(0.0))
+compiled = [torch.compile(lambda x, f=f: x + f(), backend="eager") for f in (plain, left_alone)]
+print(*(float(function(torch.ones(()))) for function in compiled))
+print(is_compiled_module(torch.compile(torch.nn.Identity(), backend="eager")), is_compiled_module(torch.nn.Identity()))
+print(isinstance(lean._when_loaded(torch.compiler.disable)(type("Own", (), {})), type))
 """
     printed, imported = run_python(code)
-    assert printed.split() == ["False", "UNet1DModel", "0.5", "2.0"]
+    left_out, compiled, recognised, left_a_class = printed.splitlines()
+    assert left_out == "False UNet1DModel 0.5"
+    assert compiled == "2.0 1.0"  # the compiler looks into one of the two functions
+    assert recognised == "True False"
+    assert left_a_class == "True"
     assert "torch._dynamo.convert_frame" in imported
+
+
+def test_a_deferred_package_is_whole_for_whoever_asks_otherwise() -> None:
+    """All of its names at once, or a file beside its code; a code that fails says so each time, not only at first."""
+    code = """
+import importlib.resources, pathlib, tempfile
+import unirender.models.lean_imports as lean
+with tempfile.TemporaryDirectory() as folder:
+    for name, source in {"whole": "__all__ = ['one']; one = 1", "broken": "raise ImportError('no libfoo')"}.items():
+        (pathlib.Path(folder) / name).mkdir()
+        (pathlib.Path(folder) / name / "__init__.py").write_text(source)
+        (pathlib.Path(folder) / name / "inner.py").touch()
+    (pathlib.Path(folder) / "whole" / "data.txt").write_text("42")
+    sys.path.insert(0, folder)
+    lean.DEFERRED = ("whole", "broken")
+    with lean.lean_imports():
+        import broken.inner, whole.inner
+    before = "one" in vars(whole)
+    print(before, importlib.resources.files("whole").joinpath("data.txt").read_text())
+    from whole import *
+    print(one)
+    for _ in range(2):
+        try:
+            broken.missing
+        except ImportError as error:
+            print(error)
+"""
+    printed, _ = run_python(code)
+    assert printed.splitlines() == ["False 42", "1", "no libfoo", "no libfoo"]
+
+
+def test_a_call_from_python_changes_nothing_of_the_process(tmp_path: Path) -> None:
+    before = gc.get_threshold(), gc.get_freeze_count(), list(sys.meta_path)
+    with pytest.raises(SystemExit, match="1"):
+        main(["decompose", str(tmp_path / "missing.png"), "--output", str(tmp_path / "out")])
+    assert (gc.get_threshold(), gc.get_freeze_count(), list(sys.meta_path)) == before
 
 
 def test_what_is_imported_already_is_left_alone() -> None:

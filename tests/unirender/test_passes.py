@@ -85,6 +85,33 @@ def test_pieces_one_after_the_other_are_pieces_side_by_side(batch: dict[str, Ten
     assert other != side_by_side  # the twin: other parts, other noise
 
 
+def test_gradients_lie_in_memory_as_their_parameters_do(
+    batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fused optimiser needs it, and does not look (the twin)."""
+    _, whole = run(gradient_of(), batch)
+
+    def other_layout(self: BatchGradient, parameters: list[Tensor], gradients: list[Tensor | None]) -> list:
+        del self, parameters
+        return [None if g is None else g.t().contiguous().t() if g.dim() == 2 else g for g in gradients]
+
+    monkeypatch.setattr(BatchGradient, "_over_processes", other_layout)
+    gradient = gradient_of()
+    _, again = run(gradient, batch)
+    assert torch.equal(again, whole)
+    with_gradient = [p for p in gradient.loss.model.parameters() if p.grad is not None]
+    assert all(p.grad is not None and p.grad.stride() == p.stride() for p in with_gradient)
+    results = []
+    for fused, layout in ((False, False), (True, False), (True, True)):
+        weight = torch.nn.Parameter(torch.ones(2, 3))
+        weight.grad = torch.tensor([[1.0, -1.0, 2.0], [-2.0, 3.0, 0.0]])
+        weight.grad = weight.grad.t().contiguous().t() if layout else weight.grad
+        torch.optim.AdamW([weight], 0.1, fused=fused).step()
+        results.append(weight.detach())
+    torch.testing.assert_close(results[1], results[0])
+    assert not torch.allclose(results[2], results[0])
+
+
 @pytest.mark.parametrize(("size", "parallel", "accumulate"), [(1, 1, 1), (2, 1, 1), (1, 3, 2), (2, 2, 1), (3, 1, 5)])
 def test_parts_are_rows_of_the_batch_whoever_computes_them(size: int, parallel: int, accumulate: int) -> None:
     splits = [Split(11, Processes(rank, size), parallel, accumulate) for rank in range(size)]

@@ -1,6 +1,7 @@
 """The samplers of diffusers on our schedule: an exact Gaussian denoiser, orders of convergence, seeds in any batch."""
 
 import math
+from collections import Counter
 from itertools import pairwise
 from typing import Any
 
@@ -23,6 +24,7 @@ from unirender.diffusion.sampling import (
 )
 from unirender.diffusion.schedule import last_timestep, make_scheduler
 from unirender.errors import UnirenderError
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 
 SAMPLERS = ("ddim", "unipc")
@@ -150,6 +152,75 @@ def test_a_row_is_the_same_in_any_batch(name: str) -> None:
     among_image = infer_image(*parts, batch, missing, **settings(3))
     torch.testing.assert_close(alone_image, among_image[:1], rtol=0, atol=1e-4)
     assert float((among_image[1:2] - alone_image).abs().max()) > 1e-2  # the twin
+
+
+NETWORKS: dict[str, dict[str, Any]] = {
+    "unified": {},
+    "split": {"unified": False},
+    "light-encoder": {"light": "encoder", "physics_prior": "none"},
+}
+
+
+@pytest.mark.parametrize("steps", [1, 4, 20])
+@pytest.mark.parametrize("kind", NETWORKS)
+def test_the_clean_stream_is_encoded_once_and_nothing_changes(kind: str, steps: int) -> None:
+    """Bit for bit what a plain loop gives that encodes both streams at every step."""
+    model, conditioning = make_model(**NETWORKS[kind])
+    batch, scheduler = make_batch(2), make_scheduler()
+    runs = Counter[str]()
+    for name, module in model.named_modules():
+        if name.endswith("unet.conv_in"):  # the first layer of each encoder
+            module.register_forward_pre_hook(lambda *_, name=name: runs.update([name.split(".")[-2]]))
+
+    def seed() -> torch.Generator:
+        return torch.Generator().manual_seed(3)
+
+    maps = infer_attributes(
+        model, conditioning, scheduler, batch["image"], batch["mask"], steps=steps, generator=seed()
+    )
+    assert runs == {"attribute_unet": steps, "image_unet": 1}
+    given = torch.ones(2, 6, dtype=torch.bool)
+    runs.clear()
+    image = infer_image(model, conditioning, scheduler, batch, given, steps=steps, generator=seed())
+    assert runs == {"attribute_unet": 1, "image_unet": steps}
+
+    noise = draw_noise((2, 72, 16, 16), batch["image"], seed())
+    looped = conditioning.decode_attributes(loop(model, conditioning, batch, ~given, noise, steps))
+    assert all(torch.equal(looped[name], value) for name, value in maps.items())
+    runs.clear()
+    noise = draw_noise((2, 84, 16, 16), batch["image"], seed())
+    looped = conditioning.decode_image(loop(model, conditioning, batch, given, noise, steps))
+    assert torch.equal(looped, image)
+    assert runs == {"attribute_unet": steps, "image_unet": steps}
+
+
+@torch.no_grad()
+def loop(
+    model: DualStreamModel,
+    conditioning: Conditioning,
+    batch: dict[str, Tensor],
+    given: Tensor,
+    noise: Tensor,
+    steps: int,
+) -> Tensor:
+    """x0 of the image where everything is given, of the attributes where nothing is, by one whole call a step."""
+    rendering = bool(given.all())
+    extras = conditioning.extras(batch["mask"], given, batch if rendering else None)
+    clean = conditioning.encode_attributes(batch) if rendering else conditioning.encode_image(batch["image"])
+    if rendering:
+        unknown, noise = noise.split((72, 12), dim=1)
+        clean = torch.where(conditioning.by_triplet(conditioning.in_latents(given)), clean, unknown)
+    zero = torch.zeros(len(clean), dtype=torch.long)
+
+    def predict(x_t: Tensor, t: Tensor) -> Tensor:
+        streams = (clean, x_t, zero, t) if rendering else (x_t, clean, t, zero)
+        other: Any = {"attribute_rows" if rendering else "image_rows": None}
+        output = model(*streams, extras.attributes, extras.image, extras.prior, extras.light, **other)
+        x_0 = output.image if rendering else output.attributes
+        assert x_0 is not None
+        return x_0
+
+    return denoise(predict, noise, make_scheduler(), steps)
 
 
 def test_extras_of_each_camera() -> None:

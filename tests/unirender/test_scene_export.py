@@ -118,9 +118,11 @@ def test_the_light_is_stored_as_it_is(intrinsics: Intrinsics, tmp_path: Path) ->
 
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(intrinsics: Intrinsics, tmp_path: Path) -> None:
     normal = intrinsics.require("normal")["normal"]
+    several: dict[str, Any] = {name: value[None] for name, value in intrinsics.maps.items()}
     for broken, said in (
         (intrinsics.replace(environment=None), "environment missing"),
         (intrinsics.replace(normal=0 * normal), "no pixel is covered"),
+        (Intrinsics(**several), r"expected one picture \(h, w, c\)"),
     ):
         with pytest.raises(UnirenderError, match=said):
             export_scene(tmp_path / "scene", broken)

@@ -30,6 +30,7 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.memory import readable, training_bytes
 from unirender.training.presets import PRESETS, LossConfig, ModelConfig, TrainConfig
 from unirender.training.run import Train
+from unirender.training.start import begin_with_diffusion
 from unirender.training.trainer import RunConfig, Trainer
 
 UNET, VAE, TEXT = ("unet", "vae", "text_encoder")
@@ -459,7 +460,7 @@ def test_gradients_are_the_same_with_checkpointing(first: Path, tmp_path: Path) 
         config = dataclasses.replace(TRAIN, model=model, loss=loss)
         run = RunConfig(tmp_path, steps=1, parallel=2)
         trainer = Trainer(config, run, torch.device("cpu"), torch.float32, vae=diffusion.vae)
-        trainer.start_from_diffusion(diffusion)
+        begin_with_diffusion(trainer, diffusion)
         if checkpointing:
             trainer.model.enable_gradient_checkpointing()
         terms = trainer.train_step(make_batch())

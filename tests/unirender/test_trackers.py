@@ -114,14 +114,30 @@ def test_a_failed_run_finishes_its_trackers(registered: str, tmp_path: Path) -> 
     assert told == ["start", "parameters", "log", "finish"]
 
 
-def test_unknown_trackers_are_refused_with_those_that_can_be_used(registered: str) -> None:
+class UnreachableTracker(LineTracker):
+    """Its service cannot be reached."""
+
+    def start(self) -> None:
+        raise ConnectionError("no such host")
+
+
+def test_trackers_that_were_started_are_finished_where_another_cannot_start(tmp_path: Path) -> None:
+    trackers = (LineTracker("one", tmp_path), UnreachableTracker("two", tmp_path), LineTracker("three", tmp_path))
+    with pytest.raises(ConnectionError, match="no such host"), tracking(trackers, TRAIN):
+        pytest.fail("the run went on without its tracker")
+    told = [json.loads(line)["event"] for line in trackers[0].path.read_text().splitlines()]
+    assert told == ["start", "parameters", "finish"]
+    assert [path.parent.name for path in tmp_path.rglob("lines.jsonl")] == ["one"]  # the third never began
+
+
+def test_unknown_trackers_are_refused_with_those_that_accelerate_knows(registered: str) -> None:
     check_trackers([NAME])
     assert NAME in known_trackers()
-    with pytest.raises(UsageError, match=rf"--track tensorbored: no tracker .* expected .*{NAME}"):
+    with pytest.raises(UsageError, match=rf"--track tensorbored: no tracker .* expected one of .* tensorboard, {NAME}"):
         check_trackers([NAME, "tensorbored"])
     missing = sorted(set(LOGGER_TYPE_TO_CLASS) - set(known_trackers()))
     assert missing  # nobody has all nine
-    with pytest.raises(UsageError, match="not installed here"):
+    with pytest.raises(UsageError, match=f"--track {missing[0]}: not installed here; pip install {missing[0]}$"):
         check_trackers([missing[0]])
 
 

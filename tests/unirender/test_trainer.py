@@ -30,12 +30,13 @@ from unirender.training.checkpoint import (
     restore_folder,
     save_state,
 )
-from unirender.training.data import iterate_batches
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
 from unirender.training.live import live_report
 from unirender.training.presets import PRESETS, LossConfig, OptimizerConfig, TrainConfig, get_preset
+from unirender.training.reader import BatchReader
 from unirender.training.source import ShardSource
+from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import RunConfig, Trainer, learning_rate
 from unirender.training.validation import Validate
 
@@ -47,11 +48,14 @@ class SyntheticSource:
     """Batch k is a function of k: a source whose place is one number."""
 
     def __init__(self, fixed: bool = False) -> None:
-        self.place, self.fixed = 0, fixed
+        self.place, self.idle, self.fixed = 0, 0, fixed
 
     def next(self) -> dict[str, Tensor]:
         self.place += 1
         return make_batch(TRAIN.batch_size, seed=0 if self.fixed else self.place)
+
+    def read_ahead(self) -> None:
+        self.idle += 1
 
     def state_dict(self) -> dict[str, Any]:
         return {"place": self.place}
@@ -89,6 +93,37 @@ def test_resume_is_exact(tmp_path: Path, parallel: int) -> None:
         assert all(torch.equal(first[name], second[name]) for name in first), group
     other = run_for(tmp_path / "c", 1, config=dataclasses.replace(TRAIN, seed=1), parallel=parallel)
     assert other != whole[:1]  # the twin that must differ
+
+
+def test_the_moments_of_a_state_get_the_layout_of_the_weights(tmp_path: Path) -> None:
+    """The fused optimiser would give each weight another's moments, without a word."""
+    run_for(tmp_path, 1)
+    state = load_state(tmp_path)
+    assert state is not None
+    turned = 0
+    for moments in state["optimizer"]["state"].values():
+        for name, value in moments.items():
+            moments[name] = value.contiguous()
+            turned += moments[name].stride() != value.stride()
+    assert turned
+    save_state(tmp_path, state)
+    again = Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32)
+    again.resume(SyntheticSource())
+    for before, (p, after) in zip(state["optimizer"]["state"].values(), again.optimizer.state.items(), strict=True):
+        assert torch.equal(after["exp_avg"], before["exp_avg"])
+        assert after["exp_avg"].stride() == after["exp_avg_sq"].stride() == p.stride()
+
+
+def test_idle_cores_are_made_use_of_once_the_passes_are_over(tmp_path: Path) -> None:
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32)
+    weight = trainer.model.attribute_unet.conv_out.weight
+    before, seen = weight.detach().clone(), []
+    trainer.train_step(make_batch(), lambda: seen.append(weight.grad is not None and torch.equal(weight, before)))
+    assert seen == [True]
+    assert not torch.equal(weight, before)
+    source = SyntheticSource()
+    trainer.fit(source)
+    assert (trainer.step, source.idle) == (2, 1)
 
 
 def test_state_of_another_config_is_refused(tmp_path: Path) -> None:
@@ -405,7 +440,7 @@ def test_a_run_starts_from_other_weights(tmp_path: Path) -> None:
     second = Trainer(dataclasses.replace(TRAIN, seed=1), RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
     name = "attribute_unet.conv_in.weight"
     assert not torch.equal(first.model.state_dict()[name], second.model.state_dict()[name])
-    second.start_from(first.model)
+    begin_with_network(second, first.model)
     for key, value in first.model.state_dict().items():
         assert torch.equal(value, second.model.state_dict()[key])
     assert torch.equal(second.ema.average[name], first.model.state_dict()[name])
@@ -416,7 +451,8 @@ def test_a_pipeline_tells_the_runs_that_it_continues(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         trainer = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
         if folders:
-            trainer.start_from(UniRenderPipeline.from_pretrained(folders[-1]).dual_stream, read_history(folders[-1]))
+            pipeline = UniRenderPipeline.from_pretrained(folders[-1])
+            begin_with_network(trainer, pipeline.dual_stream, read_history(folders[-1]))
         trainer.fit(SyntheticSource())
         again = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
         again.resume(SyntheticSource())
@@ -433,7 +469,7 @@ def test_another_prior_begins_with_its_own_picture(tmp_path: Path) -> None:
     first = Trainer(other, RunConfig(tmp_path / "a", steps=2), CPU, torch.float32)
     torch.nn.init.ones_(first.model.image_unet.conv_out.weight)
     second = Trainer(TRAIN, RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
-    second.start_from(first.model)
+    begin_with_network(second, first.model)
     assert not second.model.image_unet.conv_out.weight.any()
     assert not second.ema.average["image_unet.conv_out.weight"].any()
     assert torch.equal(first.model.image_unet.conv_in.weight, second.model.image_unet.conv_in.weight)
@@ -446,13 +482,46 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     trainer = Trainer(TRAIN, RunConfig(tmp_path / "a", steps=2), CPU, torch.float32)
     other = Trainer(wider, RunConfig(tmp_path / "b", steps=2), CPU, torch.float32)
     with pytest.raises(UnirenderError, match="expected the same network"):
-        trainer.start_from(other.model)
+        begin_with_network(trainer, other.model)
+
+
+@pytest.mark.parametrize("unified", [True, False])
+def test_a_pipeline_of_the_other_kind_of_network_is_refused(unified: bool, tmp_path: Path) -> None:
+    """The names of the weights differ as well, but say nothing of the reason."""
+    split = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, unified=False))
+    given, wanted = (TRAIN, split) if unified else (split, TRAIN)
+    trainer = Trainer(given, RunConfig(tmp_path, steps=1), CPU, torch.float32)
+    folder = export_pipeline(trainer, tmp_path / "pipeline")
+    kinds = ["one network for both directions", "a network for each direction"]
+    got, expected = kinds if unified else kinds[::-1]
+    with pytest.raises(
+        UnirenderError, match=f"pipeline: its weights are those of {got}.*, expected {expected}.*--init"
+    ):
+        read_start(wanted.model, init=folder)
+    assert read_start(given.model, init=folder).pipeline is not None  # the twin
+
+
+def test_the_config_of_a_run_survives_a_kill_while_it_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Trainer(TRAIN, RunConfig(tmp_path, steps=1), CPU, torch.float32).fit(SyntheticSource())
+    before = json.loads((tmp_path / "config.json").read_text())
+    write = Path.write_text
+
+    def killed(self: Path, text: str) -> None:
+        write(self, text[:10])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", killed)
+    with pytest.raises(KeyboardInterrupt):
+        Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
+    assert json.loads((tmp_path / "config.json").read_text()) == before
 
 
 def test_the_augmentation_of_a_config_reaches_the_batches(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", size=32)
     batches = [ShardSource(data, 2, 0, workers=0, augmentation=a).next() for a in (NO_AUGMENTATION, TRAIN.augmentation)]
-    stored = next(iterate_batches(data, 2, 0, workers=0, augmentation=NO_AUGMENTATION))
+    stored = next(BatchReader(data, 2, 0, workers=0, augmentation=NO_AUGMENTATION))
     assert torch.equal(batches[0]["image"], stored["image"])
     assert not torch.equal(batches[1]["image"], stored["image"])
 

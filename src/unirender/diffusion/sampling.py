@@ -23,7 +23,7 @@ from unirender.camera import Camera
 from unirender.diffusion.schedule import last_timestep
 from unirender.errors import UnirenderError
 from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
-from unirender.models.dual_stream import DualStreamModel
+from unirender.models.dual_stream import DualStreamModel, Encoded
 from unirender.models.priors import Maps
 
 Mode = Literal["mean", "sample"]
@@ -157,12 +157,24 @@ def infer_attributes(
     """
     image = conditioning.encode_image(image_linear).to(model.dtype)
     given = torch.zeros(len(image), len(TRIPLETS), dtype=torch.bool, device=image.device)
-    extras = extras_by_camera(conditioning, mask, given, None, camera)
-    extra_a, extra_i = extras.attributes.to(image), extras.image.to(image)
+    extras = extras_by_camera(conditioning, mask, given, None, camera).to(image)
     clean = torch.zeros(len(image), dtype=torch.long, device=image.device)
+    condition: Tensor | Encoded = image
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
-        return model(x_t.to(image), image, t, clean, extra_a, extra_i, image_rows=None).attributes.to(x_t)
+        nonlocal condition
+        output = model(
+            x_t.to(image),
+            condition,
+            t,
+            clean,
+            extras.attributes,
+            extras.image,
+            light=extras.light,
+            image_rows=None,
+        )
+        condition = output.encoded_image  # the same at every step
+        return output.attributes.to(x_t)
 
     noise = draw_noise((len(image), conditioning.attribute_channels, *image.shape[-2:]), image_linear, generator)
     return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress).float())
@@ -199,22 +211,26 @@ def infer_image(
     channels = (latents.shape[1], conditioning.codec.channels)
     noise = draw_noise((len(latents), sum(channels), *latents.shape[-2:]), latents, generator)
     unknown, x_T = noise.split(channels, dim=1)
-    attributes = torch.where(conditioning.by_triplet(given), latents, unknown).to(model.dtype)
-    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera)
-    extra_a, extra_i = extras.attributes.to(attributes), extras.image.to(attributes)
+    shown = conditioning.by_triplet(conditioning.in_latents(given))
+    attributes = torch.where(shown, latents, unknown).to(model.dtype)
+    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera).to(attributes)
     clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
+    condition: Tensor | Encoded = attributes
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
+        nonlocal condition
         output = model(
-            attributes,
+            condition,
             x_t.to(attributes),
             clean,
             t,
-            extra_a,
-            extra_i,
-            image_prior=extras.prior,  # float32 whatever the weights are: the sum keeps the composite's precision
+            extras.attributes,
+            extras.image,
+            image_prior=extras.prior,
+            light=extras.light,
             attribute_rows=None,
         )
+        condition = output.encoded_attributes  # the same at every step
         return output.image.to(x_t)
 
     return conditioning.decode_image(denoise(predict, x_T, scheduler, steps, progress).float())
@@ -244,8 +260,10 @@ def extras_by_camera(
         for i, own in enumerate(camera)
     ]
     priors = [row.prior for row in rows if row.prior is not None]
+    lights = [row.light for row in rows if row.light is not None]
     return Extras(
         torch.cat([row.attributes for row in rows]),
         torch.cat([row.image for row in rows]),
         torch.cat(priors) if priors else None,
+        torch.cat(lights) if lights else None,
     )

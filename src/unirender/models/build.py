@@ -19,6 +19,7 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         "hdr_curves": HDR_CURVES,
         "environment_size": ENVIRONMENT_SIZE,
         "physics_prior": config.physics_prior,
+        "light": config.light,
     }
     conditioning = Conditioning.of(recorded, codec)
     extra_attributes, extra_image = conditioning.extra_channels

@@ -6,7 +6,9 @@ The attributes are six pictures in [-1, 1], the paper's layout with the HDR ligh
 
 Albedo is sRGB-encoded, normals enter as they are, s, d and the light through `log1p(k x) / log1p(k x_max)`, the image
 premultiplied and sRGB-encoded. Whatever else a stream sees (presence flags, mask, rays, prior) enters as *extra*
-channels, beside the latents. The torch twins of `unirender.color` stand here, held against it by a test.
+channels, beside the latents. A network may see a given light through an encoder of its own *instead* of as the sixth
+picture, which then holds noise in rendering; it predicts the light as that picture all the same. The torch twins of
+`unirender.color` stand here, held against it by a test.
 
 Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
 """
@@ -23,9 +25,12 @@ from unirender.camera import Camera
 from unirender.color import HdrCurve
 from unirender.errors import UnirenderError
 from unirender.models.codec import Codec
+from unirender.models.light_encoder import CHANNELS
 from unirender.models.priors import PRIORS, Maps, Prior
 
 TRIPLETS = ("material", "albedo", "normal", "specular", "diffuse", "environment")
+LIGHT = TRIPLETS.index("environment")
+LIGHTS = ("latent", "encoder")  # how a given light enters a network
 HDR_CURVES: dict[str, tuple[float, float]] = {
     "specular": (10.0, 20.0),
     "diffuse": (10.0, 2.0),
@@ -74,23 +79,29 @@ class Packing:
         material = torch.cat([maps["metallic"], maps["roughness"], maps["mask"]], dim=1)
         pictures = [2 * material - 1, 2 * srgb_encode(maps["albedo"]) - 1, maps["normal"]]
         pictures += [2 * curve_encode(self.curves[name], maps[name]) - 1 for name in ("specular", "diffuse")]
-        light = 2 * curve_encode(self.curves["environment"], maps["environment"]) - 1
-        return torch.cat([*pictures, self.spread(light, size)], dim=1)
+        return torch.cat([*pictures, self.spread(self.pack_light(maps["environment"]), size)], dim=1)
+
+    def pack_light(self, environment: Float[Tensor, "b 3 eh ew"]) -> Float[Tensor, "b 3 eh ew"]:
+        """The light in [-1, 1]."""
+        return 2 * curve_encode(self.curves["environment"], environment) - 1
+
+    def unpack_light(self, picture: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 eh ew"]:
+        """The sixth picture -> light in physical units, as `unpack` gives it."""
+        return self._hdr("environment", self.gather(picture))
 
     def unpack(self, pictures: Float[Tensor, "b 18 H W"]) -> Maps:
         """Six pictures -> maps in physical units, brought into their ranges; differentiable inside them."""
         material, albedo, normal, specular, diffuse, light = pictures.chunk(6, dim=1)
         metallic, roughness, mask = (0.5 * material + 0.5).clamp(0, 1).chunk(3, dim=1)
-        hdr = {"specular": specular, "diffuse": diffuse, "environment": self.gather(light)}
-        # exp(8) of a stray prediction is no light: twice the curve's range is far above any value it was taught
-        decoded = {name: curve_decode(self.curves[name], (0.5 * x + 0.5).clamp(0, 2)) for name, x in hdr.items()}
         return {
             "albedo": srgb_decode((0.5 * albedo + 0.5).clamp(0, 1)),
             "normal": normal,
             "roughness": roughness,
             "metallic": metallic,
             "mask": mask,
-            **decoded,
+            "specular": self._hdr("specular", specular),
+            "diffuse": self._hdr("diffuse", diffuse),
+            "environment": self.unpack_light(light),
         }
 
     def spread(self, light: Float[Tensor, "b 3 eh ew"], size: tuple[int, int]) -> Float[Tensor, "b 3 H W"]:
@@ -107,6 +118,10 @@ class Packing:
     def gather(self, picture: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 eh ew"]:
         """The mean over the pixels of each texel."""
         return F.adaptive_avg_pool2d(picture, self.environment_size)
+
+    def _hdr(self, name: str, x: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        # exp(8) of a stray prediction is no light: twice the curve's range is far above any value it was taught
+        return curve_decode(self.curves[name], (0.5 * x + 0.5).clamp(0, 2))
 
 
 def pack_image(image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 H W"]:
@@ -126,34 +141,57 @@ def prior_picture(prior: Prior, maps: Maps, mask: Float[Tensor, "b 1 H W"], came
 
 @dataclass(frozen=True)
 class Extras:
-    """Additional inputs of the streams, and the latents to which the image stream's output is added."""
+    """Additional inputs of the network.
+
+    Attributes:
+        attributes: of the attribute stream.
+        image: of the image stream.
+        prior: latents to which the image stream's output is added.
+        light: of the light's own encoder.
+    """
 
     attributes: Float[Tensor, "b ea h w"]
     image: Float[Tensor, "b ei h w"]
     prior: Float[Tensor, "b c h w"] | None
+    light: Float[Tensor, "b 4 eh ew"] | None
+
+    def to(self, like: Tensor) -> "Extras":
+        """In dtype and on the device of `like`, but for the prior: the sum keeps its precision."""
+        light = None if self.light is None else self.light.to(like)
+        return Extras(self.attributes.to(like), self.image.to(like), self.prior, light)
 
 
 @dataclass(frozen=True)
 class Conditioning:
-    """Everything between maps and a `DualStreamModel`."""
+    """Everything between maps and a `DualStreamModel`.
+
+    Attributes:
+        codec: pictures <-> latents.
+        packing: maps <-> pictures.
+        physics_prior: the closed-form image that the image stream corrects.
+        light_encoder: whether a given light enters by an encoder of its own, not as the sixth picture.
+    """
 
     codec: Codec
     packing: Packing
     physics_prior: Prior | None
+    light_encoder: bool
 
     @classmethod
     def of(cls, config: dict, codec: Codec) -> "Conditioning":
         """The conditioning that a model's config describes.
 
         Raises:
-            UnirenderError: an unknown physics prior.
+            UnirenderError: an unknown physics prior, or way of the light.
         """
         curves = {name: HdrCurve(*value) for name, value in (config["hdr_curves"] or HDR_CURVES).items()}
         packing = Packing(curves, tuple(config["environment_size"]))
         name = config["physics_prior"]
         if name != "none" and name not in PRIORS:
             raise UnirenderError(f"physics_prior: got {name!r}, expected 'none' or one of: {', '.join(PRIORS)}")
-        return cls(codec, packing, PRIORS.get(name))
+        if config["light"] not in LIGHTS:
+            raise UnirenderError(f"light: got {config['light']!r}, expected one of: {', '.join(LIGHTS)}")
+        return cls(codec, packing, PRIORS.get(name), config["light"] == "encoder")
 
     @property
     def attribute_channels(self) -> int:
@@ -176,6 +214,18 @@ class Conditioning:
         pictures = self.codec.decode(latents.reshape(-1, self.codec.channels, *latents.shape[-2:]))
         return self.packing.unpack(pictures.reshape(len(latents), -1, *pictures.shape[-2:]))
 
+    def decode_given(self, latents: Float[Tensor, "b nc h w"]) -> Maps | None:
+        """Of the maps that `extras` makes something of, those in clean latents; None: it needs none.
+
+        No more than that: an autoencoder decodes slowly.
+        """
+        if self.physics_prior:
+            return self.decode_attributes(latents)
+        if self.light_encoder:
+            light = latents.chunk(len(TRIPLETS), dim=1)[LIGHT]
+            return {"environment": self.packing.unpack_light(self.codec.decode(light))}
+        return None
+
     def encode_image(self, image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b c h w"]:
         """Premultiplied linear image -> latents of the image stream."""
         return self.codec.encode(pack_image(image_linear))
@@ -183,6 +233,12 @@ class Conditioning:
     def decode_image(self, latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3 H W"]:
         """Latents of the image stream -> premultiplied linear image in [0, 1]."""
         return unpack_image(self.codec.decode(latents))
+
+    def in_latents(self, given: Bool[Tensor, "b 6"]) -> Bool[Tensor, "b 6"]:
+        """Which pictures of a rendering's attribute latents hold what is given; the others hold noise."""
+        if not self.light_encoder:
+            return given
+        return given & (torch.arange(len(TRIPLETS), device=given.device) != LIGHT)
 
     def by_triplet(self, flags: Bool[Tensor, "b 6"]) -> Bool[Tensor, "b nc 1 1"]:
         """Flags of the six pictures -> flags of their latent channels."""
@@ -200,17 +256,19 @@ class Conditioning:
         Args:
             mask: coverage; always known.
             given: which of the six pictures are given clean as a condition (none in inverse rendering).
-            maps: the given maps, from which the physics prior is made where `given` has all that it needs.
+            maps: the given maps, from which the physics prior is made where `given` has all that it needs, and the
+                input of the light's encoder where the light is given.
             camera: gives the rays; the contract's default if None.
         """
+        light = self._light(given, maps, mask) if self.light_encoder else None
         spatial = F.pixel_unshuffle(mask, self.codec.factor)
         b, _, h, w = spatial.shape
         camera = camera or Camera()
         rays = torch.from_numpy(camera.rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
-        flags = given.to(mask)[..., None, None].expand(-1, -1, h, w)
+        flags = self.in_latents(given).to(mask)[..., None, None].expand(-1, -1, h, w)
         common = torch.cat([flags, spatial, rays.permute(2, 0, 1).expand(b, -1, -1, -1)], dim=1)
         if not self.physics_prior:
-            return Extras(common, common, None)
+            return Extras(common, common, None, light)
         known = given[:, [TRIPLETS.index(name) for name in self.physics_prior.triplets]].all(dim=1)
         if maps is None:
             if known.any():
@@ -222,4 +280,15 @@ class Conditioning:
                 * known.to(mask)[:, None, None, None]
             )
         flag = known.to(mask)[:, None, None, None].expand(-1, -1, h, w)
-        return Extras(common, torch.cat([common, prior, flag], dim=1), prior)
+        return Extras(common, torch.cat([common, prior, flag], dim=1), prior, light)
+
+    def _light(self, given: Bool[Tensor, "b 6"], maps: Maps | None, like: Tensor) -> Float[Tensor, "b 4 eh ew"]:
+        """What the light's encoder sees: the packed light and a flag; zeros for a light that is not given."""
+        known = given[:, LIGHT]
+        if maps is None:
+            if known.any():
+                raise ValueError("extras: the flags say that the light is given, but maps is None")
+            return like.new_zeros(len(given), CHANNELS, *self.packing.environment_size)
+        packed = self.packing.pack_light(maps["environment"])
+        flagged = torch.cat([packed, torch.ones_like(packed[:, :1])], dim=1)
+        return torch.where(known[:, None, None, None], flagged, 0)

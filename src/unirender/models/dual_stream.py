@@ -20,27 +20,48 @@ from diffusers.utils.outputs import BaseOutput
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from unirender.models.light_encoder import LightEncoder
+
 ALL_ROWS = slice(None)
 
 
 @dataclass
-class DualStreamOutput(BaseOutput):
-    """Predicted clean latents (x0) of both streams; of the rows asked for; None without any."""
-
-    attributes: Tensor | None = None
-    image: Tensor | None = None
-
-
-@dataclass
 class Encoded:
-    """What an encoder hands to the decoders: its feature pyramid (skips, then mid) and its time embedding."""
+    """What an encoder hands to the decoders.
+
+    Attributes:
+        features: its feature pyramid: skips, then mid.
+        time: its time embedding.
+        context: what its cross-attention saw: the prompt and, of a light with an encoder of its own, the tokens.
+    """
 
     features: tuple[Tensor, ...]
     time: Tensor
+    context: Tensor
 
-    def rows(self, rows: slice) -> "Encoded":
+    def __getitem__(self, rows: slice) -> "Encoded":
         """The same for some samples of the batch."""
-        return self if rows == ALL_ROWS else Encoded(tuple(f[rows] for f in self.features), self.time[rows])
+        if rows == ALL_ROWS:
+            return self
+        return Encoded(tuple(f[rows] for f in self.features), self.time[rows], self.context[rows])
+
+
+@dataclass
+class DualStreamOutput(BaseOutput):
+    """What was predicted, of the rows asked for, and from what; None without any.
+
+    Attributes:
+        attributes: clean latents (x0).
+        image: clean latents (x0).
+        encoded_attributes: the attribute stream as the image's decoder saw it. It may stand for the same latents at the
+            same timestep in another call.
+        encoded_image: the image stream as the attributes' decoder saw it.
+    """
+
+    attributes: Tensor | None = None
+    image: Tensor | None = None
+    encoded_attributes: Encoded | None = None
+    encoded_image: Encoded | None = None
 
 
 def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d:
@@ -92,6 +113,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
         hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
+        light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
     ):
         super().__init__()
         if not set(attention_levels) <= set(range(len(block_out_channels))):
@@ -114,18 +136,21 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         width = block_out_channels[0]
         self.attribute_extra = zero_conv(attribute_extra_channels, width, 3) if attribute_extra_channels else None
         self.image_extra = zero_conv(image_extra_channels, width, 3) if image_extra_channels else None
+        rows, columns = environment_size
+        self.light_encoder = LightEncoder((rows, columns), cross_attention_dim) if light == "encoder" else None
         self.register_buffer("prompt_embedding", torch.ones(1, prompt_tokens, cross_attention_dim))
         self.prompt_embedding: Tensor
 
     def forward(
         self,
-        attributes: Float[Tensor, "b ca h w"],
-        image: Float[Tensor, "b ci h w"],
+        attributes: Float[Tensor, "b ca h w"] | Encoded,
+        image: Float[Tensor, "b ci h w"] | Encoded,
         attributes_timestep: Int[Tensor, " b"],
         image_timestep: Int[Tensor, " b"],
         attribute_extra: Float[Tensor, "b ea h w"] | None = None,
         image_extra: Float[Tensor, "b ei h w"] | None = None,
         image_prior: Float[Tensor, "b ci h w"] | None = None,
+        light: Float[Tensor, "b 4 eh ew"] | None = None,
         attribute_rows: slice | None = ALL_ROWS,
         image_rows: slice | None = ALL_ROWS,
     ) -> DualStreamOutput:
@@ -133,34 +158,54 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         batch are decoded in a stream that are asked for there.
 
         Args:
-            attributes: Noised attribute latents at `attributes_timestep`.
-            image: Noised image latents at `image_timestep`.
+            attributes: Noised attribute latents at `attributes_timestep`; or what a call before made of these latents,
+                this timestep, these extra inputs and this light, which are then not looked at.
+            image: The same for the image.
             attributes_timestep: 0 (clean) .. T (pure noise), per sample.
             image_timestep: The same for the image.
             attribute_extra: Additional inputs of the attribute stream.
             image_extra: Additional inputs of the image stream.
             image_prior: Latents to which the image stream's output is added (the physics prior).
+            light: Input of the light's own encoder, for a network that has one.
             attribute_rows: Rows whose attributes are predicted; None: none.
             image_rows: Rows whose image is predicted; None: none.
         """
-        a = self.encode(self.attribute_unet, attributes, attributes_timestep, attribute_extra, self.attribute_extra)
-        i = self.encode(self.image_unet, image, image_timestep, image_extra, self.image_extra)
-        attributes_0 = image_0 = None
+        context = self.context(attributes, image, light)
+        a, i = attributes, image
+        if isinstance(a, Tensor):
+            a = self.encode(self.attribute_unet, a, attributes_timestep, context, attribute_extra, self.attribute_extra)
+        if isinstance(i, Tensor):
+            i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra)
+        output = DualStreamOutput()
         if attribute_rows is not None:
-            rows = attribute_rows
-            attributes_0 = self.decode(self.attribute_unet, a.rows(rows), i.rows(rows), self.image_to_attributes)
+            seen = output.encoded_image = i[attribute_rows]
+            output.attributes = self.decode(self.attribute_unet, a[attribute_rows], seen, self.image_to_attributes)
         if image_rows is not None:
-            rows = image_rows
-            image_0 = self.decode(self.image_unet, i.rows(rows), a.rows(rows), self.attributes_to_image)
+            seen = output.encoded_attributes = a[image_rows]
+            output.image = self.decode(self.image_unet, i[image_rows], seen, self.attributes_to_image)
             if image_prior is not None:
-                image_0 = image_0 + image_prior[rows]
-        return DualStreamOutput(attributes=attributes_0, image=image_0)
+                output.image = output.image + image_prior[image_rows]
+        return output
+
+    def context(
+        self, attributes: Tensor | Encoded, image: Tensor | Encoded, light: Float[Tensor, "b 4 eh ew"] | None
+    ) -> Float[Tensor, "b tokens width"]:
+        """What the cross-attention of both streams sees: the stored prompt, and the light through its own encoder."""
+        if isinstance(attributes, Encoded):
+            return attributes.context
+        if isinstance(image, Encoded):
+            return image.context
+        if (light is None) != (self.light_encoder is None):
+            raise ValueError(f"light {'missing' if light is None else 'given'}, but the model was built otherwise")
+        prompt = self.prompt_embedding.to(image.dtype).expand(len(image), -1, -1)
+        return prompt if self.light_encoder is None else torch.cat([prompt, self.light_encoder(light)], dim=1)
 
     def encode(
         self,
         unet: UNet2DConditionModel,
         sample: Tensor,
         timestep: Tensor,
+        context: Float[Tensor, "b tokens width"],
         extra: Tensor | None,
         adapter: nn.Module | None,
     ) -> Encoded:
@@ -173,30 +218,28 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         hidden = unet.conv_in(sample)
         if adapter is not None:
             hidden = hidden + adapter(extra)
-        prompt = self.prompt_embedding.to(sample.dtype).expand(len(sample), -1, -1)
         features = (hidden,)
         for block in unet.down_blocks:
-            context = {"encoder_hidden_states": prompt} if getattr(block, "has_cross_attention", False) else {}
-            hidden, skips = block(hidden_states=hidden, temb=time, **context)
+            seen = {"encoder_hidden_states": context} if getattr(block, "has_cross_attention", False) else {}
+            hidden, skips = block(hidden_states=hidden, temb=time, **seen)
             features += tuple(skips)
         assert unet.mid_block is not None
-        hidden = unet.mid_block(hidden, time, encoder_hidden_states=prompt)
-        return Encoded((*features, hidden), time)
+        hidden = unet.mid_block(hidden, time, encoder_hidden_states=context)
+        return Encoded((*features, hidden), time, context)
 
     def decode(self, unet: UNet2DConditionModel, own: Encoded, other: Encoded, bridge: nn.ModuleList) -> Tensor:
         """Runs one decoder on its own features plus the other stream's, brought over by zero convolutions."""
         fused = [mine + conv(theirs) for mine, theirs, conv in zip(own.features, other.features, bridge, strict=True)]
         hidden, skips = fused[-1], fused[:-1]
-        prompt = self.prompt_embedding.to(hidden.dtype).expand(len(hidden), -1, -1)
         for block in unet.up_blocks:
             resnets = block.resnets
             assert isinstance(resnets, nn.ModuleList)
             count = len(resnets)
             skips, taken = skips[:-count], tuple(skips[-count:])
-            context = {"encoder_hidden_states": prompt} if getattr(block, "has_cross_attention", False) else {}
+            seen = {"encoder_hidden_states": own.context} if getattr(block, "has_cross_attention", False) else {}
             size = skips[-1].shape[-2:] if skips else None
             hidden = block(
-                hidden_states=hidden, temb=own.time, res_hidden_states_tuple=taken, upsample_size=size, **context
+                hidden_states=hidden, temb=own.time, res_hidden_states_tuple=taken, upsample_size=size, **seen
             )
         if unet.conv_norm_out is not None and unet.conv_act is not None:
             hidden = unet.conv_act(unet.conv_norm_out(hidden))

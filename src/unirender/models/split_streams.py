@@ -14,7 +14,7 @@ from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from unirender.models.dual_stream import ALL_ROWS, DualStreamModel, DualStreamOutput
+from unirender.models.dual_stream import ALL_ROWS, DualStreamModel, DualStreamOutput, Encoded
 
 
 class SplitDualStreamModel(DualStreamModel):
@@ -31,20 +31,22 @@ class SplitDualStreamModel(DualStreamModel):
         remove_decoder(self.attribute_unet)
         self.inverse.attributes_to_image = nn.ModuleList()
         remove_decoder(self.inverse.image_unet)
+        self.inverse.light_encoder = None  # no light is given where it is asked for
 
     def forward(
         self,
-        attributes: Float[Tensor, "b ca h w"],
-        image: Float[Tensor, "b ci h w"],
+        attributes: Float[Tensor, "b ca h w"] | Encoded,
+        image: Float[Tensor, "b ci h w"] | Encoded,
         attributes_timestep: Int[Tensor, " b"],
         image_timestep: Int[Tensor, " b"],
         attribute_extra: Float[Tensor, "b ea h w"] | None = None,
         image_extra: Float[Tensor, "b ei h w"] | None = None,
         image_prior: Float[Tensor, "b ci h w"] | None = None,
+        light: Float[Tensor, "b 4 eh ew"] | None = None,
         attribute_rows: slice | None = ALL_ROWS,
         image_rows: slice | None = ALL_ROWS,
     ) -> DualStreamOutput:
-        """As `DualStreamModel.forward`: attributes by the one network, images by the other."""
+        """As `DualStreamModel.forward`: attributes by the one network, images by the other, which sees the light."""
         inputs = (attributes, image, attributes_timestep, image_timestep, attribute_extra, image_extra, image_prior)
 
         def rows_of(rows: slice) -> list[Any]:
@@ -52,9 +54,12 @@ class SplitDualStreamModel(DualStreamModel):
 
         found = DualStreamOutput()
         if attribute_rows is not None:
-            found.attributes = self.inverse(*rows_of(attribute_rows), image_rows=None).attributes
+            inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
+            found.attributes, found.encoded_image = inverse.attributes, inverse.encoded_image
         if image_rows is not None:
-            found.image = super().forward(*rows_of(image_rows), attribute_rows=None).image
+            lit = None if light is None else light[image_rows]
+            rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)
+            found.image, found.encoded_attributes = rendered.image, rendered.encoded_attributes
         return found
 
 

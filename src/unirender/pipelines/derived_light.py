@@ -29,7 +29,7 @@ MANY_PIXELS = 500_000  # lit one by one they take about a minute
 
 logger = logging.getLogger(__name__)
 
-Light = Callable[[Intrinsics], Float[np.ndarray, "h w 3"]]
+Light = Callable[[Intrinsics, Bool[np.ndarray, "h w"] | None], Float[np.ndarray, "h w 3"]]  # of pixels, None: all
 
 
 def derived_diffuse(intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
@@ -41,8 +41,9 @@ def derived_diffuse(intrinsics: Intrinsics, environment: Float[np.ndarray, "eh e
     """
     surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
 
-    def light(surface: Intrinsics) -> Float[np.ndarray, "h w 3"]:
-        return diffuse_light(surface.require("normal")["normal"], environment)
+    def light(surface: Intrinsics, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, "h w 3"]:
+        normal = surface.require("normal")["normal"]
+        return diffuse_light(normal if where is None else normal * where[..., None], environment)
 
     return _lit(surface, light)
 
@@ -60,9 +61,9 @@ def derived_specular(
     maps = intrinsics.require("normal", "roughness", "mask")
     surface = Intrinsics(**maps, camera=intrinsics.camera)
 
-    def light(surface: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+    def light(surface: Intrinsics, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, "h w 3"]:
         maps = surface.require("normal", "roughness")
-        return specular_light(maps["normal"], maps["roughness"], environment, surface.camera)
+        return specular_light(maps["normal"], maps["roughness"], environment, surface.camera, where)
 
     sharp = (maps["roughness"][..., 0] < MIRROR_ROUGHNESS) & (mirrors and environment.shape[0] > COARSE_ROWS)
     return _lit(surface, light, sharp)
@@ -71,7 +72,7 @@ def derived_specular(
 def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | bool = False) -> np.ndarray:
     """`light` of a surface `[h w 3]`; `sharp`: pixels whose light the small size does not show."""
     if max(surface.height, surface.width) <= LIGHT_SIDE:
-        return light(surface)
+        return light(surface, None)
     normal, mask = surface.require("normal", "mask").values()
     frame = Frame(surface.height, surface.width, LIGHT_SIDE)
     small = frame.enter_intrinsics(surface)
@@ -81,10 +82,10 @@ def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | boo
     if surface.roughness is not None:
         exact |= (np.abs(maps["roughness"] - surface.roughness) > ROUGHNESS_DETAIL)[..., 0]
     seen = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
-    exact = (exact & seen)[..., None]
-    interpolated = np.where(seen[..., None], frame.leave_map(light(small), mask), 0)
+    exact &= seen
+    interpolated = np.where(seen[..., None], frame.leave_map(light(small, None), mask), 0)
     if not exact.any():
         return interpolated
     if (count := int(exact.sum())) > MANY_PIXELS:
         logger.warning("the light of %d pixels with fine detail is derived one by one, which takes minutes", count)
-    return np.where(exact, light(surface.replace(normal=np.where(exact, normal, 0))), interpolated)
+    return np.where(exact[..., None], light(surface, exact), interpolated)

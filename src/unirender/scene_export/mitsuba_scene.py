@@ -1,9 +1,9 @@
 """The card for Mitsuba 3: `mi.load_file("scene.xml")` is the picture's object under its predicted light.
 
 Its shading normals are those of the vertices of a grid, not a normal map's. Mitsuba drops the light of a normal map
-that comes from behind the surface that carries it; of a card that would be half of all light at the object's rim
-(measured on a ball under a light from all sides: 17 % of the image, against 1 %). The integrator is `volpath`, which
-hides the light behind pixels that are covered in part; `path` lets it shine through there, against `hide_emitters`.
+that comes from behind the surface that carries it; of a card that would be half of all light at the object's rim. The
+integrator is `volpath`, which hides the light behind pixels that are covered in part; `path` lets it shine through
+there, against `hide_emitters`.
 """
 
 from pathlib import Path

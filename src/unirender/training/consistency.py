@@ -109,10 +109,11 @@ class Consistency:
     def _rendered(
         self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
     ) -> Float[Tensor, ""]:
-        # maps are made of latents only where a prior is made of maps: a KL codec decodes slowly
-        maps = self.conditioning.decode_attributes(attributes) if self.conditioning.physics_prior else None
         given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
-        extras = self.conditioning.extras(mask, given, maps)
+        extras = self.conditioning.extras(mask, given, self.conditioning.decode_given(attributes))
+        if self.conditioning.light_encoder:  # the predicted light is seen by its own encoder alone
+            shown = self.conditioning.by_triplet(self.conditioning.in_latents(given))
+            attributes = torch.where(shown, attributes, noise_like(attributes, generator))
         t = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)
         timesteps = Timesteps(torch.zeros_like(t), t)
         output = predict(self.model, attributes, noise_like(clean_i, generator), timesteps, extras, None, ALL)

@@ -1,4 +1,4 @@
-"""Training samples and batches from the group shards of a data folder.
+"""Training samples from the group shards of a data folder.
 
 Sample i of an endless stream is a pure function of (folder, seed, i): epoch and place follow from i, each epoch is a
 permutation of the folder's items, and the augmentation is drawn from (seed, i). An exact resume therefore starts at
@@ -8,9 +8,7 @@ time, or one pair of any other group.
 
 import functools
 import hashlib
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -193,58 +191,6 @@ def make_batch(
     return batch
 
 
-def iterate_batches(
-    folder: str | Path | GroupDataset,
-    batch_size: int,
-    seed: int,
-    start_sample: int = 0,
-    workers: int = 1,
-    augmentation: Augmentation = DEFAULT_AUGMENTATION,
-    rows: slice = ALL_ROWS,
-) -> Iterator[Batch]:
-    """Endless batches; the k-th holds samples `start_sample + k * batch_size` onwards.
-
-    Args:
-        folder: a data folder, or an opened one.
-        batch_size: samples per batch; batches run across the end of an epoch.
-        seed: of the order and of the augmentations.
-        start_sample: samples consumed before; an interrupted run continues exactly where it was.
-        workers: background threads that prepare batches ahead, one each; 0: prepare when asked. It changes no value.
-        augmentation: what is drawn; `NO_AUGMENTATION` for pictures as they are stored.
-        rows: of each batch; the others are not read.
-
-    Yields:
-        image (linear, premultiplied), albedo, normal, specular, diffuse `[b 3 h w]` (linear, not premultiplied),
-        roughness, metallic, mask `[b 1 h w]`, environment `[b 3 16 32]`; float32.
-    """
-    if batch_size < 1 or start_sample < 0 or workers < 0:
-        raise UnirenderError(
-            f"batches: got batch_size {batch_size}, start_sample {start_sample}, workers {workers}; "
-            "expected at least 1, 0 and 0"
-        )
-    dataset = folder if isinstance(folder, GroupDataset) else GroupDataset(folder)
-    return _batches(dataset, batch_size, seed, start_sample, workers, augmentation, rows)
-
-
-def _batches(
-    dataset: GroupDataset, size: int, seed: int, first: int, workers: int, augmentation: Augmentation, rows: slice
-) -> Iterator[Batch]:
-    if workers == 0:
-        while True:
-            yield make_batch(dataset, first, size, seed, augmentation, rows)
-            first += size
-    executor = ThreadPoolExecutor(max_workers=workers, thread_name_prefix="unirender-data")
-    pending: deque[Future[Batch]] = deque()
-    try:
-        while True:
-            while len(pending) <= workers:  # one ready beside each in the making
-                pending.append(executor.submit(make_batch, dataset, first, size, seed, augmentation, rows))
-                first += size
-            yield pending.popleft().result()
-    finally:
-        executor.shutdown(wait=True, cancel_futures=True)
-
-
 def _basis(group: Group) -> _Basis:
     """Sorts a basis group's pairs into its grid.
 
@@ -291,4 +237,4 @@ def _with_material(maps: Maps, metallic: float | None, roughness: float | None) 
     return maps | {"metallic": inside * np.float32(metallic), "roughness": inside * np.float32(roughness)}
 
 
-__all__ = ["NO_AUGMENTATION", "Augmentation", "Batch", "GroupDataset", "iterate_batches", "make_batch"]
+__all__ = ["DEFAULT_AUGMENTATION", "NO_AUGMENTATION", "Augmentation", "Batch", "GroupDataset", "make_batch"]

@@ -16,9 +16,9 @@ class Ema:
     def update(self, model: nn.Module) -> None:
         """Moves the average towards the model's weights."""
         decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
-        weights = [p.detach() for _, p in model.named_parameters()]
-        for average, weight in zip(self.average.values(), weights, strict=True):
-            average.lerp_(weight, 1 - decay)
+        torch._foreach_lerp_(  # pyright: ignore[reportPrivateImportUsage] - torch.optim is built on it
+            list(self.average.values()), list(model.parameters()), 1 - decay
+        )
         self.updates += 1
 
     @torch.no_grad()

@@ -37,6 +37,7 @@ def predict(
         extras.attributes,
         extras.image,
         image_prior=extras.prior,
+        light=extras.light,
         attribute_rows=rows_a,
         image_rows=rows_i,
     )

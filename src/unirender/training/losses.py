@@ -57,7 +57,7 @@ class LossFunction:
         clean_a, clean_i = self._encode(batch)
         noisy_a, noisy_i = (t.cpu() > 0 for t in (timesteps.attributes, timesteps.image))  # a GPU is waited for once
         given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
-        known = self.conditioning.by_triplet(given | noisy_a[:, None]).to(clean_a.device)
+        known = self.conditioning.by_triplet(self.conditioning.in_latents(given) | noisy_a[:, None]).to(clean_a.device)
         given = given.to(clean_a.device)
         noise_a = noise_like(clean_a, generator)
         attributes = torch.where(known, add_noise(self.scheduler, clean_a, noise_a, timesteps.attributes), noise_a)

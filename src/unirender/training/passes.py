@@ -152,11 +152,11 @@ class BatchGradient:
         for first in range(0, len(parts), self.split.at_once):
             some = parts[first : first + self.split.at_once]
             for more, terms in self.pool.map(run, some) if self.pool else map(run, some):
-                gradients = [_plus(a, b) for a, b in zip(gradients, more, strict=True)]
+                gradients = _plus(gradients, more)
                 values.append(terms)
         gradients = self._over_processes(parameters, gradients)
         for p, gradient in zip(parameters, gradients, strict=True):
-            p.grad = gradient
+            p.grad = None if gradient is None else laid_out_like(p, gradient)
         return _sum(self.split.processes.gather(_sum(values)))
 
     def parts(self, batch: Maps) -> list[Part]:
@@ -223,11 +223,23 @@ def kind_of(term: str) -> str:
     return term if term in OWN_ROWS else "attributes"
 
 
-def _plus(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+def _plus(a: Sequence[Tensor | None], b: Sequence[Tensor | None]) -> Gradients:
     """Not in place: autograd may give two parameters one tensor."""
-    if a is None or b is None:
-        return b if a is None else a
-    return a + b
+    both = [(x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None]
+    sums = iter(
+        torch._foreach_add(  # pyright: ignore[reportPrivateImportUsage] - torch.optim is built on it
+            [x for x, _ in both], [y for _, y in both]
+        )
+        if both
+        else ()
+    )
+    return [y if x is None else x if y is None else next(sums) for x, y in zip(a, b, strict=True)]
+
+
+def laid_out_like(p: Tensor, values: Tensor) -> Tensor:
+    """A gradient, or a moment of it, with its values in memory as the parameter's: on a CPU the fused optimiser goes
+    through all of them side by side without looking at strides."""
+    return values if values.stride() == p.stride() else torch.empty_like(p).copy_(values)
 
 
 def _sum(terms: Iterable[ByName]) -> ByName:

@@ -29,6 +29,8 @@ class ModelConfig:
     linear_projection: bool = False  # attention's projections are linear layers, not 1x1 convolutions
     # the closed-form image to which the image stream adds what it leaves out
     physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
+    # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
+    light: Literal["latent", "encoder"] = "latent"
     unified: bool = True  # False: a network for each direction, and the widths are those of each
 
 
@@ -142,6 +144,7 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny": _TINY,
     "tiny_plain": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="none")),
     "tiny_composite": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="composite")),
+    "tiny_light_encoder": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, light="encoder")),
     "tiny_without_cycle": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle=0.0)),
     "tiny_cycle_into_renderer": dataclasses.replace(
         _TINY, loss=dataclasses.replace(_TINY.loss, cycle_into_renderer=True)

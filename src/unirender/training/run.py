@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, DType, usage
 from unirender.paths import cache_dir
+from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 
 if TYPE_CHECKING:
@@ -113,6 +114,8 @@ class Train:
                     "and the light's texels cover whole pixels"
                 )
             config = dataclasses.replace(config, model=dataclasses.replace(config.model, resolution=self.resolution))
+        with usage():
+            check_config(config)
         self._check_start(config)
         return config
 

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from unirender.training.checkpoint import replace_text
 from unirender.training.live import Report
 from unirender.training.processes import Processes
 
@@ -52,6 +53,4 @@ class RunLog:
             return
         lines = self.path.read_text().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
-        partial = self.path.with_name(f"{self.path.name}.partial")
-        partial.write_text("".join(kept))
-        partial.replace(self.path)
+        replace_text(self.path, "".join(kept))

@@ -1,14 +1,14 @@
 """Where a training run's batches come from, and how it remembers where it was."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from unirender.errors import UnirenderError
 from unirender.training.augment import DEFAULT_AUGMENTATION
 from unirender.training.contrasts import ContrastDataset
-from unirender.training.data import ALL_ROWS, Batch, GroupDataset, iterate_batches
+from unirender.training.data import ALL_ROWS, Batch, GroupDataset
 from unirender.training.presets import Augmentation
+from unirender.training.reader import BatchReader
 
 
 @runtime_checkable
@@ -17,6 +17,10 @@ class BatchSource(Protocol):
 
     def next(self) -> Batch:
         """The next batch: of several processes, the rows `Split.own` of it."""
+        ...
+
+    def read_ahead(self) -> None:
+        """Makes use of idle cores for the batches to come; returns at once."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -72,15 +76,19 @@ class ShardSource:
         self.augmentation, self.size, self.rows, self.group_size = augmentation, size, rows, group_size
         self.consumed = 0  # samples, over all processes
         self.dataset: GroupDataset | None = None
-        self._batches: Iterator[Batch] | None = None
+        self._batches: BatchReader | None = None
 
     def next(self) -> Batch:
         if self._batches is None:
-            self._batches = iterate_batches(
+            self._batches = BatchReader(
                 self.open(), self.batch_size, self.seed, self.consumed, self.workers, self.augmentation, self.rows
             )
         self.consumed += self.batch_size
         return next(self._batches)
+
+    def read_ahead(self) -> None:
+        if self._batches is not None:
+            self._batches.read_ahead()
 
     def open(self) -> GroupDataset:
         """Opens the folder, unless it is open.
@@ -140,5 +148,5 @@ class ShardSource:
     def close(self) -> None:
         """Stops the background threads."""
         if self._batches is not None:
-            self._batches.close()  # pyright: ignore[reportAttributeAccessIssue] - the reader's iterators are generators
+            self._batches.close()
         self._batches, self.dataset = None, None

@@ -4,17 +4,24 @@ A state in the run's folder goes before all of them.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 
 from unirender.errors import UnirenderError
+from unirender.models.build import restart_from_prior
+from unirender.models.dual_stream import DualStreamModel
+from unirender.models.split_streams import SplitDualStreamModel
 from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
+
+_KINDS = {True: "one network for both directions (unified)", False: "a network for each direction (unified=False)"}
 
 
 @dataclass(frozen=True)
@@ -44,9 +51,9 @@ class Start:
             UnirenderError: its network is another one.
         """
         if self.diffusion is not None:
-            trainer.start_from_diffusion(self.diffusion)
+            begin_with_diffusion(trainer, self.diffusion)
         elif self.pipeline is not None and self.folder is not None:
-            trainer.start_from(self.pipeline.dual_stream, read_history(self.folder))
+            begin_with_network(trainer, self.pipeline.dual_stream, read_history(self.folder))
 
 
 def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | None = None) -> Start:
@@ -73,4 +80,48 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
             f"{init}: its network has the codec {codec}, expected {config.codec}; choose the preset that the weights "
             "were trained with"
         )
+    unified = not isinstance(pipeline.dual_stream, SplitDualStreamModel)
+    if unified != config.unified:
+        raise UnirenderError(
+            f"{init}: its weights are those of {_KINDS[unified]}, expected {_KINDS[config.unified]}; choose the preset "
+            "that the weights were trained with, or begin without --init"
+        )
     return Start(init, pipeline)
+
+
+def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:
+    """Gives a trainer, and its average, the weights of another network.
+
+    With another physics prior than the network's the image stream's last convolution starts at zero again.
+
+    Args:
+        trainer: that has not begun.
+        network: of the same shape.
+        history: what `unirender.training.export.read_history` says of it.
+
+    Raises:
+        UnirenderError: the networks differ.
+    """
+    model = trainer.model
+    own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
+    curves = [m.config["hdr_curves"] for m in (model, network)]
+    if own != other or {k: tuple(v) for k, v in curves[0].items()} != {k: tuple(v) for k, v in curves[1].items()}:
+        differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
+        raise UnirenderError(
+            f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
+            "expected the same network; choose the preset that the weights were trained with"
+        )
+    model.load_state_dict(network.state_dict())
+    if network.config["physics_prior"] != model.config["physics_prior"]:
+        restart_from_prior(model)  # what it added to the other closed form is no correction of this one
+    trainer.begin_anew(history)
+
+
+def begin_with_diffusion(trainer: Trainer, weights: StableDiffusion) -> None:
+    """Gives a trainer, and its average, Stable Diffusion's weights.
+
+    Raises:
+        UnirenderError: the trainer's network is of another shape.
+    """
+    weights.initialise(trainer.model)
+    trainer.begin_anew([{"stable_diffusion": weights.folder.resolve().name}])

@@ -37,12 +37,13 @@ def check_trackers(names: Sequence[str]) -> None:
     Raises:
         UsageError: one is unknown or not installed.
     """
-    known = known_trackers()
+    usable = known_trackers()
     for name in names:
-        if name not in known:
-            why = "not installed here" if name in LOGGER_TYPE_TO_CLASS else "no tracker that accelerate knows"
-            expected = f"expected {' or '.join(known)}" if known else "and no other is either: pip install tensorboard"
-            raise UsageError(f"--track {name}: {why}, {expected}")
+        if name not in usable:
+            if name in LOGGER_TYPE_TO_CLASS:  # all of them have the name of their package
+                raise UsageError(f"--track {name}: not installed here; pip install {name}")
+            expected = ", ".join(sorted(LOGGER_TYPE_TO_CLASS))
+            raise UsageError(f"--track {name}: no tracker that accelerate knows, expected one of {expected}")
 
 
 def make_trackers(names: Sequence[str], run_folder: Path) -> tuple[GeneralTracker, ...]:

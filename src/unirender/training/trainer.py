@@ -14,7 +14,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,14 @@ from torch import nn
 
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
-from unirender.models.build import build_model, restart_from_prior
-from unirender.models.dual_stream import DualStreamModel
+from unirender.models.build import build_model
 from unirender.models.priors import Maps
-from unirender.models.stable_diffusion import StableDiffusion
-from unirender.training.checkpoint import differences, load_state, plain, save_state
+from unirender.training.checkpoint import differences, load_state, plain, replace_text, save_state
+from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report
 from unirender.training.losses import LossFunction
-from unirender.training.passes import BatchGradient, Split
+from unirender.training.passes import BatchGradient, Split, laid_out_like
 from unirender.training.pictures import save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
@@ -80,6 +79,7 @@ class Trainer:
     ) -> None:
         if run.steps is None and run.minutes is None:
             raise UnirenderError("training: no length given, expected steps or minutes (or both)")
+        check_config(config)
         self.config, self.run, self.device, self.dtype, self.processes = config, run, device, dtype, processes
         self.split = Split(config.batch_size, processes, run.parallel, run.accumulate)
         torch.manual_seed(config.seed)  # initial weights; everything later draws from self.generator
@@ -95,8 +95,9 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(config.seed)
         self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
         o = config.optimizer
+        # fused: one pass over the weights instead of ten; a state from before keeps the way it was made with
         self.optimizer = torch.optim.AdamW(
-            self.model.parameters(), o.learning_rate, betas=(o.beta1, o.beta2), weight_decay=o.weight_decay
+            self.model.parameters(), o.learning_rate, (o.beta1, o.beta2), weight_decay=o.weight_decay, fused=True
         )
         self.ema = Ema(self.model, o.ema_decay)
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
@@ -113,50 +114,23 @@ class Trainer:
         by_clock = self.seconds / (60 * self.run.minutes) if self.run.minutes else 0.0
         return max(by_steps, by_clock)
 
-    def start_from(self, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:
-        """Begins with the weights of another network, the average too. A state in the run's folder goes before.
-
-        With another physics prior than the network's the image stream's last convolution starts at zero again.
-
-        Args:
-            network: of the same shape.
-            history: what `unirender.training.export.read_history` says of it.
-
-        Raises:
-            UnirenderError: the networks differ.
-        """
-        own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (self.model, network))
-        curves = [m.config["hdr_curves"] for m in (self.model, network)]
-        if own != other or {k: tuple(v) for k, v in curves[0].items()} != {k: tuple(v) for k, v in curves[1].items()}:
-            differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
-            raise UnirenderError(
-                f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
-                "expected the same network; choose the preset that the weights were trained with"
-            )
-        self.model.load_state_dict(network.state_dict())
-        if network.config["physics_prior"] != self.model.config["physics_prior"]:
-            restart_from_prior(self.model)  # what it added to the other closed form is no correction of this one
+    def begin_anew(self, continues: Sequence[dict[str, Any]]) -> None:
+        """Begins with the weights that the model has now; `continues`: the runs that they come from."""
         self.ema = Ema(self.model, self.config.optimizer.ema_decay)
-        self.continues = list(history)
+        self.continues = list(continues)
 
-    def start_from_diffusion(self, weights: StableDiffusion) -> None:
-        """Begins with Stable Diffusion's weights, the average too. A state in the run's folder goes before.
+    def train_step(self, batch: Maps, when_idle: Callable[[], None] = lambda: None) -> dict[str, float]:
+        """One optimiser step, on this process's rows of a batch; returns the loss terms of the whole batch.
 
-        Raises:
-            UnirenderError: the network is of another shape.
+        `when_idle` is called after the passes, when a CPU has one busy core left; it returns at once.
         """
-        weights.initialise(self.model)
-        self.ema = Ema(self.model, self.config.optimizer.ema_decay)
-        self.continues = [{"stable_diffusion": weights.folder.resolve().name}]
-
-    def train_step(self, batch: Maps) -> dict[str, float]:
-        """One optimiser step, on this process's rows of a batch; returns the loss terms of the whole batch."""
         batch = {name: value.to(self.device) for name, value in batch.items()}
         rate = learning_rate(self.config.optimizer, self.step, self.progress)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.loss.cycle_scale = float(self.progress >= self.config.loss.cycle_warmup)
         terms = self.gradient(batch)
+        when_idle()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.optimizer.clip_norm)
         if not torch.isfinite(norm):
             raise UnirenderError(
@@ -204,7 +178,7 @@ class Trainer:
             clock["step"] = time.monotonic()  # pictures, validation and saves are no training
             batch = source.next()
             fixed = batch if fixed is None else fixed
-            self.log.add(self.train_step(batch) | self.overflow(batch))
+            self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
             now = time.monotonic()
             self.seconds, refreshing = self.processes.share(
                 (self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes))
@@ -314,6 +288,9 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.ema.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
+        for p, moments in self.optimizer.state.items():
+            same_shape = {name: value for name, value in moments.items() if value.shape == p.shape}
+            moments.update({name: laid_out_like(p, value) for name, value in same_shape.items()})
         self.generator.set_state(state["generator"])
         self.log.waiting.update(state.get("unlogged", {}))
         source.load_state_dict(state["source"])
@@ -331,5 +308,4 @@ class Trainer:
             return
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        self.run.out.mkdir(parents=True, exist_ok=True)
-        (self.run.out / "config.json").write_text(text + "\n")
+        replace_text(self.run.out / "config.json", text + "\n")

@@ -1,0 +1,157 @@
+"""Copies the tables and plots of studies into the documentation, so that no number is typed.
+
+    python -m unirender_evaluation.docs_tables results/speed results/sampling [--docs docs] [--check]
+
+Each folder is one that a study's command wrote. A page of the documentation includes a study's tables from a file of
+their own, whose name begins with an underscore; plots go to `_static/`. `--check` writes nothing and says what differs.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.optimiser_study import write_files
+
+PLOT_FOLDER = "_static"
+HEADING = "### "  # of a table: pages include it below a heading of the second level
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A picture that a study writes beside its tables.
+
+    Attributes:
+        file: its name, in the study's folder and in the documentation.
+        alt: what it shows, for who cannot see it.
+        caption: below it.
+    """
+
+    file: str
+    alt: str
+    caption: str
+
+    def markdown(self) -> str:
+        """The picture as a page of the documentation shows it."""
+        return f"```{{figure}} {PLOT_FOLDER}/{self.file}\n:alt: {self.alt}\n{self.caption}\n```\n"
+
+
+@dataclass(frozen=True)
+class Study:
+    """A study whose results the documentation shows.
+
+    Attributes:
+        tables: file of its tables, in the folder that it writes; no two studies have the same.
+        piece: file of the documentation that a page includes.
+        plots: below the tables.
+    """
+
+    tables: str
+    piece: str
+    plots: tuple[Plot, ...] = ()
+
+
+STUDIES = (
+    Study("speed.md", "_speed.md"),
+    Study(
+        "sampling.md",
+        "_sampling.md",
+        (
+            Plot(
+                "sampling.png",
+                "PSNR of albedo and of the render over steps, a line for each number of samples",
+                "PSNR against steps; the dashed level is mode `mean`.",
+            ),
+            Plot(
+                "calibration.png",
+                "error over spread by map, on logarithmic axes",
+                "Error of the samples' mean against their spread, in each map's own units; on the dashed line the "
+                "spread is the error.",
+            ),
+        ),
+    ),
+    Study("derived_light.md", "_derived_light.md"),
+    Study("training.md", "_training_choices.md"),
+    Study("ingredients.md", "_optimization_ingredients.md"),
+    Study("race.md", "_optimization_race.md"),
+    Study("unknown_mesh.md", "_optimization_unknown_mesh.md"),
+    Study("warm_start.md", "_optimization_warm_start.md"),
+)
+
+
+def study_of(folder: Path) -> Study:
+    """The study that wrote a folder, by the file of its tables.
+
+    Raises:
+        UnirenderError: the tables of none, or of several, are there.
+    """
+    found = [study for study in STUDIES if (folder / study.tables).is_file()]
+    if len(found) != 1:
+        got = " and ".join(study.tables for study in found) or "none of them"
+        expected = ", ".join(study.tables for study in STUDIES)
+        raise UnirenderError(f"{folder}: got {got}, expected a study's folder, with one of {expected}")
+    return found[0]
+
+
+def pieces(folder: Path) -> dict[str, str | bytes]:
+    """What the documentation shows of a study: path below the documentation's folder -> content.
+
+    Raises:
+        UnirenderError: the folder is no study's, its tables are none, or a plot is missing.
+    """
+    study = study_of(folder)
+    text = (folder / study.tables).read_text(encoding="utf-8")
+    if not text.startswith(HEADING):
+        raise UnirenderError(
+            f"{folder / study.tables}: got {text[:40]!r}, expected a table below a heading {HEADING!r}; "
+            "run the study again"
+        )
+    found: dict[str, str | bytes] = {study.piece: "\n".join([text, *(plot.markdown() for plot in study.plots)])}
+    for plot in study.plots:
+        path = folder / plot.file
+        if not path.is_file():
+            raise UnirenderError(f"{path}: no such file, expected the study's plot; run the study again")
+        found[f"{PLOT_FOLDER}/{plot.file}"] = path.read_bytes()
+    return found
+
+
+def differing(docs: Path, content: dict[str, str | bytes]) -> list[str]:
+    """The paths below the documentation's folder that are missing there or have other content."""
+
+    def stored(name: str) -> bytes | None:
+        return (docs / name).read_bytes() if (docs / name).is_file() else None
+
+    return [name for name, new in content.items() if stored(name) != (new if isinstance(new, bytes) else new.encode())]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; 0, or 1 with a line on standard error for whatever is wrong or differs."""
+    parser = argparse.ArgumentParser(
+        prog="python -m unirender_evaluation.docs_tables",
+        description="Copies the tables and plots of studies into the documentation.",
+    )
+    parser.add_argument("folders", type=Path, nargs="+", help="that `unirender bench speed` and the others wrote")
+    parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the documentation's sources")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if anything differs")
+    arguments = parser.parse_args(argv)
+    try:
+        content = {name: value for folder in arguments.folders for name, value in pieces(folder).items()}
+        changed = differing(arguments.docs, content)
+        if arguments.check:
+            for name in changed:
+                print(f"{arguments.docs / name}: not what the study wrote", file=sys.stderr)
+            return int(bool(changed))
+        for name in changed:
+            path = arguments.docs / name
+            write_files(path.parent, {path.name: content[name]})
+            print(path)
+    except (UnirenderError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Tables and plots of studies reach the documentation from the folders that the studies wrote, never by hand."""
+
+import re
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from unirender_evaluation import (
+    derived_light_study_run,
+    sampling_study_run,
+    speed_study_run,
+    training_study_run,
+    unknown_mesh_run,
+    warm_start_run,
+)
+from unirender_evaluation.docs_tables import HEADING, STUDIES, main
+from unirender_evaluation.speed_study import Part
+from unirender_evaluation.table_text import TextTable
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PIECES = [study.piece for study in STUDIES]
+PENDING = "Not measured yet with this version: run `unirender bench "
+TABLE = TextTable("Milliseconds", ("part", "ms"), ((("decompose", "12.5"),),))
+
+
+def speed(folder: Path) -> Path:
+    """A folder as `unirender bench speed` writes it."""
+    part = Part("network", (TABLE,), {"ms": 12.5})
+    with (folder.parent / "console.txt").open("w") as out:
+        speed_study_run.run(folder, {"network": lambda: part}, (("cores", "2"),), Console(file=out))
+    return folder
+
+
+def sampling(folder: Path) -> Path:
+    """A folder with the files of `unirender bench sampling`."""
+    folder.mkdir()
+    (folder / f"{sampling_study_run.NAME}.md").write_text(TABLE.markdown())
+    for number, name in enumerate((sampling_study_run.STEPS_PLOT, sampling_study_run.RELIABILITY_PLOT)):
+        (folder / name).write_bytes(bytes([137, number]))
+    return folder
+
+
+@pytest.fixture
+def docs(tmp_path: Path) -> Path:
+    """Sources of a documentation that shows nothing yet."""
+    (tmp_path / "docs" / "_static").mkdir(parents=True)
+    return tmp_path / "docs"
+
+
+def test_what_a_study_wrote_is_what_a_page_includes(tmp_path: Path, docs: Path) -> None:
+    folders = [str(speed(tmp_path / "speed")), str(sampling(tmp_path / "sampling"))]
+    assert main([*folders, "--docs", str(docs)]) == 0
+    assert (docs / "_speed.md").read_text() == (tmp_path / "speed" / "speed.md").read_text()
+    shown = (docs / "_sampling.md").read_text()
+    assert shown.startswith(TABLE.markdown())
+    assert re.findall(r"^```\{figure\} (\S+)$", shown, re.MULTILINE) == [
+        "_static/sampling.png",
+        "_static/calibration.png",
+    ]
+    assert (docs / "_static" / "calibration.png").read_bytes() == bytes([137, 1])
+    assert main([*folders, "--docs", str(docs), "--check"]) == 0
+
+
+@pytest.mark.parametrize("stale", ["_speed.md", "_sampling.md", "_static/sampling.png"])
+def test_a_check_finds_what_is_not_what_the_study_wrote(
+    tmp_path: Path, docs: Path, stale: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(speed(tmp_path / "speed")), str(sampling(tmp_path / "sampling")), "--docs", str(docs)]
+    assert main(arguments) == 0
+    (docs / stale).write_text("### A number that was typed\n")
+    capsys.readouterr()
+    assert main([*arguments, "--check"]) == 1
+    assert capsys.readouterr().err == f"{docs / stale}: not what the study wrote\n"
+    assert (docs / stale).read_text() == "### A number that was typed\n", "a check writes nothing"
+    assert main(arguments) == 0
+    assert capsys.readouterr().out == f"{docs / stale}\n", "and what was right is not written again"
+
+
+def test_what_is_no_studys_folder_is_refused_and_nothing_is_written(
+    tmp_path: Path, docs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, other = speed(tmp_path / "speed"), tmp_path / "other"
+    other.mkdir()
+    arguments = [str(good), str(other), "--docs", str(docs)]
+
+    def refused() -> str:
+        assert main(arguments) == 1
+        assert not list(docs.glob("_*.md"))
+        return capsys.readouterr().err
+
+    assert "got none of them, expected a study's folder, with one of speed.md, " in refused()
+    (other / "sampling.md").write_text(TABLE.markdown())
+    assert "sampling.png: no such file" in refused()
+    (other / "sampling.md").write_text("no table")
+    assert "got 'no table', expected a table" in refused()
+    (other / "race.md").write_text(TABLE.markdown())
+    assert "got sampling.md and race.md, expected" in refused()
+
+
+def test_the_names_are_those_that_the_studies_write() -> None:
+    """Of those that keep their name in one place."""
+    named = (derived_light_study_run, sampling_study_run, speed_study_run, training_study_run, unknown_mesh_run)
+    assert {f"{module.NAME}.md" for module in (*named, warm_start_run)} < {study.tables for study in STUDIES}
+
+
+@pytest.mark.parametrize("piece", PIECES)
+def test_one_page_includes_each_study_and_shows_tables_or_says_that_there_are_none(piece: str) -> None:
+    pages = [path for path in DOCS.glob("*.md") if f"```{{include}} {piece}\n" in path.read_text(encoding="utf-8")]
+    assert len(pages) == 1
+    text = (DOCS / piece).read_text(encoding="utf-8")
+    assert text.startswith((HEADING, PENDING))
+
+
+def test_every_figure_of_a_piece_is_there() -> None:
+    """A plot is stored with its tables."""
+    for piece in PIECES:
+        for name in re.findall(r"^```\{figure\} (\S+)$", (DOCS / piece).read_text(encoding="utf-8"), re.MULTILINE):
+            assert (DOCS / name).is_file(), f"{piece}: {name}"

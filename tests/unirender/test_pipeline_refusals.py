@@ -1,0 +1,103 @@
+"""What the pipeline refuses besides a bad picture: lights, several pictures at once; and where an edit cannot say."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_models import SIZE, make_pipeline
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.inputs import as_picture
+from unirender.pipelines.settings import Sampling
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+LIGHT = np.ones((16, 32, 3), np.float32)
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> UniRenderPipeline:
+    return make_pipeline()
+
+
+def picture() -> tuple[np.ndarray, np.ndarray]:
+    """A grey square on nothing."""
+    mask = np.zeros((SIZE, SIZE, 1), np.float32)
+    mask[8:-8, 8:-8] = 1
+    return np.full((SIZE, SIZE, 3), 0.5, np.float32), mask
+
+
+def surface() -> Intrinsics:
+    """Maps of a plate that faces the camera, but for s and d."""
+    mask = picture()[1]
+    return Intrinsics(
+        albedo=0.5 * np.repeat(mask, 3, -1),
+        normal=mask * np.array([0, 0, 1], np.float32),
+        roughness=0.5 * mask,
+        metallic=0 * mask,
+        mask=mask,
+    )
+
+
+@pytest.mark.parametrize(
+    ("light", "words"),
+    [
+        (LIGHT[..., :2], r"got shape \(16, 32, 2\), expected a lat-long map"),
+        (-LIGHT, "negative radiance"),
+        (np.where(np.arange(32)[:, None] == 3, np.nan, LIGHT), "NaN"),
+    ],
+)
+def test_a_light_that_is_none_is_refused(pipeline: UniRenderPipeline, light: np.ndarray, words: str) -> None:
+    image, mask = picture()
+    with pytest.raises(UnirenderError, match=f"environment: .*{words}"):
+        pipeline.relight(image, light.astype(np.float32), mask)
+
+
+def test_an_unknown_exposure_is_refused(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    with pytest.raises(UnirenderError, match="exposure: got 'bright', expected 'auto' or 'keep'"):
+        pipeline.relight(image, LIGHT, mask, exposure="bright")
+    assert pipeline.relight(image, LIGHT, mask, exposure="keep").image_linear.shape == image.shape
+
+
+def test_several_pictures_are_not_one(pipeline: UniRenderPipeline) -> None:
+    maps = surface().replace(environment=LIGHT)
+    several: dict[str, Any] = {name: np.stack([value, value]) for name, value in maps.maps.items()}
+    with pytest.raises(UnirenderError, match=r"render: got maps of shape \(2, .* expected one picture"):
+        pipeline.render(Intrinsics(**several))
+    assert pipeline.render(maps).shape == (SIZE, SIZE, 3)
+
+
+def test_what_is_no_array_is_refused() -> None:
+    with pytest.raises(UnirenderError, match="image: got str, expected a numpy array"):
+        as_picture("mug.png", None)
+    with pytest.raises(UnirenderError, match="mask: got str, expected a numpy array"):
+        as_picture(picture()[0], "mask.png")
+    with pytest.raises(UnirenderError, match=r"mask: .*divide an 8-bit mask by 255"):
+        as_picture(picture()[0], 255 * picture()[1])
+
+
+def test_a_number_of_samples_and_generators_must_fit() -> None:
+    with pytest.raises(UnirenderError, match="num_samples: got 0, expected at least 1"):
+        Sampling.of("sample", None, 0, None)
+    several = Sampling.of("sample", 2, 2, [torch.Generator(), torch.Generator()])
+    with pytest.raises(UnirenderError, match="generator: got 2 for 1 pictures"):
+        several.draw_seed()
+
+
+def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRenderPipeline) -> None:
+    """A light of 16 x 32 has no reflection as sharp as roughness 0.1; without a new roughness there is no question."""
+    image, mask = picture()
+    decomposition = pipeline.decompose(image, mask)
+    sharp = pipeline.edit(image, mask, roughness=0.1, decomposition=decomposition)
+    assert sharp.coarse is not None
+    assert (sharp.coarse == (mask > 0)).all()
+    assert sharp.coarse_share == 1
+    own = decomposition.intrinsics.require("roughness")["roughness"]
+    left = np.arange(SIZE)[None, :, None] < SIZE // 2
+    half = pipeline.edit(image, mask, roughness=np.where(left, own, 0.1), decomposition=decomposition)
+    assert half.coarse_share == 0.5
+    metal = pipeline.edit(image, mask, metallic=1.0, decomposition=decomposition)
+    assert metal.coarse is None
+    assert (metal.coarse_share, metal.bounded) == (0, 0)
