@@ -2,6 +2,8 @@
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
+# make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
+# make test-latex  likewise: the LaTeX tables compiled (pdflatex with booktabs; an error where it is missing)
 # make docs        the HTML documentation (docs/_build/html)
 #
 #   make PYTHON=/path/to/python3.11      another interpreter
@@ -21,7 +23,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-large lint docs format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-large test-report test-latex lint docs format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -59,6 +61,12 @@ test: lint docs
 # One process, not $(PYTEST_ARGS): it measures its own memory.
 test-large: $(VENV)/.dev
 	$(BIN)/python -m pytest -m large -s
+
+test-report: $(VENV)/.dev
+	$(BIN)/python -m pytest -m report
+
+test-latex: $(VENV)/.dev
+	$(BIN)/python -m pytest -m latex
 
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html

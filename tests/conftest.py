@@ -45,14 +45,30 @@ def pytest_configure(config: pytest.Config) -> None:
         )
 
 
+# Markers of what needs a program or a machine that not everybody has: such tests never skip; they run by their own
+# command alone, and fail there where what they need is missing.
+OWN_COMMANDS = {"large": "make test-large", "latex": "make test-latex", "report": "make test-report"}
+
+
+def left_out(config: pytest.Config) -> dict[str, str]:
+    """Markers that this run leaves out, whatever else is deselected: only `-m` with its name brings one in."""
+    expression = str(config.getoption("markexpr"))
+    return {marker: command for marker, command in OWN_COMMANDS.items() if marker not in expression}
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leaves out what is marked `large`, whatever else is deselected: only `-m large` brings it in."""
-    if "large" in str(config.getoption("markexpr")):
-        return
-    left_out = [item for item in items if item.get_closest_marker("large")]
-    if left_out:
-        items[:] = [item for item in items if item not in left_out]
-        config.hook.pytest_deselected(items=left_out)
+    """Leaves out what has its own command."""
+    others = [item for item in items if any(item.get_closest_marker(marker) for marker in left_out(config))]
+    if others:
+        items[:] = [item for item in items if item not in others]
+        config.hook.pytest_deselected(items=others)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Says by name what was left out."""
+    if found := left_out(config):
+        names = ", ".join(f"{marker} ({command})" for marker, command in found.items())
+        terminalreporter.write_line(f"left out, each has its own command: {names}")
 
 
 @pytest.fixture(scope="session")

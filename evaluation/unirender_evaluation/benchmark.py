@@ -1,10 +1,12 @@
 """`bench run`: a suite x rows -> per-sample records, tables, verdict and report in one folder.
 
     records.jsonl run.json        every value with its content key; the rows and the protocol (see `records`)
+    records.csv                   every value on a line of its own, for spreadsheets and data frames
     truth_check.json              what was rendered again on the spot, and how it compares (see `run_check`)
-    tables.md tables.tex tables.json
+    tables.md tables.tex tables.json     in the variants that are asked for
     verdict.txt                   who beats whom
     report.html                   one self-contained page
+    results.json                  run.json and records.jsonl as one validated file, for others (see `results_file`)
 
 Running the same command again reuses what is done.
 """
@@ -12,7 +14,7 @@ Running the same command again reuses what is done.
 import os
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
@@ -27,7 +29,9 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.files import checkpoint_sha256
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
-from unirender_evaluation.engine import Store
+from unirender_evaluation.engine import Job, Store
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview_pictures import MultiviewPictures
 from unirender_evaluation.multiview_rows import multiview_jobs, multiview_rows
 from unirender_evaluation.multiview_scenes import multiview_scenes
@@ -35,12 +39,16 @@ from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.prediction_check import check_predictions
-from unirender_evaluation.records import Record, RunInfo, write_run
-from unirender_evaluation.report import ALL_TABLES, report_run
+from unirender_evaluation.protocol import mask_source
+from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
+from unirender_evaluation.report import report_run
+from unirender_evaluation.results_data import NAME as RESULTS
+from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import load_suite
+from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth import quality_summary
@@ -54,7 +62,7 @@ BOUNDS = (  # keys that no row of a stranger may have
     bounds.CEILING_KEY,
     bounds.REFERENCE_KEY,
     slug(bounds.Shade.name),
-    *(info.key for info in physics_rows.INFOS),
+    *(info.key for info in (MITSUBA, *physics_rows.INFOS)),
     *map(slug, multiview_methods.NAMES),
 )
 
@@ -79,6 +87,7 @@ class BenchConfig:
         jobs: worker processes, each with one thread; 0 = all in this one.
         device: of our model: auto, cpu, cuda or mps.
         subsets: scenes of the slow parts.
+        variants: of the tables (see `tables.build_tables`); records have all of them.
     """
 
     suite: str = "tiny"
@@ -95,6 +104,7 @@ class BenchConfig:
     jobs: int = 2
     device: str = "cpu"
     subsets: Subsets = STANDARD
+    variants: tuple[Variant, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -158,21 +168,15 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
         UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions; nothing has run then. A failed
             truth check or claim is no error: the verdict says so.
     """
-    from unirender_evaluation.lpips import available
-
     console = console or Console()
-    suite, rows = load_suite(config.suite), build_rows(config)
-    scenes = scene_ids(suite, config.limit)
-    check_predictions(rows, suite)
+    here = prepare(config)
+    suite, request = here.suite, check_request(config)
     try:
         config.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UnirenderError(f"{config.out}: cannot be made ({error.strerror}); choose another --out") from error
-    backbones = tuple(available())
-    here = Run(suite, rows, scenes, versions(backbones), backbones, config.out / "pictures", config.subsets)
     store = Store.open(config.out / "records.jsonl")
     before = set(store.known)
-    request = CheckRequest(config.out / "truth_check.json", config.check_scenes, config.check_seed, config.recheck)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
         check = run_check(request, here, store, progress, partial(console.print, highlight=False))
@@ -181,12 +185,33 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     records = [record for record in store.close() if record.values]
     info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
-    tables = build_tables(records, info, ALL_TABLES)
+    write_csv(config.out / "records.csv", records)
+    tables = build_tables(records, info, ALL_TABLES, config.variants)
     verdict = verdict_text(records, info, check)
     result = BenchResult(tuple(records), info, tuple(tables), verdict, check, len({r.key for r in records} - before))
     write_outputs(config.out, result)
     report_run(config.out, suite, info, records, tables)
+    write_results(config.out / RESULTS, info, records)
     return result
+
+
+def prepare(config: BenchConfig) -> Run:
+    """What is to be scored; nothing is computed or written.
+
+    Raises:
+        UnirenderError: unusable suite, checkpoint, plug-in or predictions.
+    """
+    from unirender_evaluation.lpips import available
+
+    suite, rows, backbones = load_suite(config.suite), build_rows(config), tuple(available())
+    scenes = scene_ids(suite, config.limit)
+    check_predictions(rows, suite)
+    return Run(suite, rows, scenes, versions(backbones), backbones, config.out / "pictures", config.subsets)
+
+
+def check_request(config: BenchConfig) -> CheckRequest:
+    """The truth check that a configuration asks for."""
+    return CheckRequest(config.out / "truth_check.json", config.check_scenes, config.check_seed, config.recheck)
 
 
 def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
@@ -213,18 +238,21 @@ def _views_rows(config: BenchConfig) -> list[Row]:
     return multiview_rows() if "optimisation" in config.methods and config.subsets.views != 0 else []
 
 
-def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
-    """The multi-view table: one optimisation after another, in this process, since their seconds are part of it."""
+def views_jobs(here: Run, config: BenchConfig) -> list[Job]:
+    """Every record that the run wants of the multi-view table."""
     rows = _views_rows(config)
     scenes = multiview_scenes(here.scenes, config.subsets.views) if rows else []
-    jobs = [
+    pictures = MultiviewPictures(here.pictures)
+    return [
         job
         for scene in scenes
-        for job in multiview_jobs(
-            here.suite, scene, rows, here.key_of(scene), here.backbones, MultiviewPictures(here.pictures)
-        )
+        for job in multiview_jobs(here.suite, scene, rows, here.key_of(scene), here.backbones, pictures)
     ]
-    missing = [job for job in jobs if not job.is_done(store.has)]
+
+
+def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
+    """The multi-view table: one optimisation after another, in this process, since their seconds are part of it."""
+    missing = [job for job in views_jobs(here, config) if not job.is_done(store.has)]
     bar = progress.add_task("multi-view", total=len(missing), visible=bool(missing))
     for job in missing:
         progress.update(bar, description=job.label)
@@ -239,6 +267,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         *(row.info for row in _views_rows(config)),
         bounds.ceiling_info(suite),
         reference_row(check, scenes),
+        MITSUBA,
         *physics_rows.INFOS,
     ]
     environment = {name: installed_version(name) for name in ("unirender", "torch", "mitsuba", "numpy")}
@@ -252,7 +281,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         suite=suite.spec.name,
         suite_hash=suite.sha256,
         resolution=suite.spec.resolution,
-        methods=tuple(info for info in infos if info.key in used),
+        methods=tuple(replace(info, mask=mask_source(info.key, records)) for info in infos if info.key in used),
         coverage=float(np.mean([suite.mask(scene).mean() for scene in scenes])),
         lpips=here.backbones,
         mitsuba=str(suite.provenance["mitsuba"]),

@@ -11,11 +11,15 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, at_least
+from unirender_evaluation.crosscheck_command import BenchCrosscheck
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
+from unirender_evaluation.physics_command import BenchPhysics
+from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
 from unirender_evaluation.sampling_study_command import BenchSampling
 from unirender_evaluation.speed_study_command import BenchSpeed
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
+from unirender_evaluation.throughput_command import BenchThroughput
 from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
 from unirender_evaluation.warm_start_command import BenchWarmStart
@@ -39,6 +43,9 @@ class BenchRun:
     repeatable."""
     predictions: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=FOLDER of somebody's predictions (`unirender bench export` writes the inputs); repeatable."""
+    variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """How the numbers of tables and report are taken: masked or whole, srgb or linear, raw, aligned or aligned_rgb,
+    with - between (masked-linear), or all; repeatable. None: whole beside the published values, and masked."""
     limit: int | None = None
     """Scenes; the tables of a partial run carry a watermark."""
     seed: int = 0
@@ -49,6 +56,8 @@ class BenchRun:
     """Chooses them; None: drawn anew in a new folder, kept in one that is continued."""
     recheck: bool = False
     """Render them again also where the folder holds a check of the same truth, code and seed."""
+    dry_run: bool = False
+    """Print what would be computed and what is stored, by row; compute and write nothing."""
     sample_scenes: int | None = None
     """Scenes of the sampling rows; 0 leaves them out. None: 4, with `--full` all."""
     optimise_scenes: int | None = None
@@ -75,6 +84,7 @@ class BenchRun:
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         named_folders(self.predictions)
+        asked_variants(self.variant)
 
     @property
     def subsets(self) -> Subsets:
@@ -107,8 +117,14 @@ class BenchRun:
             jobs=self.jobs,
             device=self.device,
             subsets=self.subsets,
+            variants=asked_variants(self.variant),
         )
         try:
+            if self.dry_run:
+                from unirender_evaluation.dry_run import planned, print_plan
+
+                print_plan(planned(config), console)
+                return 0
             result = benchmark.run(config, console)
         except PredictionError as error:
             print(f"unirender: error: {error}", file=sys.stderr)  # a line for each problem
@@ -194,12 +210,19 @@ class BenchReport:
     """Folder that `unirender bench run --out` wrote."""
     suite: str | None = None
     """A bundled suite, or the path of a suite's TOML file; None: the name that the run recorded."""
+    variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """How the numbers of its tables are taken, as in `bench run`; repeatable."""
+
+    def check(self) -> None:
+        """Looks at the values; `UsageError` where one is outside its range."""
+        asked_variants(self.variant)
 
     def run(self) -> int:
         """Writes `report.html` into the folder."""
+        self.check()
         from unirender_evaluation.report import rebuild
 
-        path = rebuild(self.folder, self.suite)
+        path = rebuild(self.folder, self.suite, asked_variants(self.variant))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
         return 0
 
@@ -234,7 +257,8 @@ class BenchExport:
 
 @dataclass(frozen=True)
 class Bench:
-    """The benchmark: score methods, write the report again, check the truth, export inputs; studies beside it."""
+    """The benchmark: score methods, check, merge and compare results, check the truth, export inputs; studies beside
+    it."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
         Annotated[
@@ -243,6 +267,13 @@ class Bench:
             | Annotated[BenchExport, tyro.conf.subcommand("export")]
             | Annotated[BenchReport, tyro.conf.subcommand("report")]
             | Annotated[BenchTruth, tyro.conf.subcommand("truth")]
+            | Annotated[BenchCompare, tyro.conf.subcommand("compare")]
+            | Annotated[BenchLs, tyro.conf.subcommand("ls")]
+            | Annotated[BenchPhysics, tyro.conf.subcommand("physics")]
+            | Annotated[BenchTables, tyro.conf.subcommand("tables")]
+            | Annotated[BenchValidate, tyro.conf.subcommand("validate")]
+            | Annotated[BenchCrosscheck, tyro.conf.subcommand("crosscheck")]
+            | Annotated[BenchThroughput, tyro.conf.subcommand("throughput")]
             | Annotated[BenchDerivedLight, tyro.conf.subcommand("derived-light")]
             | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
             | Annotated[BenchRace, tyro.conf.subcommand("race")]

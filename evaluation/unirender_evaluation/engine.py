@@ -108,7 +108,10 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
 
 
 def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[str, float]:
-    """All values of one prediction."""
+    """All values of one prediction.
+
+    A picture is premultiplied and has no mask of its own: the true one is pasted. Maps bring theirs, if they have one.
+    """
     from unirender_evaluation import lpips
     from unirender_evaluation.scoring import score_image, score_maps
 
@@ -117,7 +120,7 @@ def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[
     if prediction.image is not None and task.truth_image is not None:
         values |= score_image(prediction.image, task.truth_image, task.mask, quantity=task.quantity, lpips=networks)
     if prediction.maps is not None and task.truth_maps is not None:
-        values |= score_maps(prediction.maps.replace(mask=None), task.truth_maps, lpips=networks)
+        values |= score_maps(prediction.maps, task.truth_maps, lpips=networks)
     return values
 
 

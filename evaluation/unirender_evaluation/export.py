@@ -1,14 +1,15 @@
 """Writes a suite's inputs for foreign code, in the folder names that `predictions` reads answers from.
 
     <picture>/image.png                  what a method may see: 8-bit sRGB, straight, with the mask as alpha
+    <picture>/mask.exr                   the same mask (mask.Y) unrounded, as a plug-in is handed it, in float32
     <picture>/meta.json                  the suite, the camera, and the questions by the name of their answer: table,
                                          protocol, what is asked, new metallic or roughness
     <picture>/<answer>/given.exr         maps given with a question (true ones, or s and d of another light): channels
                                          of the data contract, linear, half floats
     <picture>/<answer>/environment.exr   the light given with it: R, G, B, linear, float32, lat-long in camera axes
 
-A picture that no method may see (its true maps are given instead) has no `image.png`. No truth is written but what its
-protocol gives away.
+A picture that no method may see (its true maps are given instead) has no `image.png` and no `mask.exr`. No truth is
+written but what its protocol gives away.
 """
 
 import json
@@ -52,6 +53,7 @@ def _write_question(task: Task, folder: Path) -> dict[str, Any]:
         inputs = task.inputs[capability]
         if "image_srgb" in inputs:
             _write_picture(folder / "image.png", inputs["image_srgb"], inputs["mask"])
+            write_exr(folder / "mask.exr", {"mask.Y": inputs["mask"][..., 0]}, half=False)
         question |= {name: inputs[name] for name in ("metallic", "roughness") if name in inputs}
         given = inputs.get("intrinsics") or Intrinsics(
             **{name: inputs[name] for name in ("specular", "diffuse", "environment") if inputs.get(name) is not None}

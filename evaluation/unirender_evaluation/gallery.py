@@ -7,6 +7,7 @@ degree) compares the pictures over white with the true mask pasted on both.
 
 import base64
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -24,7 +25,13 @@ from unirender_evaluation.records import RunInfo
 from unirender_evaluation.report_plots import LEADING, heading
 from unirender_evaluation.scoring import over_white
 
+GALLERY_BYTES = 12_000_000  # of all its pictures, about: where they would take more, they are shown smaller
+BYTES_PER_PIXEL = 1.2  # of a PNG data URI; measured: 1.16, 499 pictures of the tiny suite; noise takes up to 5
+HERO_WIDTH = 256  # pixels at the head of the page
+SMALLEST = 48  # pixels that a picture keeps in any case
+
 Picture = Float[np.ndarray, "h w 3"]
+Mask = Float[np.ndarray, "h w 1"]
 AnyPicture = Float[np.ndarray, "_ _ 3"]  # sizes are checked where they are put together
 
 
@@ -121,6 +128,42 @@ def data_uri(picture: Picture, mask: Float[np.ndarray, "h w 1"] | None = None) -
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
+def picture_size(width: int, most: int) -> int:
+    """The width at which a picture is shown: its own, else the largest whole fraction of it that is at most `most`."""
+    return width // math.ceil(width / most)
+
+
+def shrink(picture: Float[np.ndarray, "h w c"], width: int) -> Float[np.ndarray, "h2 w2 c"]:
+    """A picture at a whole fraction of its width: means of squares of pixels; what is left over at the edges is cut."""
+    factor = picture.shape[1] // width
+    if factor <= 1:
+        return picture
+    height = picture.shape[0] // factor
+    cut = picture[: height * factor, : width * factor]
+    return cut.reshape(height, factor, width, factor, -1).mean(axis=(1, 3), dtype=np.float32)
+
+
+def shrink_covered(
+    picture: Picture, mask: Mask, width: int
+) -> tuple[Float[np.ndarray, "h2 w2 3"], Float[np.ndarray, "h2 w2 1"]]:
+    """The same of a picture and its mask: what lies outside the mask does not run into the edge."""
+    if width >= picture.shape[1]:
+        return picture, mask
+    small = shrink(mask, width)
+    return shrink(picture * mask, width) / np.maximum(small, 1e-6), small
+
+
+def shown_width(gallery: Sequence[GalleryItem], limit: int = GALLERY_BYTES) -> int:
+    """Pixels that a picture's width may have so that the gallery takes about `limit` bytes of the page."""
+    if not gallery:
+        return SMALLEST
+    width = max(item.mask.shape[1] for item in gallery)
+    count = sum(
+        len(item.given) + len(item.truth) + 2 * sum(map(len, item.predictions.values())) for item in gallery
+    )  # each prediction has its FLIP map
+    return min(width, max(SMALLEST, int(math.sqrt(limit / (BYTES_PER_PIXEL * count)))))
+
+
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """FLIP's OpenMP threads spin for one another on a busy machine: 170 ms a small picture, 14 ms with one thread.
@@ -141,7 +184,7 @@ def _magma(error: Float[np.ndarray, "h w"]) -> Picture:
     return np.asarray(colormaps["magma"](np.clip(error, 0, 1)), dtype=np.float32)[..., :3]
 
 
-def hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
+def hero(gallery: Sequence[GalleryItem], run: RunInfo, most: int = HERO_WIDTH) -> dict[str, Any] | None:
     """What was given, and what the first row of ours made of it on the median sample: picked by rank, not by eye."""
     kinds = [[info.key for info in run.methods if info.kind == kind] for kind in LEADING]
     ours = set(next(filter(None, kinds), []))
@@ -151,9 +194,9 @@ def hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
     item = min(candidates, key=lambda item: abs(2 * item.place - item.count - 1))
     method = next(key for key in item.predictions if key in ours)
     return {
-        "given": [_named(name, picture, item) for name, picture in item.given.items()],
+        "given": [_named(name, picture, item, most) for name, picture in item.given.items()],
         "pairs": [
-            {"name": name, "ours": _shown(picture, item), "truth": _shown(item.truth[name], item)}
+            {"name": name, "ours": _shown(picture, item, most), "truth": _shown(item.truth[name], item, most)}
             for name, picture in item.predictions[method].items()
         ],
         "caption": f"{run.method(method).label} on the sample of {item.rank or 'median'} score: "
@@ -161,8 +204,15 @@ def hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
     }
 
 
-def shelves(gallery: Sequence[GalleryItem], run: RunInfo, titles: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Cards by table and protocol, worst first in each; `titles` has the tables' names for people."""
+def shelves(gallery: Sequence[GalleryItem], run: RunInfo, titles: Mapping[str, str], most: int) -> list[dict[str, Any]]:
+    """Cards by table and protocol, worst first in each.
+
+    Args:
+        gallery: the samples.
+        run: names the rows.
+        titles: the tables' names for people.
+        most: pixels that a picture's width may have (`shown_width`).
+    """
     groups: dict[tuple[str, str], list[GalleryItem]] = {}
     for item in gallery:
         groups.setdefault((item.table, item.protocol), []).append(item)
@@ -171,7 +221,7 @@ def shelves(gallery: Sequence[GalleryItem], run: RunInfo, titles: Mapping[str, s
             "which": "-".join(which),
             "title": heading(titles.get(which[0], which[0]), which[1]),
             "by": " and ".join(dict.fromkeys(run.method(item.leader).label for item in items if item.leader)),
-            "cards": [_card(item, run) for item in sorted(items, key=lambda item: item.place)],
+            "cards": [_card(item, run, most) for item in sorted(items, key=lambda item: item.place)],
         }
         for which, items in groups.items()
     ]
@@ -194,7 +244,7 @@ def picture_rows(item: GalleryItem, run: RunInfo) -> list[tuple[str, dict[str, s
     return rows + [("Trivial", cells) for cells in shared]
 
 
-def _card(item: GalleryItem, run: RunInfo) -> dict[str, Any]:
+def _card(item: GalleryItem, run: RunInfo, most: int) -> dict[str, Any]:
     names = list(item.truth)
     place = f"{item.rank} of {item.count}" if item.rank else f"{item.place} of {item.count}"
     return {
@@ -203,33 +253,41 @@ def _card(item: GalleryItem, run: RunInfo) -> dict[str, Any]:
         "question": item.question,
         "sub": f"{item.caption} · {item.sample}",
         "names": names,
-        "truth": [_shown(picture, item) for picture in item.truth.values()],
-        "given": [_named(name, picture, item) for name, picture in item.given.items()],
+        "truth": [_shown(picture, item, most) for picture in item.truth.values()],
+        "given": [_named(name, picture, item, most) for name, picture in item.given.items()],
         "rows": [
-            {"label": label, "cells": [_prediction(item, cells[n], n, run) if n in cells else None for n in names]}
+            {
+                "label": label,
+                "cells": [_prediction(item, cells[n], n, run, most) if n in cells else None for n in names],
+            }
             for label, cells in picture_rows(item, run)
         ],
     }
 
 
-def _prediction(item: GalleryItem, method: str, name: str, run: RunInfo) -> dict[str, Any]:
+def _prediction(item: GalleryItem, method: str, name: str, run: RunInfo, most: int) -> dict[str, Any]:
     picture, info = item.predictions[method][name], run.method(method)
     error, mean = flip_map(picture, item.truth[name], item.mask)
     alone = info.kind != "trivial" or len(item.truth) == 1
     return {
-        "picture": _shown(picture, item),
+        "picture": _shown(picture, item, most),
+        "label": info.label,
         "name": "" if alone else info.label,
         "score": item.scores.get(method, {}).get(name, ""),
-        "flip": _shown(error, item),
+        "flip": _shown(error, item, most),
         "flip_mean": f"FLIP {mean:.3f}",
     }
 
 
-def _named(name: str, picture: Picture, item: GalleryItem) -> dict[str, Any]:
-    return {"name": name, "picture": _shown(picture, item)}
+def _named(name: str, picture: Picture, item: GalleryItem, most: int) -> dict[str, Any]:
+    return {"name": name, "picture": _shown(picture, item, most)}
 
 
-def _shown(picture: Picture, item: GalleryItem) -> dict[str, Any]:
-    """A picture for the template; those of the frame's size carry the mask."""
-    mask = item.mask if picture.shape[:2] == item.mask.shape[:2] else None
-    return {"uri": data_uri(picture, mask), "width": picture.shape[1], "height": picture.shape[0]}
+def _shown(picture: Picture, item: GalleryItem, most: int) -> dict[str, Any]:
+    """A picture for the template, at most `most` pixels wide; those of the frame's size carry the mask."""
+    width = picture_size(picture.shape[1], most)
+    if picture.shape[:2] == item.mask.shape[:2]:
+        small, mask = shrink_covered(picture, item.mask, width)
+    else:
+        small, mask = shrink(picture, width), None
+    return {"uri": data_uri(small, mask), "width": small.shape[1], "height": small.shape[0]}

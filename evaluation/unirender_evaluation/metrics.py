@@ -10,6 +10,7 @@ order mask, space, scale: `albedo.psnr@masked-srgb-raw`, `roughness.mse@masked`,
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -26,6 +27,7 @@ Scale = Literal["raw", "aligned", "aligned_rgb"]
 MASKS: tuple[Mask, ...] = ("masked", "whole")
 SPACES: tuple[Space, ...] = ("srgb", "linear")
 SCALES: tuple[Scale, ...] = ("raw", "aligned", "aligned_rgb")
+LPIPS_SCALES: tuple[Scale, ...] = ("raw",)  # those that runs compute: with others, scoring takes half as long again
 
 SSIM_SIGMA, SSIM_TRUNCATE = 1.5, 3.5  # Wang et al. 2004: an 11 x 11 Gaussian window
 SSIM_K1, SSIM_K2 = 0.01, 0.03
@@ -70,7 +72,20 @@ class Variant:
         return cls(**axes)  # type: ignore[arg-type]  # each word was looked up among its axis' values
 
 
-DEFAULT_VARIANT = Variant()  # what we believe; the paper's column stands beside Variant("whole")
+DEFAULT_VARIANT = Variant()  # what we believe
+PUBLISHED_VARIANT = Variant("whole")  # beside which the paper's numbers stand: its own, as far as it is known
+ALL_VARIANTS = tuple(Variant(mask, space, scale) for mask in MASKS for space in SPACES for scale in SCALES)
+ALL = "all"
+
+
+def chosen_variants(texts: Iterable[str]) -> tuple[Variant, ...] | None:
+    """What `--variant` asks for: each text a variant (`Variant.parse`) or "all"; None where there is none.
+
+    Raises:
+        UnirenderError: a text is no variant.
+    """
+    found = [variant for text in texts for variant in (ALL_VARIANTS if text == ALL else (Variant.parse(text),))]
+    return tuple(dict.fromkeys(found)) or None
 
 
 @dataclass(frozen=True)
@@ -114,6 +129,7 @@ METRICS: dict[str, Metric] = {
         Metric("ssim", "SSIM", "", True, 1.0, _ALL, 4, "Wang et al. 2004, Gaussian 11 x 11, sigma 1.5"),
         Metric("lpips_vgg", "LPIPS-VGG", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
         Metric("lpips_alex", "LPIPS-Alex", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
+        Metric("iou", "IoU", "", True, 1.0, (), 4, "sum of min(p, t) over sum of max(p, t), of masks"),
         Metric("mse", "MSE", "", False, 0.0, ("mask",), 4, "mean squared error per pixel"),
         Metric("mse_object", "MSE (object)", "", False, 0.0, (), 4, "squared difference of the in-mask means"),
         Metric("cosine", "cos", "", True, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
@@ -129,6 +145,9 @@ def metric_key(quantity: str, metric: Metric | str, variant: Variant = DEFAULT_V
     metric = METRICS[metric] if isinstance(metric, str) else metric
     axes = "-".join(getattr(variant, axis) for axis in metric.axes)
     return f"{quantity}.{metric.name}" + (f"@{axes}" if axes else "")
+
+
+OWN_MASK = metric_key("mask", "iou")  # recorded where maps were scored with a mask of the method's own
 
 
 def mse(

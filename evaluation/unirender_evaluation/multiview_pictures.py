@@ -33,7 +33,6 @@ class MultiviewPictures:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        folder.mkdir(parents=True, exist_ok=True)
 
     def has(self, scene_key: str, method: str, key: str) -> bool:
         """Whether the pictures of a record are there, and the truth's."""

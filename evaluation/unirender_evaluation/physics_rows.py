@@ -5,13 +5,14 @@ from functools import partial
 from typing import Any
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.bounds import SHADE_SPP, KeyOf, Shade
+from unirender_evaluation.bounds import SHADE_SPP, KeyOf
 from unirender_evaluation.engine import Job, ask
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.physics import RENDERER_TESTS, closed_loop, composite_shader, renderer_tests
+from unirender_evaluation.mitsuba_method import MITSUBA
+from unirender_evaluation.physics_stage import Light, Stage
+from unirender_evaluation.physics_tests import LOSS, PSNR, TESTS, renderer_tests
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
-from unirender_evaluation.scoring import score_image
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture, scene_ids
 from unirender_evaluation.versions import REFERENCE
@@ -27,14 +28,6 @@ INFOS = (TRUE_MAPS,)
 METHODS = ("composite", "ours-mean")
 
 
-def shade_under(maps: Intrinsics, environment: Any) -> Any:
-    """Mitsuba's shading of maps under a light."""
-    return Shade().render(maps.replace(environment=environment))
-
-
-SHADERS = {"shade": shade_under, "composite": composite_shader}
-
-
 def physics_scenes(suite: Suite, scenes: list[Scene], most: int | None) -> list[Scene]:
     """The scenes of the physics table: at most `most` of the run's, evenly spaced; None = all of them."""
     if most is None or len(scenes) <= most:
@@ -42,47 +35,68 @@ def physics_scenes(suite: Suite, scenes: list[Scene], most: int | None) -> list[
     return [s for s in scene_ids(suite, most) if s in scenes] or scenes[:most]
 
 
-def renderer_values(render: Callable[[Intrinsics], Any], suite: Suite, scene: Scene) -> dict[str, float]:
+def renderer_values(render: Callable[[Intrinsics], Any], stage: Stage) -> dict[str, float]:
     """Metric key -> value of a renderer's tests on one scene."""
-    values = renderer_tests(render, suite, scene)
-    return {metric_key(name, RENDERER_TESTS[name][1]): value for name, value in values.items()}
+    return {TESTS[name].key: value for name, value in renderer_tests(render, stage).items()}
 
 
-def loop_values(maps: Intrinsics, suite: Suite, scene: Scene) -> dict[str, float]:
-    """Metric key -> value of the closed loops of one picture's maps."""
-    base, mask, values = suite.spec.base, suite.mask(scene), {}
-    for name, image in closed_loop(maps.replace(mask=mask), suite, scene, SHADERS).items():
-        lit = scene if name.endswith("input") else suite.other_light(scene)
-        values |= score_image(image, suite.image(lit, base), mask, quantity=name)
+def loop_values(maps: Intrinsics, stage: Stage) -> dict[str, float]:
+    """Metric key -> value of the closed loops of the maps found in the base picture, and what they lose to the true."""
+    base, true = stage.suite.spec.base, stage.true_maps(stage.suite.spec.base)
+    lights: tuple[Light, ...] = ("input", "heldout")
+    values: dict[str, float] = {}
+    for light in lights:
+        for shader in ("shade", "composite"):
+            values |= stage.loop_values(maps, shader, light, base, f"{shader}_{light}")
+        key = metric_key(f"shade_{light}", PSNR)
+        best = stage.loop_values(true, "shade", light, base, f"shade_{light}")[key]
+        values[metric_key(f"loss_{light}", LOSS)] = best - values[key]
     return values
 
 
-def physics_jobs(suite: Suite, scene: Scene, rows: Sequence[Row], key_of: KeyOf) -> Iterator[Job]:
-    """The records of the physics table on one scene: renderers, decomposers, and the true maps."""
-    key = key_of("physics", TRUE_MAPS, {REFERENCE})
-    yield Job(key, f"physics: {TRUE_MAPS.label}", partial(_true_maps, suite, scene, key))
+def physics_jobs(
+    suite: Suite, scene: Scene, rows: Sequence[Row], key_of: KeyOf, with_mitsuba: bool = False
+) -> Iterator[Job]:
+    """The records of the physics table on one scene: renderers, decomposers, the true maps and, if asked for, Mitsuba's
+    own buffers."""
+    stage = Stage(suite, scene)
+    bounds = ((TRUE_MAPS, _true_maps), *([(MITSUBA, _mitsuba)] if with_mitsuba else []))
+    for info, record in bounds:
+        key = key_of("physics", info, {REFERENCE})
+        yield Job(key, f"physics: {info.label}", partial(record, stage, key))
     for row in filter(takes_part, rows):
         loops = callable(getattr(row.method, "decompose", None))  # shaded again by Mitsuba
         key = key_of("physics", row.info, row.uses | {REFERENCE} if loops else row.uses)
-        yield Job(key, f"physics: {row.info.label}", partial(_record, suite, scene, row, key))
+        yield Job(key, f"physics: {row.info.label}", partial(_record, stage, row, key))
 
 
-def _true_maps(suite: Suite, scene: Scene, key: str) -> Record:
-    values = loop_values(suite.intrinsics(scene, suite.spec.base), suite, scene)
-    return Record("physics", "physics", TRUE_MAPS.key, scene.key, scene.object, values, key)
+def _true_maps(stage: Stage, key: str) -> Record:
+    return _made(stage, TRUE_MAPS, loop_values(stage.true_maps(stage.suite.spec.base), stage), key)
 
 
-def _record(suite: Suite, scene: Scene, row: Row, key: str) -> Record:
+def _mitsuba(stage: Stage, key: str) -> Record:
+    """Mitsuba's closed loops: its own buffers, traced again; nothing where the object is not the truth's."""
+    mitsuba = stage.mitsuba
+    values = loop_values(mitsuba.maps(stage.suite.spec.base), stage) if mitsuba.shows_the_truth else {}
+    return _made(stage, MITSUBA, values, key)
+
+
+def _record(stage: Stage, row: Row, key: str) -> Record:
     values: dict[str, float] = {}
+    suite, scene = stage.suite, stage.scene
     if callable(getattr(row.method, "render", None)):
         render = partial(ask, row, "render", f"physics/{scene.key}")
-        values |= renderer_values(lambda maps: render(intrinsics=maps), suite, scene)
+        values |= renderer_values(lambda maps: render(intrinsics=maps), stage)
     if callable(getattr(row.method, "decompose", None)):
         seen = picture(suite, scene, suite.spec.base)
         maps = ask(row, "decompose", f"physics/{scene.key}", **seen)
         if {"albedo", "normal", "roughness", "metallic"} <= set(maps.present):
-            values |= loop_values(maps, suite, scene)
-    return Record("physics", "physics", row.info.key, scene.key, scene.object, values, key)
+            values |= loop_values(maps, stage)
+    return _made(stage, row.info, values, key)
+
+
+def _made(stage: Stage, info: MethodInfo, values: dict[str, float], key: str) -> Record:
+    return Record("physics", "physics", info.key, stage.scene.key, stage.scene.object, values, key)
 
 
 def takes_part(row: Row) -> bool:

@@ -7,7 +7,8 @@ at 64 pixels.
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,6 @@ class Pictures:
 
     def __init__(self, folder: Path, suite: Suite, scenes: list[Scene]) -> None:
         self.folder, self.suite, self.scenes = folder, suite, scenes
-        folder.mkdir(parents=True, exist_ok=True)
 
     def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None:
         """Stores what the gallery would show of a prediction; `key` is the record's content key."""
@@ -76,8 +76,7 @@ class Pictures:
             leader, ranked = ranking([r for r in asked if r.method in pictured], table, main)
             for place, rank in chosen_places(len(ranked)).items():
                 sample, score = ranked[place]
-                scenes = [scene for scene in self.scenes if sample.startswith(f"{scene.key}_")]
-                task = next((t for t in tasks(self.suite, table, protocol, scenes) if t.sample == sample), None)
+                task = self._task(table, protocol, sample)
                 if task is None:
                     continue
                 about = {"leader": leader, "rank": rank, "place": place + 1, "count": len(ranked)}
@@ -85,6 +84,33 @@ class Pictures:
                 item = self._item(task, [r for r in asked if r.sample == sample], about | {"figure": figure})
                 found += [] if item is None else [item]
         return found
+
+    def leading(self, records: Sequence[Record], main: str) -> Iterator[GalleryItem]:
+        """Every sample with the pictures of its protocol's leading row alone: the worst of all protocols first.
+
+        Args:
+            records: of the run.
+            main: key of the row that leads where it has scores and pictures, as in `items`.
+        """
+        queues = []
+        for table, protocol in PROTOCOLS:
+            asked = [r for r in records if (r.table, r.protocol, r.subset) == (table, protocol, "main")]
+            pictured = [r for r in asked if self._path(f"{table}/{protocol}/{r.sample}", r.method).is_file()]
+            leader, ranked = ranking(pictured, table, main)
+            own = {record.sample: record for record in pictured if record.method == leader}
+            queues.append([(own[sample], place, len(ranked)) for place, (sample, _) in enumerate(ranked)])
+        for line in zip_longest(*queues):
+            for record, place, count in filter(None, line):
+                task = self._task(record.table, record.protocol, record.sample)
+                about = {"leader": record.method, "place": place + 1, "count": count}
+                item = None if task is None else self._item(task, [record], about)
+                if item is not None:
+                    yield item
+
+    def _task(self, table: str, protocol: str, sample: str) -> Task | None:
+        """The question behind a sample; None where the run's scenes have none of that name."""
+        scenes = [scene for scene in self.scenes if sample.startswith(f"{scene.key}_")]
+        return next((t for t in tasks(self.suite, table, protocol, scenes) if t.sample == sample), None)
 
     def _item(self, task: Task, records: Sequence[Record], about: dict[str, Any]) -> GalleryItem | None:
         truth = _pictures(task, task.truth_image, task.truth_maps)
@@ -183,12 +209,14 @@ def sheet_key(path: Path) -> str | None:
 
 
 def write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
-    """Writes display pictures of one size side by side, with their names and a content key in the PNG's text."""
+    """Writes display pictures of one size side by side, with their names and a content key in the PNG's text; makes
+    the folder."""
     levels = [np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in pictures.values()]
     sheet = np.concatenate(levels, axis=1) if levels else np.zeros((1, 1, 3), np.uint8)
     text = PngInfo()
     text.add_text("key", key)
     text.add_text("names", json.dumps(list(pictures)))
+    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_suffix(".tmp")
     PngImage.fromarray(sheet).save(temporary, format="PNG", pnginfo=text)
     os.replace(temporary, path)

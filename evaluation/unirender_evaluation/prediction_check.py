@@ -16,7 +16,8 @@ from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
 
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
-IGNORED = ("image.png", "meta.json", "environment.exr", "environment.png", "mask.png")  # of `bench export`, `decompose`
+# Of `bench export`, `decompose`.
+IGNORED = ("image.png", "mask.exr", "meta.json", "environment.exr", "environment.png", "mask.png")
 
 
 class PredictionError(UnirenderError):

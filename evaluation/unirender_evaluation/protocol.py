@@ -1,8 +1,9 @@
 """The protocol line: everything one must know to compare a number with one's own."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Literal
 
-from unirender_evaluation.metrics import Variant
+from unirender_evaluation.metrics import LPIPS_SCALES, OWN_MASK, Variant
 from unirender_evaluation.published import not_stated
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import Protocol
@@ -14,6 +15,13 @@ SCALE_TEXT = {
     "aligned": "one least-squares factor per image, fitted in linear light in the true mask",
     "aligned_rgb": "one least-squares factor per image and channel, fitted in linear light in the true mask",
 }
+MASKED_QUANTITIES = ("albedo", "specular", "diffuse", "roughness", "metallic")  # maps, which a method's mask belongs to
+
+
+def mask_source(method: str, records: Iterable[Record]) -> Literal["own", "pasted"]:
+    """Which mask the whole-frame figures of a method's maps were taken with, by a run's records."""
+    own = any(record.method == method and OWN_MASK in record.values for record in records)
+    return "own" if own else "pasted"
 
 
 def protocol_line(
@@ -29,7 +37,8 @@ def protocol_line(
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
     items = [
         ("given", protocol.given),
-        ("mask", _mask_text(variant, methods)),
+        ("variant", variant.label),
+        ("mask", _mask_text(variant, methods, records)),
         ("colour", SPACE_TEXT[variant.space]),
         ("scale alignment", SCALE_TEXT[variant.scale]),
         ("exposure", run.exposure),
@@ -38,7 +47,7 @@ def protocol_line(
         ("coverage", "-" if run.coverage is None or protocol.truth else f"{run.coverage:.3f}"),
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
-        ("LPIPS", f"v0.1, {' and '.join(run.lpips)}" if run.lpips else "n/a (no weights)"),
+        ("LPIPS", _lpips_text(variant, run)),
         ("interval", f"{CONFIDENCE:.0%} bootstrap over objects, {RESAMPLES} draws, seed {SEED}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
@@ -54,14 +63,24 @@ def protocol_text(items: Sequence[tuple[str, str]]) -> str:
     return " · ".join(f"{name}: {value}" for name, value in items)
 
 
-def _mask_text(variant: Variant, methods: Sequence[MethodInfo]) -> str:
+def _mask_text(variant: Variant, methods: Sequence[MethodInfo], records: Sequence[Record]) -> str:
     if variant.mask == "masked":
         return "inside the true mask, weighted by coverage"
     text = "whole frame in linear light over white (0 behind materials)"
-    own = [info.label for info in methods if info.mask == "own"]
+    quantities = {key.partition(".")[0] for record in records for key in record.values}
+    maps = not quantities.isdisjoint(MASKED_QUANTITIES)
+    own = [info.label for info in methods if info.mask == "own"] if maps else []
     if not own:
         return f"{text}, the true mask pasted on every row"
-    return f"{text}; own mask: {', '.join(own)}; true mask pasted: all other rows"
+    return f"{text}; own mask: {', '.join(own)} (maps; on pictures the true one is pasted); pasted: all other rows"
+
+
+def _lpips_text(variant: Variant, run: RunInfo) -> str:
+    if variant.scale not in LPIPS_SCALES:
+        return f"not computed of aligned pictures (a {'-'.join(LPIPS_SCALES)} variant has it)"
+    if not run.lpips:
+        return "n/a (no weights)"
+    return f"v0.1, {' and '.join(run.lpips)}{'' if variant.space == 'srgb' else ', of sRGB pictures as everywhere'}"
 
 
 def _sampling_text(methods: Sequence[MethodInfo]) -> str:

@@ -61,8 +61,11 @@ class Record:
 
     def to_json(self) -> str:
         """Returns one line of strict JSON (infinities as strings)."""
-        data = dataclasses.asdict(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
-        return json.dumps(data, allow_nan=False, sort_keys=True)
+        return json.dumps(self.to_plain(), allow_nan=False, sort_keys=True)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Returns what `to_json` writes, before it is text."""
+        return dataclasses.asdict(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
 
     @classmethod
     def from_json(cls, line: str) -> "Record":
@@ -75,6 +78,11 @@ class Record:
             data = json.loads(line)
         except json.JSONDecodeError as error:
             raise UnirenderError(f"not a JSON line: {line[:80]!r} ({error})") from error
+        return cls.from_plain(data)
+
+    @classmethod
+    def from_plain(cls, data: Any) -> "Record":
+        """Inverse of `to_plain`; raises UnirenderError as `from_json` does."""
         return _build(cls, data | {"values": _decode_values(data.get("values"))} if isinstance(data, dict) else data)
 
 
@@ -131,7 +139,7 @@ class RunInfo:
 
 def write_records(path: Path, records: Iterable[Record]) -> None:
     """Writes records as JSONL, atomically (temporary file, fsync, rename)."""
-    _write_atomic(path, "".join(record.to_json() + "\n" for record in records))
+    write_atomic(path, "".join(record.to_json() + "\n" for record in records))
 
 
 def write_csv(path: Path, records: Iterable[Record]) -> None:
@@ -143,7 +151,7 @@ def write_csv(path: Path, records: Iterable[Record]) -> None:
     for record in records:
         for metric, value in sorted(record.values.items()):
             writer.writerow((*(getattr(record, name) for name in names), metric, repr(float(value))))
-    _write_atomic(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
 def append_record(path: Path, record: Record) -> None:
@@ -186,7 +194,7 @@ def read_records(path: Path, *, torn_tail: Literal["raise", "drop"] = "raise") -
 
 def write_run(path: Path, run: RunInfo) -> None:
     """Writes a `RunInfo` as JSON, atomically."""
-    _write_atomic(path, json.dumps(dataclasses.asdict(run), indent=2, sort_keys=True, allow_nan=False) + "\n")
+    write_atomic(path, json.dumps(dataclasses.asdict(run), indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def read_run(path: Path) -> RunInfo:
@@ -202,6 +210,11 @@ def read_run(path: Path) -> RunInfo:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
         got = data.get("schema") if isinstance(data, dict) else type(data).__name__
         raise UnirenderError(f"{path}: got schema {got!r}, expected {SCHEMA_VERSION}; make the run again")
+    return run_from_plain(data)
+
+
+def run_from_plain(data: dict[str, Any]) -> RunInfo:
+    """A `RunInfo` from the JSON object that `write_run` writes; raises UnirenderError on unknown or missing fields."""
     methods = tuple(_build(MethodInfo, item) for item in data.get("methods", ()))
     tuples = {name: tuple(data.get(name, ())) for name in ("lpips", "seeds")}
     return _build(RunInfo, data | tuples | {"methods": methods})
@@ -239,7 +252,8 @@ def _check_value(name: str, value: Any) -> None:
         )
 
 
-def _write_atomic(path: Path, text: str) -> None:
+def write_atomic(path: Path, text: str) -> None:
+    """Writes a text file by way of a temporary one, so that a reader never meets half of it."""
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
         file.write(text)

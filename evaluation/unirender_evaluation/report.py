@@ -1,11 +1,13 @@
 """The report: one self-contained HTML file that works from file:// without a network.
 
 Tables with the published value beside the measured one and the protocol below, the standing of our rows between the
-trivial ones and the noise ceiling, one tick per sample, paired verdicts, and a gallery that begins with the failures.
+trivial ones and the noise ceiling, one tick per sample, paired verdicts, a gallery that begins with the failures, and a
+table of all samples that opens to every row's numbers.
 This module turns results into view models; `templates/` lays them out. `unirender bench report RUN` writes the page
 of a finished run again.
 """
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from itertools import groupby
@@ -17,12 +19,11 @@ from markupsafe import Markup
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, verdicts
-from unirender_evaluation.gallery import GalleryItem, hero, shelves
+from unirender_evaluation.gallery import GalleryItem, hero, shelves, shown_width
 from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
-from unirender_evaluation.physics import PHYSICS_TABLE
 from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_records, read_run
 from unirender_evaluation.report_plots import heading, strip_plots, tiles
+from unirender_evaluation.report_samples import Place, Sheet, make_sheets, sample_sections
 from unirender_evaluation.specs import TABLES, TableSpec
 from unirender_evaluation.table_formats import (
     NOT_AVAILABLE,
@@ -33,13 +34,13 @@ from unirender_evaluation.table_formats import (
     row_label,
     to_json,
 )
+from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Cell, Row, Table, build_tables
 
 if TYPE_CHECKING:
     from unirender_evaluation.suites import Suite
 
 TEMPLATES = Path(__file__).parent / "templates"
-ALL_TABLES = {**TABLES, **{spec.name: spec for spec in (MULTIVIEW_TABLE, PHYSICS_TABLE)}}
 HEADLINE = ("psnr", "mse", "cosine")  # metrics of the verdicts, the tiles and the distributions
 DENSE = 8  # columns: from here on the interval stands below its mean
 KIND_NAMES = {
@@ -62,6 +63,7 @@ def write_report(
     records: Sequence[Record] = (),
     *,
     specs: Mapping[str, TableSpec] | None = None,
+    sheets: Mapping[Place, Sheet] | None = None,
     title: str = "Rendering and inverse rendering, scored against path tracing",
 ) -> Path:
     """Writes the report, atomically.
@@ -71,8 +73,9 @@ def write_report(
         tables: in the order in which they are shown; variants of one table become tabs.
         gallery: samples with pictures; shown by table and protocol, worst first.
         run: rows and protocol.
-        records: per-sample values for distributions and verdicts; none = these sections are left out.
+        records: per-sample values for distributions, verdicts and the table of samples; none = without these sections.
         specs: columns, for tables beyond `TABLES`.
+        sheets: pictures of samples for the table of samples.
         title: heading of the page.
 
     Returns:
@@ -86,6 +89,8 @@ def write_report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    most = shown_width(gallery)
+    samples = sample_sections(tables, records, run, sheets or {})
     page = environment.get_template("report.html.j2").render(
         title=title,
         lede=_lede(run, tables),
@@ -97,9 +102,12 @@ def write_report(
         blocks=[_block(list(group)) for _, group in groupby(tables, key=_identity)],
         strips=strip_plots(specs, records, run, HEADLINE),
         verdicts=_verdicts(specs, records, run),
-        gallery=shelves(gallery, run, {name: spec.title for name, spec in specs.items()}),
+        gallery=shelves(gallery, run, {name: spec.title for name, spec in specs.items()}, most),
         footer=f"{run.suite} {run.suite_hash[:12]} · code {run.code or '-'} · {run.date or 'no date'}.",
-        json=Markup(to_json(tables).replace("</", "<\\/")),
+        shown=most if most < run.resolution else None,
+        samples=[{"which": section["which"], "title": section["title"]} for section in samples],
+        samples_json=_inline(json.dumps(samples, separators=(",", ":"), allow_nan=False, ensure_ascii=False)),
+        json=_inline(to_json(tables)),
     )
     temporary = path.with_name(path.name + ".tmp")
     with temporary.open("w", encoding="utf-8") as file:
@@ -108,6 +116,11 @@ def write_report(
         os.fsync(file.fileno())
     temporary.replace(path)
     return path
+
+
+def _inline(data: str) -> Markup:
+    """JSON inside a script element: nothing in it ends the element."""
+    return Markup(data.replace("<", "\\u003c"))
 
 
 def _lede(run: RunInfo, tables: Sequence[Table]) -> str:
@@ -236,8 +249,8 @@ def _verdicts(specs: Mapping[str, TableSpec], records: Sequence[Record], run: Ru
     return groups
 
 
-def read_results(folder: Path) -> tuple[RunInfo, list[Record], list[Table]]:
-    """What a finished run left: its description, its records, and the tables made from them.
+def read_results(folder: Path, variants: Sequence[Variant] | None = None) -> tuple[RunInfo, list[Record], list[Table]]:
+    """What a finished run left: its description, its records, and the tables made from them, in these variants.
 
     Raises:
         UnirenderError: no run in the folder.
@@ -246,22 +259,23 @@ def read_results(folder: Path) -> tuple[RunInfo, list[Record], list[Table]]:
         raise UnirenderError(f"{folder}: no run.json, expected the folder that `unirender bench run --out` wrote")
     run = read_run(folder / "run.json")
     records = [record for record in read_records(folder / "records.jsonl") if record.values]
-    return run, records, build_tables(records, run, ALL_TABLES)
+    return run, records, build_tables(records, run, ALL_TABLES, variants)
 
 
-def rebuild(folder: Path, suite: str | None = None) -> Path:
+def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] | None = None) -> Path:
     """Writes `report.html` of a finished run again; nothing is measured.
 
     Args:
         folder: that `unirender bench run --out` wrote.
         suite: name or TOML file; None = the name that the run recorded.
+        variants: of the tables; None = the usual ones (`tables.build_tables`).
 
     Raises:
         UnirenderError: no run in the folder, or the suite is not the one that it scored.
     """
     from unirender_evaluation.suites import load_suite  # what runs need, a report alone does not
 
-    run, records, tables = read_results(folder)
+    run, records, tables = read_results(folder, variants)
     loaded = load_suite(suite or run.suite)
     if loaded.sha256 != run.suite_hash:
         raise UnirenderError(
@@ -280,7 +294,8 @@ def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Rec
     pictures = Pictures(folder / "pictures", suite, scene_ids(suite, run.limit))
     items = pictures.items(records, leading_row(run))
     items += MultiviewPictures(folder / "pictures").items(records, suite)
-    return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES)
+    sheets = make_sheets(pictures.leading(records, leading_row(run)))
+    return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES, sheets=sheets)
 
 
 def leading_row(run: RunInfo) -> str:

@@ -6,7 +6,7 @@ that its renders give the row *reference (other seed)*.
 
 import json
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -56,11 +56,8 @@ def run_check(
         progress: gets a bar while Mitsuba renders.
         say: prints one line.
     """
-    identity = [here.suite.sha256, request.scenes, here.versions.of({REFERENCE, LPIPS})]
-    stored = read_check(request.path)
-    complete = all(key in store.known or key in store.used for key in stored.get("records", {}))
-    same = stored.get("identity") == identity and request.seed in (None, stored.get("seed"))
-    if same and complete and not request.again:
+    stored = stored_check(request, here, store.known.keys() | store.used.keys())
+    if stored is not None:
         for key, scene in stored["records"].items():
             if here.suite.scene(scene) in here.scenes:
                 store.has(key)
@@ -73,7 +70,7 @@ def run_check(
     outcome = _render(here.suite, request.scenes, seed, progress)
     summary = outcome.summary()
     check = summary | {
-        "identity": identity,
+        "identity": _identity(request, here),
         "date": datetime.now(UTC).isoformat(timespec="minutes"),
         "checked_scenes": summary["scenes"],
     }
@@ -84,6 +81,24 @@ def run_check(
     check["records"] = {record.key: scene.key for record, scene in records}
     _write(request.path, json.dumps(check, indent=1) + "\n")
     return check
+
+
+def stored_check(request: CheckRequest, here: Run, known: Collection[str]) -> dict[str, Any] | None:
+    """The check in the run's folder, if it is the one that is asked for.
+
+    Args:
+        request: what is to be checked.
+        here: the run.
+        known: content keys of the records in its folder.
+    """
+    stored = read_check(request.path)
+    complete = all(key in known for key in stored.get("records", {}))
+    same = stored.get("identity") == _identity(request, here) and request.seed in (None, stored.get("seed"))
+    return stored if same and complete and not request.again else None
+
+
+def _identity(request: CheckRequest, here: Run) -> list[Any]:
+    return [here.suite.sha256, request.scenes, here.versions.of({REFERENCE, LPIPS})]
 
 
 def reference_row(check: dict[str, Any], scenes: list[Scene]) -> MethodInfo:

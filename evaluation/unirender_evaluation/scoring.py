@@ -2,14 +2,14 @@
 
 Compositing (DESIGN, "Edges and background"). *Masked* figures compare un-premultiplied maps and weight by the true
 coverage. *Whole-frame* figures composite in linear light, then clip, then encode: white behind image, albedo, specular
-and diffuse light, 0 behind materials; the prediction with its own mask, or with the true one where it has none
-(pasted: `mask_source` says which, and the protocol line prints it). SSIM and LPIPS look at neighbourhoods: their
+and diffuse light, 0 behind materials; found maps with the prediction's own mask, or with the true one pasted where it
+has none, or returns the one that it was given. An own mask has a value itself, `mask.iou`, by which records and the
+protocol line tell the two. SSIM and LPIPS look at neighbourhoods: their
 masked variants compare whole-frame composites with the true mask pasted on both sides; SSIM then weights its map by
 coverage, LPIPS (which has no map) stays a mean over the frame.
 """
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,17 +19,23 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import Lpips
-from unirender_evaluation.metrics import MASKS, SCALES, SPACES, Mask, Scale, Space, Variant, metric_key
+from unirender_evaluation.metrics import (
+    LPIPS_SCALES,
+    MASKS,
+    OWN_MASK,
+    SCALES,
+    SPACES,
+    Mask,
+    Scale,
+    Space,
+    Variant,
+    metric_key,
+)
 
 Rgb = Float[np.ndarray, "h w 3"]
 Weights = Float[np.ndarray, "h w 1"]
 MATERIALS = ("roughness", "metallic")
-IMAGE_SCALES: tuple[Scale, ...] = ("raw", "aligned")
-
-
-def mask_source(prediction_mask: Weights | None) -> Literal["own", "pasted"]:
-    """Which mask whole-frame figures of a prediction use."""
-    return "pasted" if prediction_mask is None else "own"
+SAME_MASK = 1 / 255  # largest difference of a mask that was stored in 8 bits, whether rounded or cut off
 
 
 def score_maps(
@@ -37,7 +43,7 @@ def score_maps(
     truth: Intrinsics,
     *,
     lpips: Sequence[Lpips] = (),
-    lpips_scales: Sequence[Scale] = ("raw",),
+    lpips_scales: Sequence[Scale] = LPIPS_SCALES,
 ) -> dict[str, float]:
     """Scores every map that prediction and truth both have.
 
@@ -45,10 +51,11 @@ def score_maps(
         prediction: one picture's intrinsics `[h, w, c]`; maps that are None get no values.
         truth: the same at the same size, with its mask.
         lpips: backbones to compute; a backbone left out has no values (the cell says n/a).
-        lpips_scales: scale alignments for which LPIPS is computed; each one more costs a third of the scoring time.
+        lpips_scales: scale alignments for which LPIPS is computed.
 
     Returns:
-        Metric key -> value, for the quantities albedo, specular, diffuse, roughness, metallic, normal, environment.
+        Metric key -> value, for the quantities albedo, specular, diffuse, roughness, metallic, normal, environment; and
+        mask, where the prediction has one of its own.
 
     Raises:
         UnirenderError: if the truth has no mask or an empty one, or sizes differ.
@@ -56,6 +63,8 @@ def score_maps(
     w = _truth_mask(truth.mask)
     own = _own_mask(prediction.mask, w)
     values: dict[str, float] = {}
+    if own is not w:
+        values[OWN_MASK] = float(np.minimum(own, w).sum() / np.maximum(own, w).sum())
     colours = [
         (name, p, t) for name in ("albedo", "specular", "diffuse") if (p := getattr(prediction, name)) is not None
         and (t := getattr(truth, name)) is not None
@@ -95,7 +104,7 @@ def score_image(
     prediction_mask: Weights | None = None,
     quantity: str = "relit",
     lpips: Sequence[Lpips] = (),
-    lpips_scales: Sequence[Scale] = ("raw",),
+    lpips_scales: Sequence[Scale] = LPIPS_SCALES,
 ) -> dict[str, float]:
     """Scores a rendered image.
 
@@ -109,7 +118,7 @@ def score_image(
         lpips_scales: scale alignments for which LPIPS is computed.
 
     Returns:
-        Metric key -> value, scales raw and aligned (one factor per image).
+        Metric key -> value, all variants.
 
     Raises:
         UnirenderError: if the mask is empty, sizes differ, or the prediction is not finite.
@@ -118,7 +127,7 @@ def score_image(
     own = _own_mask(prediction_mask, w)
     _check_shapes(quantity, prediction_linear, truth_linear)
     p, t = (unpremultiply(x, m) for x, m in ((prediction_linear, own), (truth_linear, w)))
-    return score_colour(quantity, p, t, w, own, IMAGE_SCALES, lpips, lpips_scales)
+    return score_colour(quantity, p, t, w, own, SCALES, lpips, lpips_scales)
 
 
 def over_white(colour: Rgb, mask: Weights) -> Rgb:
@@ -134,7 +143,7 @@ def score_colour(
     own: Weights,
     scales: Sequence[Scale],
     lpips: Sequence[Lpips] = (),
-    lpips_scales: Sequence[Scale] = ("raw",),
+    lpips_scales: Sequence[Scale] = LPIPS_SCALES,
 ) -> dict[str, float]:
     """PSNR, SSIM and LPIPS of un-premultiplied linear maps, all variants; `own` is the prediction's mask."""
     values: dict[str, float] = {}
@@ -196,11 +205,11 @@ def _truth_mask(mask: Weights | None) -> Weights:
 
 
 def _own_mask(mask: Weights | None, truth: Weights) -> Weights:
-    """The truth's very array where the method has no mask of its own, or the same one."""
+    """The truth's very array where the method has no mask of its own, or the same one as far as 8 bits can tell."""
     if mask is None:
         return truth
     _check_shapes("mask", mask, truth)
-    return truth if np.array_equal(mask, truth) else mask
+    return truth if np.abs(mask - truth).max() <= SAME_MASK + 1e-6 else mask
 
 
 def _check_shapes(name: str, p: np.ndarray, t: np.ndarray) -> None:

@@ -70,7 +70,11 @@ class Column:
 
     def key(self, variant: Variant) -> str:
         """The metric key that the column shows under a variant."""
-        return metric_key(self.quantity, self.metric, dataclasses.replace(variant, **self.overrides))
+        return metric_key(self.quantity, self.metric, self.variant(variant))
+
+    def variant(self, variant: Variant) -> Variant:
+        """The variant with the axes that the column pins."""
+        return dataclasses.replace(variant, **self.overrides)
 
     @property
     def published_key(self) -> str:
@@ -114,6 +118,7 @@ TABLES: dict[str, TableSpec] = {
             Column("Metallic", "metallic", METRICS["mse"], _IN_MASK, uniform_grid=GRID_MSE),
             Column("Roughness", "roughness", METRICS["mse"], _IN_MASK, uniform_grid=GRID_MSE),
             Column("Normal", "normal", METRICS["cosine"]),
+            Column("Mask", "mask", METRICS["iou"], published=False),  # only where some row has one of its own
         ),
         ("single-image",),
         "One image in; maps out. Metallic, roughness and normal are always taken inside the mask.",

@@ -14,6 +14,7 @@ class Subsets:
         optimise: of the rows that optimise each picture.
         pictures: pictures of each such scene in the inverse table.
         views: objects of the multi-view table; 0 = leave it out.
+        mitsuba: of the row *Mitsuba*, which renders as many samples as the truth has; 0 = leave it out.
     """
 
     sample: int | None = 4
@@ -22,7 +23,8 @@ class Subsets:
     optimise: int | None = 4
     pictures: int | None = 2
     views: int | None = 4
+    mitsuba: int | None = 4
 
 
 STANDARD = Subsets()
-WHOLE = Subsets(sample=None, shade=None, physics=None, optimise=None, pictures=None, views=None)
+WHOLE = Subsets(sample=None, shade=None, physics=None, optimise=None, pictures=None, views=None, mitsuba=None)

@@ -8,6 +8,7 @@ the watermark of a partial run, and the protocol below.
 import dataclasses
 import json
 import math
+import textwrap
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any
@@ -23,6 +24,7 @@ from unirender_evaluation.statistics import Estimate
 from unirender_evaluation.tables import Cell, Row, Table
 
 MISSING, NOT_AVAILABLE = "-", "n/a"
+TEX_COLUMN = 13  # letters of a column's heading in LaTeX: longer ones are broken, so that the column stays narrow
 
 
 def format_number(value: float, decimals: int) -> str:
@@ -82,33 +84,41 @@ def to_markdown(table: Table) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A booktabs `table*` in the paper's layout; needs packages booktabs, graphicx and (for ↑ and †) nothing else."""
+    """A booktabs `table*` in the paper's layout; needs packages booktabs and graphicx, and nothing else.
+
+    The title is the caption, protocol and notes stand below; a table that is wider than the page is scaled to it. A
+    name in letters that LaTeX's own fonts do not have needs another engine than pdflatex.
+    """
     groups = [(name, list(columns)) for name, columns in groupby(table.columns, key=lambda column: column.group)]
     doubled = dict(zip(map(id, table.columns), table.published_columns, strict=True))
-    spans = [sum(1 + doubled[id(column)] for column in columns) for _, columns in groups]
     top, rules, start = [""], [], 2
-    for (name, _), span in zip(groups, spans, strict=True):
-        top.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex(name)}}}")
+    for name, columns in groups:
+        span = sum(1 + doubled[id(column)] for column in columns)
+        top.append(rf"\multicolumn{{{span}}}{{c}}{{{_tex_stacked(name, TEX_COLUMN * span)}}}")
         rules.append(rf"\cmidrule(lr){{{start}-{start + span - 1}}}")
         start += span
-    second = ["Method"]
+    second, third = ["Method"], [""]
     for column in table.columns:
         name = _tex(column.metric.label) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
-        second += [f"{name} paper", "here"] if doubled[id(column)] else [name]
+        second.append(rf"\multicolumn{{2}}{{c}}{{{name}}}" if doubled[id(column)] else name)
+        third += ["paper", "here"] if doubled[id(column)] else [""]
     lines = [
         r"\begin{table*}[t]",
         r"\centering",
-        rf"\caption{{\textbf{{{_tex(table.heading)}.}} {_tex_caption(table)}}}",
+        r"\setlength{\belowcaptionskip}{4pt}",
+        rf"\caption{{\textbf{{{_tex(table.heading)}.}}{_tex_watermark(table)}}}",
+        rf"\label{{tab:{table.name}-{table.protocol_key}-{table.variant.label}}}",
+        r"\setlength{\tabcolsep}{4pt}",
+        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{l{'c' * (start - 2)}}}",
+        r"\toprule",
     ]
-    lines += [r"\resizebox{\textwidth}{!}{%", rf"\begin{{tabular}}{{l{'c' * sum(spans)}}}", r"\toprule"]
     lines += [_tex_row(top), "".join(rules), _tex_row(second)]
+    lines += [_tex_row(third)] if any(doubled.values()) else []
     for _, rows in groupby(table.rows, key=lambda row: row.section):
         lines += [r"\midrule", *(_tex_row(_latex_cells(row, table)) for row in rows)]
-    lines += [
-        r"\bottomrule",
-        r"\end{tabular}}",
-        rf"\label{{tab:{table.name}-{table.protocol_key}-{table.variant.mask}}}",
-    ]
+    lines += [r"\bottomrule", r"\end{tabular}}"]
+    lines += [r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {_tex_below(table)}}}"]
     return "\n".join([*lines, r"\end{table*}"]) + "\n"
 
 
@@ -196,9 +206,20 @@ def _latex_cells(row: Row, table: Table) -> list[str]:
     return texts
 
 
-def _tex_caption(table: Table) -> str:
-    watermark = rf"\textbf{{{_tex(table.watermark)}.}} " if table.watermark else ""
-    return watermark + " ".join(_tex(text) for text in (f"{protocol_text(table.protocol)}.", *table.notes))
+def _tex_stacked(text: str, width: int) -> str:
+    """The text in as many lines as it needs where one has `width` letters."""
+    lines = [_tex(line) for line in textwrap.wrap(text, width, break_long_words=False)]
+    stacked = r" \\ ".join(lines)
+    return rf"\shortstack{{{stacked}}}" if len(lines) > 1 else stacked
+
+
+def _tex_watermark(table: Table) -> str:
+    return rf" \textbf{{{_tex(table.watermark)}.}}" if table.watermark else ""
+
+
+def _tex_below(table: Table) -> str:
+    """Protocol and notes, each a sentence."""
+    return " ".join(_tex(f"{text.rstrip('.')}.") for text in (protocol_text(table.protocol), *table.notes))
 
 
 def _tex_rank(text: str, rank: int | None) -> str:
@@ -209,13 +230,31 @@ def _tex_number(text: str) -> str:
     return text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
 
 
+# Characters that mean something to TeX, or are no letters of its fonts; `--` would become a dash.
+_TEX = str.maketrans(
+    {character: rf"\{character}" for character in "&%_#${}"}
+    | {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "|": r"\textbar{}",
+        "†": r"$^\dagger$",
+        "·": r"$\cdot$",
+        "±": r"$\pm$",
+        "\N{MULTIPLICATION SIGN}": r"$\times$",
+        "≥": r"$\geq$",
+        "≤": r"$\leq$",
+        "→": r"$\to$",
+        "\N{MINUS SIGN}": r"$-$",
+        "∞": r"$\infty$",
+    }
+)
+
+
 def _tex(text: str) -> str:
-    for old, new in (("\\", r"\textbackslash "), ("&", r"\&"), ("%", r"\%"), ("_", r"\_"), ("#", r"\#"), ("$", r"\$")):
-        text = text.replace(old, new)
-    symbols = (("†", r"$^\dagger$"), ("·", r"$\cdot$"), ("±", r"$\pm$"))
-    for old, new in symbols:
-        text = text.replace(old, new)
-    return text
+    return text.translate(_TEX).replace("--", "-{}-")
 
 
 def _tex_row(texts: Iterable[str]) -> str:

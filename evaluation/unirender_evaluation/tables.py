@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, values_of
-from unirender_evaluation.metrics import DEFAULT_VARIANT, Metric, Variant
+from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.protocol import protocol_line
 from unirender_evaluation.published import PublishedRow, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
 
+OTHER_AXES = {"linear": "linear light", "aligned": "scale-aligned", "aligned_rgb": "scale-aligned per channel"}
 RANKED_KINDS = ("ours", "paper", "optimisation", "baseline", "external", "trivial")  # bounds are no competitors
 KIND_ORDER = ("ours", "paper", "optimisation", "external", "baseline", "trivial", "ceiling", "reference")
 SECTIONS = {
@@ -84,9 +85,10 @@ class Table:
     @property
     def heading(self) -> str:
         """The title with its protocol, where that says more, and what is counted."""
-        suffix = "" if self.subset == "main" else f", {self.subset}"
         same = self.protocol_label.casefold() == self.title.casefold()
-        return f"{self.title}{'' if same else f': {self.protocol_label}'} ({self.variant.mask}{suffix})"
+        other = [OTHER_AXES[word] for word in (self.variant.space, self.variant.scale) if word in OTHER_AXES]
+        counted = [self.variant.mask, *other, *(() if self.subset == "main" else (self.subset,))]
+        return f"{self.title}{'' if same else f': {self.protocol_label}'} ({', '.join(counted)})"
 
 
 def build_table(
@@ -104,7 +106,7 @@ def build_table(
         spec: columns and title.
         records: of any table; those of this table, protocol and subset are used.
         run: the rows' descriptions and the protocol.
-        protocol: key of `PROTOCOLS`. Published values appear only where it carries them and the frame is whole.
+        protocol: key of `PROTOCOLS`. Published values appear only where it carries them, under `PUBLISHED_VARIANT`.
         variant: how numbers are taken, where a column does not pin it.
         subset: population.
 
@@ -116,7 +118,7 @@ def build_table(
     declared = PROTOCOLS[protocol]
     chosen = Selection(spec.name, protocol, subset).of(records)
     methods = [run.method(key) for key in dict.fromkeys(record.method for record in chosen)]
-    show_published = declared.published and variant.mask == "whole" and subset == "main"
+    show_published = declared.published and variant == PUBLISHED_VARIANT and subset == "main"
     spec = _answered(spec, chosen, show_published)
     measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
     rows = _merge(published_tables().get(spec.name, ()) if show_published else (), spec, measured)
@@ -142,11 +144,17 @@ def build_tables(
     records: Sequence[Record],
     run: RunInfo,
     specs: Mapping[str, TableSpec] | None = None,
-    variants: Sequence[Variant] = (Variant("whole"), Variant("masked")),
+    variants: Sequence[Variant] | None = None,
 ) -> list[Table]:
-    """Every table, protocol and subset that has records; the paper's protocol in each variant, the others masked.
+    """Every table, protocol and subset that has records.
 
-    Whole frame is for the column beside the paper's; masked is what we believe.
+    Args:
+        records: of any table.
+        run: the rows' descriptions and the protocol.
+        specs: tables by name; None: those of the paper.
+        variants: each table in each of these; where two differ only on axes that no column of a table has (as in the
+            physics table), it appears once. None: masked, which is what we believe, and before it, where published
+            values stand, the whole frame that they were taken on.
     """
     tables = []
     for spec in (TABLES if specs is None else specs).values():
@@ -156,9 +164,17 @@ def build_tables(
                 if not any(record.subset == subset for record in found):
                     continue
                 carries = PROTOCOLS[protocol].published and subset == "main"
-                for variant in variants if carries else [v for v in variants if v.mask == "masked"] or variants[:1]:
+                usual = (PUBLISHED_VARIANT, DEFAULT_VARIANT) if carries else (DEFAULT_VARIANT,)
+                for variant in usual if variants is None else _telling(spec, variants):
                     tables.append(build_table(spec, records, run, protocol=protocol, variant=variant, subset=subset))
     return tables
+
+
+def _telling(spec: TableSpec, variants: Sequence[Variant]) -> list[Variant]:
+    """The variants that give a table other numbers than one before; axes that none of its columns has are the usual."""
+    axes = {axis for column in spec.columns for axis in column.metric.axes if axis not in column.overrides}
+    usual = {name: getattr(DEFAULT_VARIANT, name) for name in ("mask", "space", "scale") if name not in axes}
+    return list(dict.fromkeys(dataclasses.replace(variant, **usual) for variant in variants))
 
 
 def _answered(spec: TableSpec, records: Sequence[Record], show_published: bool) -> TableSpec:
@@ -175,7 +191,8 @@ def _measured_row(spec: TableSpec, records: Sequence[Record], run: RunInfo, info
     for column in spec.columns:
         values = values_of(records, info.key, column.key(variant))
         backbone = column.metric.name.removeprefix("lpips_")
-        missing = column.metric.name.startswith("lpips_") and backbone not in run.lpips
+        asked_for = column.metric.name.startswith("lpips_") and column.variant(variant).scale in LPIPS_SCALES
+        missing = asked_for and backbone not in run.lpips
         if values:
             estimate = bootstrap_mean(list(values.values()), [objects[sample] for sample in values])
             cells.append(Cell(measured=estimate))
@@ -248,5 +265,6 @@ def _notes(spec: TableSpec, rows: Iterable[Row], total: int) -> tuple[str, ...]:
         )
     if any(cell.unavailable for row in rows for cell in row.cells):
         notes.append("n/a: the LPIPS backbone's weights are not on this machine (unirender_evaluation.lpips_convert).")
-    stored = [f"{row.label}: stored, not measured in this run ({row.stored})" for row in rows if row.stored]
-    return tuple(notes + stored)
+    origins = dict.fromkeys(row.stored for row in rows if row.stored)
+    stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
+    return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))

@@ -5,10 +5,10 @@ from PIL import Image
 
 from unirender.color import unpremultiply
 from unirender.files import map_picture
+from unirender_evaluation.figures import Grid, Line, Tile, draw, over_white
 from unirender_evaluation.gallery import Picture
 from unirender_evaluation.multiview_scenes import MultiviewScene
 from unirender_evaluation.multiview_scoring import Looks, true_looks
-from unirender_evaluation.strip import Panel, draw_strip, over_white
 
 CAMERAS = 2  # of the held-out ones are shown
 MAPS = ("albedo", "normal", "roughness", "metallic")
@@ -23,10 +23,11 @@ def found_strip(scene: MultiviewScene, looks: Looks) -> Image.Image:
     """
     count = min(CAMERAS, len(scene.held_out_poses))
     ours, true = ([camera_panels(scene, one, camera) for camera in range(count)] for one in (looks, true_looks(scene)))
-    panels: list[list[Panel]] = [
-        [(name, found[name], given[name]) for name in found] for found, given in zip(ours, true, strict=True)
-    ]
-    return draw_strip(panels)
+    lines = []
+    for found, given in zip(ours, true, strict=True):
+        lines.append(Line("unirender", tuple(map(Tile, found.values())), starts=True))
+        lines.append(Line("Mitsuba", tuple(Tile(given[name]) for name in found)))
+    return draw(Grid(tuple(ours[0]), tuple(lines)))
 
 
 def camera_panels(scene: MultiviewScene, looks: Looks, camera: int) -> dict[str, Picture]:

@@ -5,8 +5,9 @@ uses, so that a change of the network's code leaves the composite's records vali
 
     core        shared vocabulary, tasks, methods, metrics
     lpips       the backbones' weights, by content: every row whose pictures are scored
-    model       the network, its diffusion and pipeline: our rows, and plug-ins, which may call them
-    reference   Mitsuba, the generators of shapes and the lights with their data: every row that renders
+    model       the network, its diffusion and pipeline, and the adapters of others' pipelines: our rows, and plug-ins,
+                which may call them
+    reference   Mitsuba, its row, the generators of shapes and the lights with their data: every row that renders
     optimizer   inverse rendering by optimisation: its rows
     multiview   scenes and scores of the multi-view table: its rows
 """
@@ -47,27 +48,53 @@ class Part:
 # Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
 # the records anew at the end of every run.
 COMMANDS = (
+    "__init__",
+    "*_command",
+    "*_commands",
     "benchmark",
     "commands",
+    "crosscheck*",
+    "dry_run",
     "export",
     "lpips_convert",
+    "physics_run",
+    "physics_tracer",
     "prediction_check",
+    "score_api",
     "subsets",
+    "throughput*",
     "truth",
     "validation",
     "workers",
 )
-FROM_RECORDS = ("claims", "comparisons", "protocol", "published", "readme", "statistics", "table*", "verdict")
-PICTURES = ("figures*", "gallery*", "pictures*", "report*", "strip")
+FROM_RECORDS = (
+    "claims",
+    "comparisons",
+    "docs_tables",
+    "merge",
+    "protocol",
+    "published",
+    "readme",
+    "results_*",
+    "schema*",
+    "statistics",
+    "table*",
+    "verdict",
+)
+PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
 VIEWS = ("light_metrics", "multiview_*")
+ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-ins do
+MITSUBA_ROW = ("mitsuba_method",)
 # Commands of their own, whose records hold `modules_version` of what measures.
 STUDIES = (
     "derived_light_study*",
     "optimiser_study*",
+    "public_*",
     "sampling_study*",
     "speed_study*",
+    "study_rows",
     "training_study*",
     "unknown_mesh*",
     "warm_start*",
@@ -114,13 +141,25 @@ PARTS: Mapping[str, Part] = {
             *(f"unirender/{name}.py" for name in ("cli", "command_line", "commands", "options")),
             *(
                 f"unirender_evaluation/{name}.py"
-                for name in (*COMMANDS, *FROM_RECORDS, *PICTURES, *OPTIMIZED, *VIEWS, *STUDIES, "versions")
+                for name in (
+                    *(*COMMANDS, *FROM_RECORDS, *PICTURES, *STUDIES, "versions"),
+                    *(*OPTIMIZED, *VIEWS, *ADAPTERS, *MITSUBA_ROW),
+                )
             ),
         ),
     ),
-    MODEL: Part({"unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py")}, ("torch", "diffusers")),
+    MODEL: Part(
+        {
+            "unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py"),
+            "unirender_evaluation": tuple(f"{name}.py" for name in ADAPTERS),
+        },
+        ("torch", "diffusers"),
+    ),
     REFERENCE: Part(
-        {"unirender_reference": ("**/*.py", "data/**/*.*")},
+        {
+            "unirender_reference": ("**/*.py", "data/**/*.*"),
+            "unirender_evaluation": tuple(f"{name}.py" for name in MITSUBA_ROW),
+        },
         ("mitsuba", "drjit", "karellen-llvm-core"),
         ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in NOT_IN_RECORDS)),
         ("UNIRENDER_MITSUBA_VARIANT",),

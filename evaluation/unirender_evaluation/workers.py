@@ -8,10 +8,11 @@ from pathlib import Path
 
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import Job, content_key, method_jobs
+from unirender_evaluation.mitsuba_method import mitsuba_jobs
 from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
-from unirender_evaluation.rows import Row
+from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions
@@ -45,8 +46,11 @@ class Run:
         keeper = Pictures(self.pictures, self.suite, self.scenes)
         yield from method_jobs(self.suite, self.rows, self.scenes, scene, self.versions, self.backbones, keeper)
         yield from ceiling_jobs(self.suite, scene, key_of, self.backbones)
-        if scene in physics_scenes(self.suite, self.scenes, self.subsets.physics):
-            yield from physics_jobs(self.suite, scene, self.rows, key_of)
+        yield from mitsuba_jobs(self.suite, self.scenes, scene, key_of, self.backbones, self.subsets.mitsuba)
+        chosen = physics_scenes(self.suite, self.scenes, self.subsets.physics)
+        if scene in chosen:
+            with_mitsuba = scene in evenly(chosen, self.subsets.mitsuba)
+            yield from physics_jobs(self.suite, scene, self.rows, key_of, with_mitsuba)
 
     def key_of(self, scene: Scene) -> KeyOf:
         """Makes the content keys of records of a scene."""

@@ -1,5 +1,7 @@
 """`bench run`: which rows a configuration asks for, what stops it, and a whole run with Mitsuba, twice."""
 
+import csv
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,6 +17,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
 from unirender_evaluation.commands import BenchRun
+from unirender_evaluation.metrics import ALL_VARIANTS
 from unirender_evaluation.prediction_check import PredictionError
 from unirender_evaluation.rows import make_row, trivial_rows
 from unirender_evaluation.suites import Suite, load_suite
@@ -135,7 +138,7 @@ def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert first.truth_check["passed"], first.truth_check
     assert first.computed == len(first.records) > 0
     names = {"records.jsonl", "run.json", "truth_check.json", "tables.md", "tables.tex", "tables.json", "verdict.txt"}
-    assert names | {"report.html"} <= {path.name for path in out.iterdir()}
+    assert names | {"report.html", "records.csv"} <= {path.name for path in out.iterdir()}
     assert "limit 2" in (out / "tables.md").read_text()
     assert all(table.watermark for table in first.tables)
     assert not ceiling_breaches(first.records)
@@ -149,8 +152,15 @@ def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "against noise-ceiling" not in first.verdict
     assert "noise-ceiling, difference" in first.verdict
     assert "ours" not in first.verdict
-    second = run(config, Console())
+    with (out / "records.csv").open(newline="") as file:
+        lines = [(row["method"], row["sample"], row["metric"], float(row["value"])) for row in csv.DictReader(file)]
+    assert lines == [(r.method, r.sample, *item) for r in first.records for item in sorted(r.values.items())]
+    second = run(replace(config, variants=ALL_VARIANTS), Console())
     assert f"check seed {first.truth_check['seed']}" in " ".join(capsys.readouterr().out.split())
     assert second.computed == 0
     assert [r.to_json() for r in second.records] == [r.to_json() for r in first.records]
     assert second.verdict == first.verdict
+    inverse = [table for table in second.tables if table.name == "inverse"]
+    assert [table.variant for table in inverse] == list(ALL_VARIANTS)
+    assert all(row.cells[0].measured for table in inverse for row in table.rows if row.key == "guess")
+    assert all(table.heading in (out / "tables.md").read_text() for table in inverse)

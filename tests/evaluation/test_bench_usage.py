@@ -47,6 +47,14 @@ def test_values_outside_their_range(
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", [["run"], ["report", "run"], ["tables", "results.json"]])
+def test_a_word_that_no_axis_of_a_variant_has(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--variant", "masked-linear", "--variant", "whole-shiny"]
+    status, printed = refused(["bench", *command, *words], capsys)
+    assert status == 2
+    assert "--variant masked-linear whole-shiny: variant 'whole-shiny': got 'shiny', expected one word" in printed
+
+
 def test_an_unknown_device_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, printed = refused(["bench", "run", "--device", "foo", "--out", str(tmp_path / "out")], capsys)
     assert status == 2

@@ -17,14 +17,18 @@ from unirender_evaluation import engine
 from unirender_evaluation.engine import KEY_PREFIX, Prediction, Store, content_key, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
+from unirender_evaluation.metrics import OWN_MASK
+from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
+from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run, run_in_workers
 
+NO_MITSUBA = Subsets(mitsuba=0)
 TEST_VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
 
 
@@ -65,10 +69,22 @@ class Guess:
         return (0.4 * maps["albedo"] * maps["mask"]).astype(np.float32)
 
 
+class Halved(Guess):
+    """The same, which thinks that the object ends in the middle."""
+
+    name = "halved"
+    config: dict[str, Any] = {"guess": 1, "mask": "left half"}  # noqa: RUF012 - a constant of the test
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        half = mask * (np.arange(mask.shape[1]) < mask.shape[1] // 2)[:, None].astype(np.float32)
+        return super().decompose(image_srgb, mask, camera).replace(mask=half)
+
+
 def evaluate(suite: Suite, rows: list[Row], path: Path, stop_after: int | None = None) -> list[Record]:
     """The engine without Mitsuba and without LPIPS; after `stop_after` records it is killed."""
     store = Store.open(path)
-    whole = Run(suite, rows, list(suite.scenes), TEST_VERSIONS, (), path.parent / "pictures" / path.stem)
+    pictures = path.parent / "pictures" / path.stem
+    whole = Run(suite, rows, list(suite.scenes), TEST_VERSIONS, (), pictures, NO_MITSUBA)
     done = 0
     for scene in suite.scenes:
         for job in whole.jobs(scene):
@@ -133,7 +149,7 @@ def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
 
 def test_workers_give_the_same_numbers(suite: Suite, tmp_path: Path) -> None:
     here = evaluate(suite, trivial_rows(), tmp_path / "here.jsonl")
-    whole = Run(suite, (), list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures")
+    whole = Run(suite, (), list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
     made = [r for records in run_in_workers(whole, trivial_rows, [suite.scenes[0]], frozenset(), 1) for r in records]
     expected = {r.key: r.values for r in here}
     found = {r.key: r.values for r in made if r.table != "physics"}
@@ -204,6 +220,25 @@ def test_records_of_other_code_are_dropped(suite: Suite, tmp_path: Path) -> None
     assert not any(Store.open(path).has(record.key) for record in whole)
 
 
+def test_maps_are_scored_with_the_mask_that_they_bring_and_pictures_with_the_true_one(
+    suite: Suite, tmp_path: Path
+) -> None:
+    records = evaluate(suite, [make_row(m, "external") for m in (Guess(), Halved())], tmp_path / "r.jsonl")
+    values = {(r.table, r.protocol, r.sample, r.method): dict(r.values) for r in records}
+    assert [mask_source(key, records) for key in ("guess", "halved")] == ["pasted", "own"]
+    with_maps = set()
+    for (table, protocol, sample, method), own in values.items():
+        if method == "halved":
+            pasted = values[table, protocol, sample, "guess"]
+            different = {key for key in pasted if own[key] != pasted[key]}
+            assert all("@whole" in key and not key.startswith(("relit", "edit")) for key in different)
+            if OWN_MASK in own:
+                with_maps.add((table, protocol))
+                assert 0.2 < own[OWN_MASK] < 0.8
+            assert bool(different) == (own.keys() - pasted.keys() == {OWN_MASK})
+    assert with_maps == {("inverse", "single-image"), ("relighting", "from-image-sd")}
+
+
 def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
     """A stranger's method, called and read back from EXR files: the same numbers to half-float rounding."""
     method, folder = Guess(), tmp_path / "guess"
@@ -228,7 +263,7 @@ def test_export_writes_inputs_and_no_truth(suite: Suite, tmp_path: Path) -> None
     count = export_inputs(suite, tmp_path / "out")
     assert count == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, list(suite.scenes)))
     names = {path.name for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    assert names == {"image.png", "meta.json", "given.exr", "environment.exr"}
+    assert names == {"image.png", "mask.exr", "meta.json", "given.exr", "environment.exr"}
     for meta in (tmp_path / "out").glob("*/meta.json"):
         for answer, question in json.loads(meta.read_text())["answers"].items():
             assert {"table", "protocol"} <= set(question)

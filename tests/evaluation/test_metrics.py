@@ -15,7 +15,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender_evaluation import metrics
-from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_variants, metric_key
 
 
 def images(seed: int, height: int = 40, width: int = 33, distance: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
@@ -166,6 +166,19 @@ def test_variants_are_read_from_text() -> None:
     for bad in ("whole-blue", "whole-masked"):
         with pytest.raises(UnirenderError, match="expected one word per axis"):
             Variant.parse(bad)
+
+
+def test_what_the_option_asks_for() -> None:
+    assert chosen_variants([]) is None
+    assert chosen_variants(["all"]) == ALL_VARIANTS
+    assert len({variant.label for variant in ALL_VARIANTS}) == 12
+    assert chosen_variants(["linear", "masked-linear"]) == (Variant("masked", "linear"),)  # the same one, once
+    found = chosen_variants(["whole", "all"]) or ()
+    assert found[0] == Variant("whole")
+    assert set(found) == set(ALL_VARIANTS)
+    assert len(found) == 12
+    with pytest.raises(UnirenderError, match="got 'none', expected one word per axis"):
+        chosen_variants(["all", "none"])
 
 
 def test_a_perfect_value_is_better_than_any_other() -> None:

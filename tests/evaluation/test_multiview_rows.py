@@ -17,10 +17,11 @@ from unirender_evaluation.multiview_rows import TRIVIAL_USES, multiview_jobs
 from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.report import ALL_TABLES, write_report
+from unirender_evaluation.report import write_report
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.table_formats import to_json, to_latex, to_markdown
+from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
@@ -98,7 +99,6 @@ def test_a_lost_picture_is_made_again(suite: Suite, rows: list[Row], folder: Pat
     assert [job.kept for job in jobs(suite, rows, folder / "elsewhere")] == [True, False], "the ceiling has none"
 
 
-@pytest.mark.report
 def test_the_report_shows_what_was_found(
     suite: Suite, rows: list[Row], folder: Path, records: list[Record], table: Table
 ) -> None:

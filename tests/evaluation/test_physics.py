@@ -1,7 +1,4 @@
-"""Each physics test: a perfect renderer passes, and a broken one (its twin) fails that test."""
-
-from collections.abc import Callable
-from pathlib import Path
+"""Each physics test: a perfect renderer or decomposer passes, and a broken one (its twin) fails that test."""
 
 import numpy as np
 import pytest
@@ -10,11 +7,14 @@ from tiny_suites import make_suite
 from unirender.intrinsics import Intrinsics
 from unirender.symmetries import quarter_turn
 from unirender_evaluation import physics
-from unirender_evaluation.methods import Composite
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.physics_stage import LEVELS, ROUGH, Stage
+from unirender_evaluation.physics_tests import PHYSICS_TABLE, TESTS, renderer_tests, rough_loop, true_maps
+from unirender_evaluation.suites import Material, Suite
 
 PERFECT = Composite().render
-Render = Callable[[Intrinsics], np.ndarray]
+EXACT = tuple(test.name for test in TESTS.values() if test.asks == "render" and test.expected == 0)
 
 
 @pytest.fixture(scope="module")
@@ -22,39 +22,23 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     return make_suite(tmp_path_factory.mktemp("physics"), objects=1)
 
 
-def broken(change: Callable[[np.ndarray, Intrinsics], np.ndarray]) -> Render:
-    return lambda maps: change(PERFECT(maps), maps).astype(np.float32)
-
-
-def horizontal_gradient(image: np.ndarray, _: Intrinsics) -> np.ndarray:
-    return image * np.linspace(0.7, 1.3, image.shape[1])[None, :, None]
-
-
-TWINS: dict[str, Render] = {
-    "superposition": broken(lambda image, _: image**0.8),
-    "exposure_linearity": broken(lambda image, _: image**0.8),
-    "white_furnace": broken(lambda image, _: 0.8 * image),
-    "mirror_flip": broken(horizontal_gradient),
-    "roll": broken(horizontal_gradient),
-    "metallic_linearity": lambda maps: PERFECT(maps.replace(metallic=maps.require("metallic")["metallic"] ** 2)),
-}
-
-
-@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize("name", EXACT)
 def test_perfect_renderer_passes_and_twin_fails(name: str, suite: Suite) -> None:
-    scene = suite.scenes[0]
-    good = physics.renderer_tests(PERFECT, suite, scene)[name]
-    bad = physics.renderer_tests(TWINS[name], suite, scene)[name]
+    stage, test = Stage(suite, suite.scenes[0]), TESTS[name]
+    good, bad = test.run(PERFECT, stage), test.run(test.twin, stage)
     assert good < 1e-4
     assert bad > 0.03
+    assert test.fails(bad, good)
+    assert not test.fails(good, good)
 
 
 def test_roughness_response(suite: Suite) -> None:
     """The composite's truth is its own composite: correlation 1; a renderer blind to roughness scores 0."""
-    scene = suite.scenes[1]
-    assert physics.renderer_tests(PERFECT, suite, scene)["roughness_response"] > 0.99
-    blind = lambda maps: PERFECT(maps.replace(specular=maps.require("diffuse")["diffuse"]))  # noqa: E731 - a broken twin
-    assert abs(physics.renderer_tests(blind, suite, scene)["roughness_response"]) < 1e-6
+    stage, test = Stage(suite, suite.scenes[1]), TESTS["roughness_response"]
+    good, bad = test.run(PERFECT, stage), test.run(test.twin, stage)
+    assert good > 0.99
+    assert abs(bad) < 1e-6
+    assert test.fails(bad, good)
 
 
 def test_quarter_turn_is_a_symmetry_of_the_world(suite: Suite) -> None:
@@ -79,18 +63,72 @@ def test_mirror_of_derived_light_is_exact(suite: Suite) -> None:
 
 def test_closed_loop_of_true_maps(suite: Suite) -> None:
     """The true maps shaded by the composite are the truth of this suite, under either light; wrong maps are not."""
-    scene = suite.scenes[0]
-    maps = suite.intrinsics(scene, suite.spec.base)
-    shaders = {"composite": physics.composite_shader}
-    loops = physics.closed_loop(maps, suite, scene, shaders)
-    for name, lit in (("composite_input", scene), ("composite_heldout", suite.other_light(scene))):
-        truth = suite.image(lit, suite.spec.base)
-        assert physics.relative_error(loops[name], truth) < 2e-3
-    wrong = physics.closed_loop(maps.replace(albedo=0.5 * maps.require("albedo")["albedo"]), suite, scene, shaders)
-    assert physics.relative_error(wrong["composite_input"], suite.image(scene, suite.spec.base)) > 0.1
+    stage = Stage(suite, suite.scenes[0])
+    for name in ("composite_input", "composite_heldout"):
+        test = TESTS[name]
+        good, bad = test.run(true_maps, stage), test.run(test.twin, stage)
+        assert good > 50
+        assert bad < 30
+        assert test.fails(bad, good)
 
 
-def test_every_test_has_a_column(suite: Suite, tmp_path: Path) -> None:
-    columns = {column.quantity for column in physics.PHYSICS_TABLE.columns}
-    assert columns == set(physics.RENDERER_TESTS) | set(physics.CLOSED_LOOPS)
-    assert set(physics.renderer_tests(PERFECT, suite, suite.scenes[0])) == set(physics.RENDERER_TESTS)
+class OneShading(Stage):
+    """The composite in Mitsuba's place: nothing is rendered, and the loops of the true maps are exact here."""
+
+    def shaded(self, maps: Intrinsics, shader: object, light: object) -> Image:
+        return super().shaded(maps, "composite", light)  # type: ignore[arg-type]  # one of Light
+
+
+def test_loss_is_what_the_found_maps_lose(suite: Suite) -> None:
+    stage = OneShading(suite, suite.scenes[0])
+    for name in ("loss_input", "loss_heldout", "loss_rough"):
+        test = TESTS[name]
+        assert test.run(true_maps, stage) == 0.0
+        assert test.fails(test.run(test.twin, stage), 0.0)
+    direct = TESTS["shade_input"].run(true_maps, stage) - TESTS["shade_input"].run(TESTS["shade_input"].twin, stage)
+    assert TESTS["loss_input"].run(TESTS["loss_input"].twin, stage) == pytest.approx(direct)
+
+
+def test_the_primary_loop_takes_the_rough_pictures(suite: Suite) -> None:
+    """A decomposer that is wrong on smooth pictures alone loses nothing in the primary figure, all in the other."""
+    stage = OneShading(suite, suite.scenes[0])
+
+    def wrong_where_smooth(stage: Stage, material: Material, image: Image) -> Intrinsics:
+        return (true_maps if material[1] >= ROUGH else TESTS["loop_smooth"].twin)(stage, material, image)
+
+    assert rough_loop(True, wrong_where_smooth, stage) == rough_loop(True, true_maps, stage)
+    assert rough_loop(False, wrong_where_smooth, stage) < rough_loop(False, true_maps, stage) - 10
+    assert {m[1] >= ROUGH for m in stage.pictures} == {True, False}
+
+
+@pytest.mark.parametrize("parameter", ["roughness", "metallic"])
+def test_tau_ranks_the_sweep(parameter: str, suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The true maps rank their 11 pictures, reversed ones rank them backwards, a constant (the twin) not at all."""
+    stage, test = Stage(suite, suite.scenes[0]), TESTS[f"tau_{parameter}"]
+    monkeypatch.setattr(Stage, "image", lambda self, material: np.zeros((32, 32, 3), np.float32))
+
+    def backwards(stage: Stage, material: Material, _: Image) -> Intrinsics:
+        return stage.true_maps((1 - material[0], 1 - material[1]))
+
+    assert test.run(true_maps, stage) == pytest.approx(1.0)
+    assert test.run(backwards, stage) == pytest.approx(-1.0)
+    assert test.run(test.twin, stage) == 0.0
+    assert test.fails(0.0, 1.0)
+
+
+def test_kendall_tau_counts_pairs() -> None:
+    """One swapped neighbour among n(n-1)/2 pairs costs two of them."""
+    swapped = [1, 0, *range(2, 11)]
+    assert physics.kendall_tau(LEVELS, [float(x) for x in swapped]) == pytest.approx(1 - 2 / 55)
+
+
+def test_every_test_is_defined_and_has_a_column(suite: Suite) -> None:
+    columns = {column.key(DEFAULT_VARIANT) for column in PHYSICS_TABLE.columns}
+    assert columns == {test.key for test in TESTS.values() if test.in_run}
+    assert set(renderer_tests(PERFECT, Stage(suite, suite.scenes[0]))) == {
+        test.name for test in TESTS.values() if test.asks == "render"
+    }
+    for test in TESTS.values():
+        assert test.formula
+        assert test.twin_is
+        assert test.margin > 0

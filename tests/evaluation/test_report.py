@@ -1,11 +1,9 @@
 """The report: one file, nothing from the network, failures first, both themes; and the gallery's pictures."""
 
 import base64
-import html
 import io
+import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,58 +11,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from report_pieces import RUN, SIZE, item, mask, records
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import Prediction
-from unirender_evaluation.gallery import GalleryItem, data_uri, flip_map, image_picture, map_pictures, picture_rows
+from unirender_evaluation.gallery import (
+    GALLERY_BYTES,
+    data_uri,
+    flip_map,
+    image_picture,
+    map_pictures,
+    picture_rows,
+    picture_size,
+    shelves,
+    shown_width,
+    shrink_covered,
+)
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_records, write_run
-from unirender_evaluation.report import ALL_TABLES, leading_row, rebuild, report_run, write_report
+from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
+from unirender_evaluation.report import leading_row, rebuild, report_run, write_report
 from unirender_evaluation.report_plots import Scale, heading, tiles
+from unirender_evaluation.report_samples import make_sheets
+from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_tables
 from unirender_evaluation.tasks import tasks
-
-SIZE = 24
-RUN = RunInfo(
-    "tiny",
-    "abcdef0123456789",
-    SIZE,
-    (
-        MethodInfo("ours", "Ours <mean>", "ours", "Ours", 1, 1, 0),
-        MethodInfo("input", "Input as albedo", "trivial"),
-        MethodInfo("ceiling", "Noise ceiling", "ceiling"),
-    ),
-    lpips=("alex",),
-    limit=2,
-)
-
-
-def mask() -> np.ndarray:
-    y, x = np.mgrid[0:SIZE, 0:SIZE] - (SIZE - 1) / 2
-    return np.clip(9 - np.hypot(y, x), 0, 1).astype(np.float32)[..., None]
-
-
-def records() -> list[Record]:
-    made = []
-    for method, level in (("ours", 20.0), ("input", 12.0), ("ceiling", 45.0)):
-        for i in range(6):
-            values = {metric_key("albedo", "psnr", Variant(m)): level + i for m in ("masked", "whole")}
-            made.append(Record("inverse", "single-image", method, f"s{i}", f"o{i // 2}", values))
-    return made
-
-
-def item(sample: str, place: int = 1, rank: str = "") -> GalleryItem:
-    rng = np.random.default_rng(0)
-    truth, other = rng.random((2, SIZE, SIZE, 3), dtype=np.float32)
-    maps = {"albedo": truth, "normal": other}
-    return GalleryItem(
-        "inverse", "single-image", sample, f"caption {sample}", mask(), {"image": other}, maps,
-        {"ours": maps, "input": {"albedo": other}}, {"ours": {"albedo": "20.0 dB"}},
-        question=f"question {sample}", rank=rank, place=place, count=6, leader="ours", figure=f"PSNR {place} dB",
-    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -300,30 +273,74 @@ def test_a_report_made_again_is_the_same_without_a_row_of_ours(tmp_path: Path) -
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == first
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-PROBE = """<iframe id="f" style="width:{width}px;height:800px;border:0" srcdoc="{page}"></iframe><script>
-f.onload = () => {{ const d = f.contentDocument.documentElement; document.title = d.scrollWidth + " of " + {width}; }}
-</script>"""
+def samples_of(page: str) -> list[dict]:
+    """The page's own numbers."""
+    (data,) = re.findall(r'<script type="application/json" id="samples-json">(.*?)</script>', page, re.DOTALL)
+    return json.loads(data)
 
 
-def in_chromium(page: str, folder: Path, width: int) -> tuple[str, list[str]]:
-    """("scroll width of frame width", console messages) of a page in a frame of that width."""
-    path = folder / "probe.html"
-    path.write_text(PROBE.format(width=width, page=html.escape(page)), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--enable-logging=stderr"]
-    command = [str(CHROMIUM), *options, f"--user-data-dir={folder / 'profile'}", "--dump-dom", path.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    title = re.search("<title>(.*?)</title>", done.stdout)
-    assert title is not None, done.stdout[:500]
-    return title[1], [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
+def test_every_value_of_every_sample_is_in_the_page_as_the_tables_round_it(page: str) -> None:
+    (section,) = samples_of(page)
+    assert [method["label"] for method in section["methods"]] == ["Ours <mean>", "Input as albedo", "Noise ceiling"]
+    keys = [column["key"] for column in section["columns"]]
+    assert keys.index(metric_key("albedo", "psnr", Variant("masked"))) < keys.index(
+        metric_key("albedo", "psnr", Variant("whole"))
+    ), "what we believe comes first"
+    found = {
+        (method["label"], sample["id"], key): value
+        for sample in section["samples"]
+        for method, row in zip(section["methods"], sample["values"], strict=True)
+        for key, value in zip(keys, row or [], strict=bool(row))
+        if value is not None
+    }
+    labels = {info.key: info.label for info in RUN.methods}
+    expected = {(labels[r.method], r.sample, key): round(v, 2) for r in records() for key, v in r.values.items()}
+    assert found == expected
 
 
-@pytest.mark.report
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-def test_in_a_browser_nothing_fails_and_a_phone_does_not_scroll_sideways(page: str, tmp_path: Path) -> None:
-    assert in_chromium(page, tmp_path, 390) == ("390 of 390", [])
-    wide = page.replace("</main>", '<p style="width:500px">wide</p><script>no_such_function()</script></main>')
-    title, messages = in_chromium(wide, tmp_path, 390)
-    assert int(title.split()[0]) > 390
-    assert "no_such_function is not defined" in messages[0]
+def test_infinite_values_and_rows_without_an_answer_are_told_apart(tmp_path: Path) -> None:
+    key = metric_key("albedo", "psnr")
+    made = [*records(), Record("inverse", "single-image", "ours", "alone", "o9", {key: float("inf")})]
+    page = write_report(tmp_path / "r.html", build_tables(made, RUN), [], RUN, made).read_text(encoding="utf-8")
+    (alone,) = [sample for sample in samples_of(page)[0]["samples"] if sample["id"] == "alone"]
+    assert "inf" in alone["values"][0]
+    assert alone["values"][1:] == [None, None]
+
+
+def test_sheets_take_the_worst_first_and_no_more_than_their_limit() -> None:
+    items = [item(f"s{i}", place=i + 1) for i in range(6)]
+    one = len(make_sheets(items[:1])["inverse", "single-image", "s0"].uri)
+    sheets = make_sheets(iter(items), limit=3 * one + 10)
+    assert [sample for _, _, sample in sheets] == ["s0", "s1", "s2"]
+    sheet = sheets["inverse", "single-image", "s0"]
+    assert (sheet.names, sheet.width, sheet.height) == (("albedo", "normal"), 2 * SIZE, 2 * SIZE)
+    picture = Image.open(io.BytesIO(base64.b64decode(sheet.uri.partition(",")[2])))
+    assert picture.size == (sheet.width, sheet.height)
+
+
+def test_the_gallery_of_large_pictures_is_shown_smaller_and_scored_at_full_size() -> None:
+    """Noise, which no PNG can pack: the worst case."""
+    large = 384
+    rng = np.random.default_rng(0)
+    picture = rng.random((large, large, 3), dtype=np.float32)
+    whole = np.ones((large, large, 1), np.float32)
+    made = replace(
+        item("x"), mask=whole, given={}, truth={"albedo": picture}, predictions={"ours": {"albedo": 1 - picture}}
+    )
+    items = [made] * 12
+    most = shown_width(items, limit=1_000_000)
+    (card,) = shelves([replace(made)], RUN, {}, most)[0]["cards"]
+    shown = card["rows"][0]["cells"][0]
+    assert shown["picture"]["width"] == picture_size(large, most) <= most < large
+    assert shown["flip_mean"] == f"FLIP {flip_map(1 - picture, picture, whole)[1]:.3f}"
+    assert 12 * sum(len(p["uri"]) for p in (card["truth"][0], shown["picture"], shown["flip"])) < 5 * 1_000_000
+    assert shown_width([item("x")]) == SIZE, "small ones stay as they are"
+    assert shown_width(items) > most, f"{GALLERY_BYTES} bytes hold more"
+
+
+def test_a_shrunken_picture_keeps_its_colour_at_the_edge() -> None:
+    inside = (mask() > 0).astype(np.float32)
+    picture, half = shrink_covered(0.5 * inside * np.ones(3, np.float32), inside, SIZE // 2)
+    assert picture.shape == (SIZE // 2, SIZE // 2, 3)
+    np.testing.assert_allclose(picture[half[..., 0] > 0], 0.5, rtol=1e-5)
+    assert half[(half > 0) & (half < 1)].size > 0

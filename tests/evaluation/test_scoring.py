@@ -9,8 +9,8 @@ from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
-from unirender_evaluation.metrics import SCALES
-from unirender_evaluation.scoring import mask_source, over_white, score_image, score_maps
+from unirender_evaluation.metrics import OWN_MASK, SCALES
+from unirender_evaluation.scoring import over_white, score_image, score_maps
 
 SIZE = 32
 
@@ -88,7 +88,17 @@ def test_a_mask_of_ones_own_changes_the_whole_frame_and_not_the_masked_figures()
     assert own["albedo.psnr@whole-srgb-raw"] < pasted["albedo.psnr@whole-srgb-raw"]
     for key in ("albedo.psnr@masked-srgb-raw", "albedo.ssim@masked-linear-raw", "roughness.mse@masked"):
         assert own[key] == pasted[key]
-    assert (mask_source(None), mask_source(small.mask)) == ("pasted", "own")
+    assert OWN_MASK not in pasted
+    assert own[OWN_MASK] == pytest.approx(disc(6).sum() / disc().sum())  # one disc in the other
+
+
+def test_the_given_mask_after_8_bits_is_no_mask_of_ones_own() -> None:
+    truth = intrinsics(0)
+    pasted = score_maps(intrinsics(1).replace(mask=None), truth)
+    for stored in (np.round(disc() * 255) / 255, np.floor(disc() * 255) / 255, disc().astype(np.float16)):
+        assert score_maps(intrinsics(1).replace(mask=stored.astype(np.float32)), truth) == pasted
+    rough = score_maps(intrinsics(1).replace(mask=np.round(disc() * 15) / np.float32(15)), truth)
+    assert 0.9 < rough[OWN_MASK] < 1
 
 
 def test_scaled_albedo_scores_raw_badly_and_aligned_perfectly() -> None:
@@ -119,7 +129,16 @@ def test_images_are_premultiplied() -> None:
     values = score_image(noisy, image, disc(), quantity="edit_metallic")
     expected = metrics.psnr(image_srgb(truth.diffuse + 0.1 * (disc() > 0)), image_srgb(truth.diffuse), disc())
     assert values["edit_metallic.psnr@masked-srgb-raw"] == pytest.approx(expected, abs=1e-3)
-    assert not [key for key in values if "aligned_rgb" in key]
+
+
+def test_a_tinted_picture_is_right_up_to_a_factor_per_channel() -> None:
+    truth = intrinsics(0)
+    assert truth.diffuse is not None
+    image = (truth.diffuse * disc()).astype(np.float32)
+    values = score_image(image * np.array([0.9, 0.6, 0.3], np.float32), image, disc())
+    raw, aligned, per_channel = (values[f"relit.psnr@whole-linear-{scale}"] for scale in SCALES)
+    assert raw < aligned < 30 < 100 < per_channel
+    assert len([key for key in values if key.startswith("relit.ssim@")]) == 2 * 2 * len(SCALES)
 
 
 def test_environment_is_compared_at_the_predictions_resolution() -> None:

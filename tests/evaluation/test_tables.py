@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from io import StringIO
 
 import pytest
@@ -12,12 +13,13 @@ from rich.console import Console
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, compare, verdicts
-from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_variants, metric_key
+from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
 from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
-from unirender_evaluation.tables import Row, Table, build_table, build_tables
+from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
 
 METHODS = (
     MethodInfo("ours", "Ours (mean)", "ours", "Ours", 1, 1, 0),
@@ -158,8 +160,10 @@ def test_a_stored_row_says_so() -> None:
 def test_the_protocol_is_printed_with_every_format() -> None:
     found = table()
     names = [name for name, _ in found.protocol]
-    assert names[:7] == ["given", "mask", "colour", "scale alignment", "exposure", "resolution", "n"]
-    assert {"coverage", "steps x samples", "seeds", "LPIPS", "interval", "suite", "truth"} <= set(names)
+    assert names[:6] == ["given", "variant", "mask", "colour", "scale alignment", "exposure"]
+    assert {"resolution", "n", "coverage", "steps x samples", "seeds", "LPIPS", "interval", "suite", "truth"} <= set(
+        names
+    )
     buffer = StringIO()
     print_table(Console(file=buffer, width=90), found)
     flat = " ".join(buffer.getvalue().split())
@@ -168,6 +172,61 @@ def test_the_protocol_is_printed_with_every_format() -> None:
         assert "own mask: Ours (sample)" in text
         assert "8 samples of 4 objects" in text
     assert "published" not in [name for name, _ in table("masked").protocol]
+
+
+def test_the_protocol_says_whose_mask() -> None:
+    """Maps have a mask of their own, pictures do not; without an own mask nothing is claimed."""
+    relit = [replace(r, table="relighting", protocol="from-image-sd") for r in inverse("sample")]
+    pictures = [replace(r, values={"relit.psnr@whole-srgb-raw": 20.0}) for r in relit]
+    build = partial(build_table, TABLES["relighting"], run=RUN, protocol="from-image-sd", variant=Variant("whole"))
+    assert "own mask: Ours (sample) (maps;" in dict(build(records=relit).protocol)["mask"]
+    assert "the true mask pasted on every row" in dict(build(records=pictures).protocol)["mask"]
+    own = replace(relit[0], method="ours", values={"mask.iou": 0.9})
+    assert [mask_source(key, [*relit, own]) for key in ("ours", "sample")] == ["own", "pasted"]
+
+
+def test_every_variant_has_a_table_with_its_own_numbers() -> None:
+    levels = {variant: 20.0 + i for i, variant in enumerate(ALL_VARIANTS)}
+    values = {metric_key("albedo", "psnr", variant): level for variant, level in levels.items()}
+    values |= {metric_key("albedo", "lpips_alex", Variant(mask)): 0.1 for mask in ("masked", "whole")}
+    records = [Record("inverse", "single-image", "ours", f"s{i}", f"o{i}", values) for i in range(2)]
+    found = build_tables(records, RUN, variants=chosen_variants(["all"]))
+    assert [table.variant for table in found] == list(ALL_VARIANTS)
+    for table in found:
+        (ours,) = [row for row in table.rows if row.key == "ours"]
+        assert ours.cells[0].measured is not None
+        assert ours.cells[0].measured.mean == levels[table.variant]
+        assert dict(table.protocol)["variant"] == table.variant.label
+        assert any(table.published_columns) == (table.variant == Variant("whole"))
+    assert (
+        len({table.heading for table in found})
+        == len({to_latex(t).split("label{")[1].split("}")[0] for t in found})
+        == len(found)
+    )
+
+
+def test_lpips_of_aligned_pictures_is_a_dash_and_the_protocol_says_why() -> None:
+    values = {metric_key("albedo", "psnr", Variant(scale=scale)): 20.0 for scale in ("raw", "aligned")}
+    values[metric_key("albedo", "lpips_alex")] = 0.1
+    records = [Record("inverse", "single-image", "ours", f"s{i}", f"o{i}", values) for i in range(2)]
+    raw, aligned = build_tables(records, RUN, variants=chosen_variants(["masked", "masked-aligned"]) or ())
+    vgg, alex = ([column.metric.name for column in raw.columns].index(name) for name in ("lpips_vgg", "lpips_alex"))
+    assert raw.rows[0].cells[vgg].unavailable
+    assert raw.rows[0].cells[alex].measured is not None
+    assert aligned.rows[0].cells[vgg] == aligned.rows[0].cells[alex] == Cell()
+    assert "not computed of aligned pictures" in dict(aligned.protocol)["LPIPS"]
+    assert "not computed" not in dict(raw.protocol)["LPIPS"]
+    assert "n/a:" not in to_markdown(aligned)
+
+
+def test_variants_that_a_table_cannot_tell_apart_are_one_table() -> None:
+    column = Column("Material", "metallic", METRICS["mse"], published=False)
+    spec = TableSpec("physics", "Physics", (column,), ("physics",))
+    values = {"metallic.mse@masked": 0.1, "metallic.mse@whole": 0.05}
+    records = [Record("physics", "physics", "ours", "s", "o", values)]
+    found = build_tables(records, RUN, {"physics": spec}, ALL_VARIANTS)
+    assert [table.variant for table in found] == [Variant("masked"), Variant("whole")]
+    assert [table.variant for table in build_tables(records, RUN, {"physics": spec})] == [Variant("masked")]
 
 
 def test_markdown_is_a_table() -> None:
@@ -180,9 +239,10 @@ def test_markdown_is_a_table() -> None:
 def test_latex_is_balanced_booktabs() -> None:
     text = to_latex(table())
     body = text[text.index(r"\toprule") : text.index(r"\bottomrule")]
-    columns = len(re.findall(r"(?<!\\)&", body.splitlines()[3]))
-    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
-    assert all(len(re.findall(r"(?<!\\)&", line)) == columns for line in rows[1:])
+    (spec,) = re.findall(r"\\begin\{tabular\}\{l(c+)\}", text)
+    rows = [line for line in body[body.index(r"\midrule") :].splitlines() if line.endswith(r"\\")]
+    assert len(rows) == len(table().rows)
+    assert all(len(re.findall(r"(?<!\\)&", line)) == len(spec) for line in rows)
     assert text.count("{") == text.count("}")
     assert r"\textbf{26.15} {\scriptsize $\pm$" in text
     assert not re.search(r"[±†·∞↑↓]", text)

@@ -66,6 +66,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("light_metrics.py", "multiview_scoring.py", "multiview_settings.py")),
+        ("core", "unirender_evaluation", ("physics.py", "physics_rows.py", "records.py", "suite_spec.py")),
     ],
 )
 def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:
@@ -86,6 +87,30 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
 def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str, files: tuple[str, ...]) -> None:
     for name in files:
         assert any(fnmatch(f"{package}/{name}", pattern) for pattern in PARTS[part].without), name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("__init__", "schema", "schema_check", "merge", "score_api", "commands", "results_commands", "results_check"),
+        *("throughput", "throughput_command", "crosscheck", "figures_command", "report_pages", "public_metrics"),
+        *("table_list", "docs_tables", "study_rows"),
+    ],
+)
+def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
+    path = f"unirender_evaluation/{name}.py"
+    assert any(fnmatch(path, pattern) for pattern in PARTS["core"].without)
+    patterns = [p for part in PARTS.values() for p in part.files.get("unirender_evaluation", ()) if p != "*.py"]
+    assert not [pattern for pattern in patterns if fnmatch(f"{name}.py", pattern)]
+
+
+@pytest.mark.parametrize(("name", "part"), [("adapters_marigold", MODEL), ("mitsuba_method", REFERENCE)])
+def test_a_row_of_other_code_follows_the_part_of_that_code_alone(name: str, part: str) -> None:
+    owners = [
+        key for key, p in PARTS.items() for q in p.files.get("unirender_evaluation", ()) if fnmatch(f"{name}.py", q)
+    ]
+    assert owners == ["core", part]
+    assert any(fnmatch(f"unirender_evaluation/{name}.py", pattern) for pattern in PARTS["core"].without)
 
 
 def test_a_record_follows_the_parts_that_its_row_uses() -> None:

@@ -12,7 +12,7 @@ for (const block of all(".block")) { // variants of one table as tabs
   if (tabs.length) show(0);
 }
 
-for (const table of all("table.data")) { // sort inside sections, so that bounds stay bounds
+for (const table of all("table.data:not(#sample-rows)")) { // sort inside sections, so that bounds stay bounds
   const heads = all("thead tr:last-child th", table);
   heads.forEach((head, i) => head.querySelector("button")?.addEventListener("click", () => {
     const descending = head.getAttribute("aria-sort") !== "descending";
@@ -56,11 +56,12 @@ document.querySelector("#theme")?.addEventListener("click", () => {
   const now = root.dataset.theme ?? (dark ? "dark" : "light");
   root.dataset.theme = now === "dark" ? "light" : "dark";
 });
-document.querySelector("#download")?.addEventListener("click", () => {
-  const text = document.querySelector("#tables-json").textContent;
+const save = (text, name) => {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
-  link.download = "tables.json";
+  link.download = name;
   link.click();
   URL.revokeObjectURL(link.href);
-});
+};
+document.querySelector("#download")?.addEventListener("click", () =>
+  save(document.querySelector("#tables-json").textContent, "tables.json"));

@@ -1,0 +1,108 @@
+"""`bench run --dry-run`: what a run would compute and what its folder holds already, by row. Nothing is computed or
+written.
+
+The only estimate is one that was measured: where the folder holds records of a row, the mean seconds of its answers,
+times those that are missing. It leaves scoring out (`unirender bench throughput`), and so it is said.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from unirender_evaluation.benchmark import BenchConfig, check_request, prepare, views_jobs
+from unirender_evaluation.engine import Job, Store
+from unirender_evaluation.records import Record, read_records
+from unirender_evaluation.run_check import stored_check
+
+
+@dataclass(frozen=True)
+class PlannedRow:
+    """What a run has to do for one row.
+
+    Attributes:
+        label: of the row.
+        stored: records that are there.
+        missing: records that would be computed.
+        seconds: mean time of an answer, of the stored records that have one; None = not measured.
+    """
+
+    label: str
+    stored: int
+    missing: int
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run has to do; `check_date` is that of the truth check that it would reuse, None = Mitsuba renders."""
+
+    out: Path
+    rows: tuple[PlannedRow, ...]
+    check_scenes: int
+    check_date: str | None
+    jobs: int
+
+
+def planned(config: BenchConfig) -> Plan:
+    """The plan of a configuration.
+
+    Raises:
+        UnirenderError: what would stop the run before it begins: unusable suite, checkpoint, plug-in or predictions.
+    """
+    here, known = prepare(config), _stored(config.out)
+    jobs = [job for scene in here.scenes for job in here.jobs(scene)] + views_jobs(here, config)
+    labels = dict.fromkeys(job.label for job in jobs)
+    check = stored_check(check_request(config), here, known.keys())
+    return Plan(
+        out=config.out,
+        rows=tuple(_planned_row(label, [job for job in jobs if job.label == label], known) for label in labels),
+        check_scenes=config.check_scenes,
+        check_date=None if check is None else str(check["date"]),
+        jobs=config.jobs,
+    )
+
+
+def _planned_row(label: str, jobs: Sequence[Job], known: dict[str, Record]) -> PlannedRow:
+    stored = sum(job.is_done(known.__contains__) for job in jobs)
+    times = [known[job.key].seconds for job in jobs if job.key in known]
+    measured = [seconds for seconds in times if seconds is not None]
+    mean = sum(measured) / len(measured) if measured else None
+    return PlannedRow(label, stored, len(jobs) - stored, mean)
+
+
+def _stored(folder: Path) -> dict[str, Record]:
+    """The records in a run's folder by content key; half a line of a killed run, or of one at work, is left alone."""
+    path = folder / "records.jsonl"
+    files = [file for file in (Store(path).unused_path, path) if file.exists()]
+    return {record.key: record for file in files for record in read_records(file, torn_tail="drop")}
+
+
+def print_plan(plan: Plan, console: Console) -> None:
+    """Prints a plan."""
+    table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("Row")
+    for name in ("stored", "to compute", "s an answer", "answers, s"):
+        table.add_column(name, justify="right")
+    for row in plan.rows:
+        each = "-" if row.seconds is None else f"{row.seconds:.3g}"
+        total = "-" if row.seconds is None else f"{row.seconds * row.missing:.3g}"
+        table.add_row(escape(row.label), str(row.stored), str(row.missing), each, total)
+    table.add_section()
+    stored, missing = (sum(getattr(row, name) for row in plan.rows) for name in ("stored", "missing"))
+    table.add_row("all", str(stored), str(missing), "", "")
+    console.print(table)
+    scenes = "1 scene" if plan.check_scenes == 1 else f"{plan.check_scenes} scenes"
+    check = f"Mitsuba renders {scenes}" if plan.check_date is None else f"that of {plan.check_date} is reused"
+    console.print(f"Truth check: {check}.", highlight=False)
+    if any(row.seconds is not None for row in plan.rows):
+        console.print(
+            "Seconds: the mean of the answers that are stored, in the process that gave them; scoring is not in them.",
+            highlight=False,
+        )
+    processes = "this process" if plan.jobs == 0 else f"{plan.jobs} processes"
+    console.print(f"Dry run: {missing} records for {processes} in {plan.out}; nothing was computed.", highlight=False)

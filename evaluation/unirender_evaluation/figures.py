@@ -1,0 +1,163 @@
+"""Draws the paper's kinds of figure: a grid of labelled pictures, in rows that belong to one scene.
+
+A grid says what stands where; `figures_panels` fills it. Pictures are display values in [0, 1] over white, `[h, w, 3]`,
+enlarged by a whole factor without interpolation, so that every pixel of the suite can be counted.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, ImageDraw, ImageFont
+
+from unirender.errors import UnirenderError
+
+SIDE = 128  # of a cell, pixels, about: the nearest whole multiple of the pictures' own size, and never less than it
+GAP, GROUP_GAP, HEADER, MARGIN = 6, 16, 24, 12
+INK, SOFT = "#222222", "#666666"
+FONT, SMALL = 13, 12
+
+Shown = Float[np.ndarray, "_ _ 3"]
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One picture, with a text in its lower right corner."""
+
+    picture: Shown
+    corner: str = ""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row of a grid: `tiles` may have holes; `starts` is set where another scene begins."""
+
+    label: str
+    tiles: tuple[Tile | None, ...]
+    starts: bool = False
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A figure: `columns` are the headings; `caption` stands below.
+
+    Raises:
+        UnirenderError: it or one of its lines is empty, or a line has not as many tiles as there are columns.
+    """
+
+    columns: tuple[str, ...]
+    lines: tuple[Line, ...]
+    caption: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.columns or not self.lines:
+            raise UnirenderError("figure: got no pictures, expected at least one row and one column")
+        for line in self.lines:
+            if len(line.tiles) != len(self.columns):
+                raise UnirenderError(
+                    f"figure, row {line.label!r}: got {len(line.tiles)} pictures, expected {len(self.columns)}"
+                )
+            if not any(tile is not None for tile in line.tiles):
+                raise UnirenderError(f"figure, row {line.label!r}: got no picture, expected at least one")
+
+
+def over_white(values: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
+    """A map's display values over the page; one channel becomes grey."""
+    rgb = np.broadcast_to(values, (*values.shape[:2], 3))
+    return (rgb * mask + (1 - mask)).astype(np.float32)
+
+
+def cell_side(grid: Grid) -> int:
+    """Pixels of a cell's side: the widest picture, enlarged by a whole factor to about `SIDE`."""
+    widest = max(max(tile.picture.shape[:2]) for line in grid.lines for tile in line.tiles if tile is not None)
+    return widest * max(1, round(SIDE / widest))
+
+
+def draw(grid: Grid) -> Image.Image:
+    """The picture of a grid: headings above, labels at the left, the caption below."""
+    side, font = cell_side(grid), ImageFont.load_default(FONT)
+    small = ImageFont.load_default(SMALL)
+    left = MARGIN + max(_width(line.label, font) for line in grid.lines) + MARGIN
+    width = left + len(grid.columns) * (side + GAP) + MARGIN - GAP
+    caption = _wrapped(grid.caption, small, width - 2 * MARGIN)
+    tops, heights, y = [], [_height(line, side) for line in grid.lines], MARGIN + HEADER
+    for number, line in enumerate(grid.lines):
+        y += GROUP_GAP if line.starts and number else 0
+        tops.append(y)
+        y += heights[number] + GAP
+    height = y + len(caption) * (SMALL + 6) + MARGIN
+    sheet = Image.new("RGB", (width, height), "white")
+    pen = ImageDraw.Draw(sheet)
+    for column, text in enumerate(grid.columns):
+        x = left + column * (side + GAP) + side // 2
+        pen.text((x, MARGIN + HEADER // 2), _fitting(text, font, side + GAP), fill=INK, font=font, anchor="mm")
+    for line, top, high in zip(grid.lines, tops, heights, strict=True):
+        pen.text((left - MARGIN, top + high // 2), line.label, fill=INK, font=font, anchor="rm")
+        for column, tile in enumerate(line.tiles):
+            if tile is not None:
+                _paste(sheet, pen, tile, (left + column * (side + GAP), top), (side, high))
+    for number, text in enumerate(caption):
+        pen.text((MARGIN, y + 4 + number * (SMALL + 6)), text, fill=SOFT, font=small)
+    return sheet
+
+
+def save(grid: Grid, path: Path) -> Path:
+    """Writes the figure as a PNG, by way of a temporary file; returns the path."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".tmp")
+    draw(grid).save(temporary, format="PNG", optimize=True)
+    temporary.replace(path)
+    return path
+
+
+def _paste(
+    sheet: Image.Image, pen: ImageDraw.ImageDraw, tile: Tile, corner: tuple[int, int], cell: tuple[int, int]
+) -> None:
+    """A picture in the middle of its cell of (width, height) pixels."""
+    height, width = tile.picture.shape[:2]
+    factor = _factor(tile, cell[0])
+    levels = np.round(np.clip(tile.picture, 0, 1) * 255).astype(np.uint8)
+    picture = Image.fromarray(levels).resize((width * factor, height * factor), Image.Resampling.NEAREST)
+    x, y = corner[0] + (cell[0] - picture.width) // 2, corner[1] + (cell[1] - picture.height) // 2
+    sheet.paste(picture, (x, y))
+    if tile.corner:
+        font = ImageFont.load_default(SMALL)
+        at = (corner[0] + cell[0] - 4, corner[1] + cell[1] - 3)
+        box = pen.textbbox(at, tile.corner, font=font, anchor="rs")
+        pen.rectangle((box[0] - 3, box[1] - 2, box[2] + 3, box[3] + 2), fill="white")
+        pen.text(at, tile.corner, fill=INK, font=font, anchor="rs")
+
+
+def _factor(tile: Tile, side: int) -> int:
+    """By which a picture is enlarged."""
+    return max(1, side // max(tile.picture.shape[:2]))
+
+
+def _height(line: Line, side: int) -> int:
+    """Of a row: its highest picture's; lights are wider than high."""
+    return max(tile.picture.shape[0] * _factor(tile, side) for tile in line.tiles if tile is not None)
+
+
+def _width(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont") -> int:
+    return int(np.ceil(font.getlength(text)))
+
+
+def _fitting(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int) -> str:
+    """The text, cut where it is too wide."""
+    if _width(text, font) <= width:
+        return text
+    while text and _width(text + "...", font) > width:
+        text = text[:-1]
+    return text + "..."
+
+
+def _wrapped(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int) -> list[str]:
+    """The text in lines that fit."""
+    lines: list[str] = []
+    for word in text.split():
+        if lines and _width(f"{lines[-1]} {word}", font) <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines

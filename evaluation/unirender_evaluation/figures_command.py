@@ -1,0 +1,138 @@
+"""`unirender figures`. Light to import; the command loads what it needs when it runs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+import tyro
+
+from unirender.errors import UsageError
+from unirender.options import Device, at_least
+
+if TYPE_CHECKING:
+    from unirender_evaluation.figures import Grid
+    from unirender_evaluation.figures_panels import MitsubaTruth, Subject
+    from unirender_evaluation.suites import Scene, Suite
+
+Kind = Literal["metallic", "roughness", "relighting", "comparison", "overview"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+SCENES = 2  # that are shown where none is named
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Draw the paper's kinds of figure from any checkpoint, beside Mitsuba's truth: PNG files with labels and PSNR.
+
+    Strips of edited metallic and roughness, a grid of relightings, a sheet that compares checkpoints and methods, and
+    an overview of what is found in one picture.
+    """
+
+    out: Path = Path("figures")
+    """Folder of the pictures, one PNG for each of `--kinds`."""
+    checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
+    """Folder of a checkpoint of ours; repeatable. None: the shipped tiny, unless there is a --method."""
+    method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Somebody else's method: module:Class or path/to/file.py:Class, as in `unirender bench run`; repeatable."""
+    suite: str = "tiny"
+    """A bundled suite, or the path of a suite's TOML file."""
+    scenes: tuple[str, ...] = ()
+    """Keys of scenes of the suite. None: two, from its first and second half."""
+    kinds: tuple[Kind, ...] = KINDS
+    """metallic, roughness: the input edited over `--values`. relighting: under other lights of the suite. comparison: a
+    column for each checkpoint and method. overview: maps, edits and relighting of one picture."""
+    values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """Of metallic and roughness in the strips, in [0, 1]."""
+    lights: int = 4
+    """Of the relighting grid."""
+    spp: int = 1024
+    """Samples per pixel of the truth that is rendered for strips and relighting."""
+    device: Device = "cpu"
+    """Where our model runs. auto: cuda, then mps, then cpu, whichever is there."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range, or named twice.
+        """
+        at_least(1, lights=self.lights, spp=self.spp)
+        for name in ("scenes", "kinds", "values", "checkpoint", "method"):
+            given = getattr(self, name)
+            if len(set(given)) < len(given):
+                raise UsageError(f"--{name} {' '.join(map(str, given))}: expected none of them twice")
+        outside = [value for value in self.values if not 0 <= value <= 1]
+        if outside or not self.values:
+            shown = " ".join(f"{value:g}" for value in self.values)
+            raise UsageError(f"--values {shown}: expected at least one number, all in [0, 1]")
+        if not self.kinds:
+            raise UsageError(f"--kinds: expected at least one of {', '.join(KINDS)}")
+
+    def run(self) -> int:
+        """Draws, and prints a line for each figure; returns the exit status."""
+        self.check()
+        from rich.console import Console
+
+        from unirender_evaluation.figures import save
+        from unirender_evaluation.figures_panels import MitsubaTruth
+        from unirender_evaluation.suites import load_suite
+
+        console, suite = Console(), load_suite(self.suite)
+        scenes = [suite.scene(key) for key in self.scenes] or default_scenes(suite)
+        subjects, truth = self.subjects(), MitsubaTruth(suite, self.spp)
+        for kind in self.kinds:
+            path = save(self.draw(kind, subjects, suite, scenes, truth), self.out / f"{kind}.png")
+            console.print(f"{path} ({path.stat().st_size / 1000:.0f} kB)", highlight=False, markup=False)
+        return 0
+
+    def subjects(self) -> "list[Subject]":
+        """The checkpoints and methods that were named, checkpoints first.
+
+        Raises:
+            UnirenderError: a checkpoint or a method is not there.
+        """
+        from unirender.files import checkpoint_sha256
+        from unirender.models.precision import resolve_device
+        from unirender.options import ModelOptions
+        from unirender_evaluation.benchmark import shipped_checkpoint
+        from unirender_evaluation.figures_panels import Subject
+        from unirender_evaluation.pipeline_method import PipelineMethod
+        from unirender_evaluation.plugins import named_plugin
+        from unirender_evaluation.rows import make_row, plugin_rows
+
+        found, device = [], str(resolve_device(self.device))
+        folders = self.checkpoint or (() if self.method else (shipped_checkpoint(),))
+        for folder, label in zip(folders, labels(folders), strict=True):
+            pipeline = ModelOptions(folder, self.device, "float32", progress=False).load()
+            weights = checkpoint_sha256(folder)
+            method = PipelineMethod(pipeline, label, "mean", True, 1, 1, 0, weights, device=device)
+            found.append(Subject(label, make_row(method, "ours")))
+        for row in plugin_rows([named_plugin(spec) for spec in self.method]):
+            found.append(Subject(row.info.label, row))
+        return found
+
+    def draw(
+        self, kind: Kind, subjects: "list[Subject]", suite: "Suite", scenes: "list[Scene]", truth: "MitsubaTruth"
+    ) -> "Grid":
+        """One figure."""
+        from unirender_evaluation import figures_overview
+        from unirender_evaluation import figures_panels as panels
+
+        if kind == "overview":
+            return figures_overview.overview(subjects, suite, scenes)
+        if kind == "comparison":
+            return panels.comparison_sheet(subjects, suite, scenes)
+        if kind == "relighting":
+            return panels.relighting_grid(subjects, suite, scenes, self.lights, truth)
+        return panels.material_strip(subjects, suite, scenes, kind, self.values, truth)
+
+
+def labels(folders: tuple[Path, ...]) -> list[str]:
+    """Names of checkpoints: their folders', or their paths where two folders have one name."""
+    names = [folder.resolve().name for folder in folders]
+    return names if len(set(names)) == len(names) else [str(folder) for folder in folders]
+
+
+def default_scenes(suite: "Suite") -> "list[Scene]":
+    """`SCENES` scenes from the middle of equal parts of the suite: neither picked by eye nor the first ones."""
+    parts = min(SCENES, len(suite.scenes))
+    return [suite.scenes[(2 * part + 1) * len(suite.scenes) // (2 * parts)] for part in range(parts)]

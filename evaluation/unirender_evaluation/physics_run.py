@@ -1,0 +1,152 @@
+"""`bench physics`: every physics test on Mitsuba, our method, the composite and the test's broken twin, side by side.
+
+    physics.json   every value, by test, row and scene; the settings
+    physics.md     the table: means with 95 % intervals over objects, what a perfect renderer scores, and whether the
+                   test refuses its twin
+
+Rows: *Mitsuba* renders with its path tracer and decomposes into its own buffers; *shade (true maps)* is one bounce and
+one point per pixel, and the loops' ceiling; *ours* and *composite* are the rows of `bench run`.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.bounds import Shade
+from unirender_evaluation.methods import Composite, Image, quantise
+from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics_tests import TESTS, PhysicsTest, true_maps
+from unirender_evaluation.physics_tracer import PathTracer
+from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.suites import Material, Scene, Suite
+
+MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours (mean)", "composite", "broken twin"
+ROWS = (MITSUBA, SHADE, OURS, COMPOSITE, TWIN)
+
+
+@dataclass(frozen=True)
+class Value:
+    """What one row scores in one test on one scene."""
+
+    test: str
+    row: str
+    scene: str
+    object: str
+    value: float
+
+
+def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Iterator[list[Value]]:
+    """The values of one test after another, scene by scene.
+
+    Args:
+        suite: the suite.
+        scenes: whose objects the generator makes here as the truth shows them.
+        ours: our method, with `render` and `decompose`.
+        spp: samples per pixel of Mitsuba's path tracer.
+    """
+    for scene in scenes:
+        stage = Stage(suite, scene)
+        tracer = PathTracer(stage, spp)
+        for test in TESTS.values():
+            yield [
+                Value(test.name, row, scene.key, scene.object, test.run(subject, stage))
+                for row, subject in subjects(test, tracer, ours).items()
+            ]
+
+
+def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any) -> dict[str, Any]:
+    """Who answers a test: name of the row -> renderer or decomposer."""
+    if test.asks == "render":
+        return {
+            MITSUBA: tracer.render,
+            SHADE: Shade().render,
+            OURS: ours.render,
+            COMPOSITE: Composite().render,
+            TWIN: test.twin,
+        }
+    return {MITSUBA: _buffers, SHADE: true_maps, OURS: partial(_found, ours.decompose), TWIN: test.twin}
+
+
+def _buffers(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    return stage.mitsuba.maps(material)
+
+
+def _found(decompose: Callable[..., Intrinsics], stage: Stage, _: Material, image: Image) -> Intrinsics:
+    """What a method finds: it is handed what a camera would store, nothing else."""
+    return decompose(image_srgb=quantise(image, stage.mask), mask=stage.mask, camera=stage.suite.spec.camera)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table: `rows` by name; `refused`: whether the twin fails the test, `n` scenes."""
+
+    test: PhysicsTest
+    rows: dict[str, Estimate]
+
+    @property
+    def refused(self) -> bool:
+        return self.test.fails(self.rows[TWIN].mean, self.rows[MITSUBA].mean)
+
+
+def findings(values: Sequence[Value]) -> list[Finding]:
+    """Means and intervals by test and row; samples of one object are one cluster."""
+    found = []
+    for test in TESTS.values():
+        rows = {}
+        for row in ROWS:
+            own = [v for v in values if (v.test, v.row) == (test.name, row)]
+            if own:
+                rows[row] = bootstrap_mean([v.value for v in own], [v.object for v in own])
+        found.append(Finding(test, rows))
+    return found
+
+
+def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
+    """The table with its protocol."""
+    lines = [
+        "| Test | expected | " + " | ".join(ROWS) + " | twin refused |",
+        "| :-- | --: | " + "--: | " * len(ROWS) + ":-- |",
+    ]
+    for finding in found:
+        test = finding.test
+        expected = "true maps' loop" if test.expected is None else f"{test.expected:g}"
+        cells = [_cell(finding.rows.get(row), test.metric.decimals) for row in ROWS]
+        verdict = "PASS" if finding.refused else "FAIL"
+        heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
+        lines.append(f"| {heading} | {expected} | {' | '.join(cells)} | {verdict}: {test.twin_is} |")
+    protocol = " · ".join(f"{name}: {value}" for name, value in settings.items())
+    return "\n".join([*lines, "", f"Protocol: {protocol}.", ""])
+
+
+def _cell(estimate: Estimate | None, decimals: int) -> str:
+    if estimate is None:
+        return "-"
+    width = estimate.half_width
+    return f"{estimate.mean:.{decimals}f}" + (f" ± {width:.{decimals}f}" if width == width else "")
+
+
+def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[Finding]:
+    """Writes both files; returns the table's lines."""
+    found = findings(values)
+    out.mkdir(parents=True, exist_ok=True)
+    tests = [
+        {
+            "name": f.test.name,
+            "formula": f.test.formula,
+            "unit": f.test.unit,
+            "direction": f.test.direction,
+            "expected": f.test.expected,
+            "margin": f.test.margin,
+            "twin": f.test.twin_is,
+            "twin_refused": f.refused,
+        }
+        for f in found
+    ]
+    text = json.dumps({"settings": settings, "tests": tests, "values": [asdict(v) for v in values]}, indent=1)
+    (out / "physics.json").write_text(text + "\n", encoding="utf-8")
+    (out / "physics.md").write_text(markdown(found, settings), encoding="utf-8")
+    return found

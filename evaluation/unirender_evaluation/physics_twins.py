@@ -1,0 +1,47 @@
+"""What each physics test must refuse: the composite, or the true maps, broken in one place."""
+
+import numpy as np
+
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.suites import Material
+
+_PERFECT = Composite().render
+
+
+def gamma(maps: Intrinsics) -> Image:
+    """Radiance to the power 0.8: not linear in the light."""
+    return (_PERFECT(maps) ** 0.8).astype(np.float32)
+
+
+def darkening(maps: Intrinsics) -> Image:
+    """0.8 of the radiance: loses energy."""
+    return (0.8 * _PERFECT(maps)).astype(np.float32)
+
+
+def gradient(maps: Intrinsics) -> Image:
+    """A left-to-right gradient: neither mirror nor turn leaves it alone."""
+    image = _PERFECT(maps)
+    return (image * np.linspace(0.7, 1.3, image.shape[1])[None, :, None]).astype(np.float32)
+
+
+def squared_metallic(maps: Intrinsics) -> Image:
+    """Metallic squared."""
+    return _PERFECT(maps.replace(metallic=maps.require("metallic")["metallic"] ** 2))
+
+
+def blind_to_roughness(maps: Intrinsics) -> Image:
+    """s replaced by d."""
+    return _PERFECT(maps.replace(specular=maps.require("diffuse")["diffuse"]))
+
+
+def half_albedo(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    """The true maps with half the albedo."""
+    maps = stage.true_maps(material)
+    return maps.replace(albedo=0.5 * maps.require("albedo")["albedo"])
+
+
+def constant_material(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    """The true albedo and normal, metallic and roughness 0.5 whatever the picture."""
+    return stage.true_maps((0.5, 0.5)).replace(albedo=stage.true_maps(material).albedo)

@@ -1,0 +1,128 @@
+"""Scores of one prediction from a notebook or a training loop: the benchmark's numbers without a suite.
+
+import unirender_evaluation
+values = unirender_evaluation.score(prediction, truth, "masked-srgb-raw")
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
+
+if TYPE_CHECKING:
+    from unirender_evaluation.lpips import Lpips
+
+Picture = Float[np.ndarray, "h w 3"]
+
+
+def score(
+    prediction: Any,
+    truth: Any,
+    protocol: Variant | str | None = None,
+    *,
+    mask: Any = None,
+    lpips: Sequence[str] = (),
+    quantity: str = "image",
+) -> dict[str, float]:
+    """Scores maps or a picture against the truth, by the functions that the benchmark itself uses.
+
+    Args:
+        prediction: `Intrinsics` of one picture, or a picture (h, w, 3): linear light, premultiplied, float. The mask of
+            `Intrinsics`, if any, counts as the method's own in whole-frame figures.
+        truth: the same kind, of the same size. Maps that either side lacks get no values; `Intrinsics` need a mask.
+        protocol: how numbers are taken: "masked-srgb-raw", "whole-linear-aligned" and so on (what is left out is
+            masked, srgb, raw), or a `Variant`; None: every variant at once.
+        mask: coverage (h, w, 1) of a true picture, in [0, 1]; `np.ones((h, w, 1))` where all of it counts. Not for
+            `Intrinsics`, which have their own.
+        lpips: backbones to compute, "alex" or "vgg". They need torch and take longer than all else together.
+        quantity: what a picture's keys begin with.
+
+    Returns:
+        Metric key -> value: `albedo.psnr@masked-srgb-raw`, `normal.cosine`, ... The PSNR of identical pictures is inf.
+
+    Raises:
+        UnirenderError: the two are of different kinds or sizes, a picture is not linear floats with the channels last,
+            a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score.
+    """
+    from unirender_evaluation.scoring import score_image, score_maps
+
+    variant = Variant.parse(protocol) if isinstance(protocol, str) else protocol
+    options: dict[str, Any] = {
+        "lpips": _networks(lpips),
+        "lpips_scales": ("raw" if variant is None else variant.scale,),
+    }
+    if isinstance(prediction, Intrinsics) != isinstance(truth, Intrinsics):
+        got = f"{type(prediction).__name__} and {type(truth).__name__}"
+        raise UnirenderError(f"score: got {got}, expected two unirender.Intrinsics or two pictures")
+    if isinstance(prediction, Intrinsics):
+        if mask is not None:
+            raise UnirenderError("score: got maps and mask=, expected the coverage in the truth's own mask")
+        values = score_maps(prediction, truth, **options)
+    else:
+        if mask is None:
+            raise UnirenderError(
+                "score: pictures need mask=, the true coverage (h, w, 1); np.ones((h, w, 1)) where all of it counts"
+            )
+        p, t = _picture(prediction, "the prediction"), _picture(truth, "the truth")
+        if p.shape != t.shape:
+            raise UnirenderError(
+                f"score: got pictures of {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
+            )
+        values = score_image(p, t, _mask(mask, t), quantity=quantity, **options)
+    chosen = values if variant is None else {key: value for key, value in values.items() if _is_of(key, variant)}
+    if not chosen:
+        what = "no map that both sides have" if not values else f"no value under {variant and variant.label}"
+        raise UnirenderError(f"score: {what}, expected at least one number")
+    return chosen
+
+
+def _networks(backbones: Sequence[str]) -> "list[Lpips]":
+    if isinstance(backbones, str):
+        raise UnirenderError(f"score: got lpips={backbones!r}, expected a list of names: lpips=[{backbones!r}]")
+    if not backbones:
+        return []
+    from unirender_evaluation.lpips import load
+
+    return [load(name) for name in backbones]
+
+
+def _is_of(key: str, variant: Variant) -> bool:
+    """Whether a metric key is how its quantity and metric are named under a variant."""
+    quantity, _, rest = key.partition(".")
+    return metric_key(quantity, METRICS[rest.partition("@")[0]], variant) == key
+
+
+def _picture(value: Any, what: str) -> Picture:
+    return _array(value, what, 3, "linear light, premultiplied; `unirender.color.srgb_decode` decodes display values")
+
+
+def _mask(value: Any, truth: Picture) -> Float[np.ndarray, "h w 1"]:
+    found = _array(value, "mask", 1, "coverage in [0, 1]")
+    if found.shape[:2] != truth.shape[:2]:
+        raise UnirenderError(f"score: got a mask of {found.shape[:2]} and a truth of {truth.shape[:2]} pixels")
+    if found.min() < 0 or found.max() > 1:
+        raise UnirenderError(f"score: mask is in [{found.min():g}, {found.max():g}], expected coverage in [0, 1]")
+    return found
+
+
+def _array(value: Any, what: str, channels: int, meaning: str) -> Float[np.ndarray, "h w c"]:
+    """A float array `[h, w, channels]`, or a sentence that says why it is none."""
+    if hasattr(value, "detach"):
+        raise UnirenderError(
+            f"score: {what} is a torch tensor, expected a numpy array with the channels last: "
+            "`x.detach().cpu().movedim(-3, -1).numpy()` of one picture"
+        )
+    found = np.asarray(value)
+    wanted = f"floats of shape (h, w, {channels}), {meaning}"
+    if found.ndim == 3 and found.shape[-1] != channels and found.shape[0] == channels:
+        wanted += "; the channels come last"
+    if found.ndim == 4:
+        wanted += "; score one picture at a time"
+    if found.dtype.kind != "f" or found.ndim != 3 or found.shape[-1] != channels:
+        raise UnirenderError(f"score: {what} is {found.dtype} of shape {found.shape}, expected {wanted}")
+    return found.astype(np.float32)

@@ -1,0 +1,231 @@
+"""The figures: what is drawn where, what is asked of whom, and what the command refuses."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_suites import SIZE, make_suite
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.figures import GAP, Grid, Line, Tile, cell_side, draw, save
+from unirender_evaluation.figures_command import Figures, default_scenes, labels
+from unirender_evaluation.figures_overview import MAPS, overview
+from unirender_evaluation.figures_panels import (
+    MitsubaTruth,
+    Subject,
+    comparison_sheet,
+    material_strip,
+    other_lights,
+    relighting_grid,
+)
+from unirender_evaluation.methods import InputAsAlbedo, UneditedInput
+from unirender_evaluation.rows import make_row
+from unirender_evaluation.suites import Material, Scene, Suite, load_suite
+
+UNEDITED = Subject("unedited", make_row(UneditedInput(), "trivial"))
+ALBEDO = Subject("as albedo", make_row(InputAsAlbedo(), "trivial"))
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("figures"))
+
+
+class StoredTruth:
+    """The suite's base picture whatever is asked, and what was asked."""
+
+    def __init__(self, suite: Suite) -> None:
+        self.suite, self.asked = suite, []
+
+    def __call__(self, scene: Scene, material: Material, environment: np.ndarray) -> np.ndarray:
+        self.asked.append((scene.key, material, float(environment.mean())))
+        return self.suite.image(scene, self.suite.spec.base)
+
+
+class Told:
+    """A method that writes down what it is handed and answers black."""
+
+    name, config = "told", {"told": 1}
+
+    def __init__(self) -> None:
+        self.calls: list[dict] = []
+
+    def edit(self, image_srgb: np.ndarray, **given: Any) -> np.ndarray:
+        self.calls.append(given)
+        return np.zeros_like(image_srgb)
+
+    relight = edit
+
+
+def colour(level: float, height: int = 8, width: int = 8) -> np.ndarray:
+    return np.full((height, width, 3), level, np.float32)
+
+
+def test_every_tile_is_where_its_row_and_column_say_pixel_by_pixel(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).random((8, 8, 3), dtype=np.float32)
+    green = np.broadcast_to(np.array([0.2, 0.8, 0.4], np.float32), (8, 8, 3))  # no text is green
+    grid = Grid(("one", "two"), (Line("a", (Tile(green), None)), Line("b", (None, Tile(picture)))), "caption")
+    side = cell_side(grid)
+    assert side == 128
+    sheet = np.asarray(Image.open(save(grid, tmp_path / "new" / "f.png")).convert("RGB"))
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["f.png"], "no temporary file is left"
+    place = np.argwhere((sheet == [51, 204, 102]).all(axis=-1))
+    top, left = place.min(axis=0)
+    assert (place.max(axis=0) - place.min(axis=0) + 1).tolist() == [side, side]
+    there = sheet[top + side + GAP : top + 2 * side + GAP, left + side + GAP : left + 2 * side + GAP]
+    np.testing.assert_array_equal(there[8::16, 8::16], np.round(picture * 255).astype(np.uint8))
+    assert (sheet[top : top + side, left + side + GAP : left + 2 * side + GAP] == 255).all(), "a hole stays white"
+
+
+def test_a_row_is_as_high_as_its_pictures_and_a_corner_has_its_text() -> None:
+    flat = Grid(("light",), (Line("a", (Tile(colour(0.5, 4, 8)),)),))
+    square = Grid(("light",), (Line("a", (Tile(colour(0.5)),)),))
+    assert draw(square).height - draw(flat).height == 64
+    said = replace(square, lines=(Line("a", (Tile(colour(0.5), "12.3 dB"),)),))
+    assert np.asarray(draw(said)).tolist() != np.asarray(draw(square)).tolist()
+
+
+def test_a_grid_with_a_row_of_another_length_or_nothing_in_it_is_refused() -> None:
+    with pytest.raises(UnirenderError, match="row 'a': got 1 pictures, expected 2"):
+        Grid(("one", "two"), (Line("a", (Tile(colour(0)),)),))
+    with pytest.raises(UnirenderError, match="row 'a': got no picture"):
+        Grid(("one",), (Line("a", (None,)),))
+    with pytest.raises(UnirenderError, match="at least one row"):
+        Grid(("one",), ())
+
+
+@pytest.mark.parametrize(("what", "kept"), [("metallic", "roughness 0.5"), ("roughness", "metallic 0.5")])
+def test_a_strip_asks_every_value_and_keeps_the_other(
+    suite: Suite, what: Literal["metallic", "roughness"], kept: str
+) -> None:
+    told, truth = Told(), StoredTruth(suite)
+    grid = material_strip(
+        [Subject("told", make_row(told, "external")), UNEDITED], suite, suite.scenes[:2], what, (0.0, 0.3), truth
+    )
+    assert [line.label for line in grid.lines] == ["told", "unedited", "Mitsuba"] * 2
+    assert [call[what] for call in told.calls] == [0.0, 0.3] * 2
+    assert all("environment" not in call for call in told.calls)
+    expected = [(0.0, 0.5), (0.3, 0.5)] if what == "metallic" else [(0.5, 0.0), (0.5, 0.3)]
+    assert [material for _, material, _ in truth.asked] == expected * 2
+    assert kept in grid.caption
+    corners = [tile.corner for tile in grid.lines[1].tiles[1:] if tile is not None]
+    assert all(float(corner.removesuffix(" dB")) > 45 for corner in corners), "the input is that truth, but for 8 bits"
+    black = [tile.corner for tile in grid.lines[0].tiles[1:] if tile is not None]
+    assert all(float(corner.removesuffix(" dB")) < 15 for corner in black), "and black is not"
+
+
+def test_relighting_takes_lights_that_no_input_has(suite: Suite) -> None:
+    told, truth, first = Told(), StoredTruth(suite), suite.scenes[0]
+    grid = relighting_grid([Subject("told", make_row(told, "external"))], suite, [first], 4, truth)
+    (other,) = other_lights(suite, [first], 4)
+    assert other.light != first.light
+    np.testing.assert_array_equal(told.calls[0]["environment"], suite.environment(other))
+    assert truth.asked == [(first.key, suite.spec.base, float(suite.environment(other).mean()))]
+    assert grid.columns == ("input", other.light)
+    assert [line.label for line in grid.lines] == ["light", "told", "Mitsuba"]
+    with pytest.raises(UnirenderError, match="all 2 lights of suite ball"):
+        other_lights(suite, suite.scenes, 4)
+
+
+def test_the_comparison_asks_the_benchmarks_questions_and_leaves_holes(suite: Suite) -> None:
+    grid = comparison_sheet([UNEDITED, ALBEDO], suite, suite.scenes[:1])
+    assert grid.columns == ("input", "unedited", "as albedo", "Mitsuba")
+    assert [line.label for line in grid.lines] == ["metallic 1", "roughness 0.1", "roughness 0.9", "relit", "albedo"]
+    answered = [[tile is not None for tile in line.tiles] for line in grid.lines]
+    assert answered == [[True, True, False, True]] * 4 + [[True, False, True, True]]
+
+
+def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite) -> None:
+    grid = overview([ALBEDO, UNEDITED], suite, suite.scenes[:1])
+    assert [line.label for line in grid.lines] == ["as albedo", "Mitsuba"], "who finds no maps has no row"
+    found = dict(zip(grid.columns, grid.lines[0].tiles, strict=True))
+    assert [name for name in MAPS if found[name] is not None] == ["albedo"]
+    assert found["metallic 1"] is None
+    assert all(tile is not None for tile in grid.lines[1].tiles[1:])
+
+
+def test_a_figure_that_no_method_can_fill_is_refused_by_name(suite: Suite) -> None:
+    with pytest.raises(UnirenderError, match=r"metallic strip: got as albedo, of which none can edit; .* --kinds"):
+        material_strip([ALBEDO], suite, suite.scenes[:1], "metallic", (0.5,), StoredTruth(suite))
+    with pytest.raises(UnirenderError, match="overview: got unedited, of which none can decompose"):
+        overview([UNEDITED], suite, suite.scenes[:1])
+
+
+def test_the_truth_of_an_object_that_is_made_otherwise_here_is_refused(suite: Suite) -> None:
+    scene = suite.scenes[0]
+    with pytest.raises(UnirenderError, match=r"ball-0: got a mesh .* expected none, which suite ball"):
+        MitsubaTruth(suite, 8)(scene, suite.spec.base, suite.environment(scene))
+
+
+@pytest.mark.slow
+def test_the_rendered_truth_is_the_suites_own_within_its_noise() -> None:
+    """And that of another metallic value is not."""
+    tiny = load_suite("tiny")
+    scene, base = tiny.scenes[0], tiny.spec.base
+    truth, environment = MitsubaTruth(tiny, 256), tiny.environment(tiny.scenes[0])
+    stored = tiny.image(scene, base)
+    errors = [float(np.abs(truth(scene, m, environment) - stored).mean()) for m in (base, (1.0, base[1]))]
+    assert errors[0] < 0.01, f"mean difference {errors[0]:.4f} at 256 samples per pixel (threshold 0.01)"
+    assert errors[1] > 2 * errors[0], "the twin"
+
+
+def test_default_scenes_come_from_both_halves_and_labels_are_unique() -> None:
+    tiny = load_suite("tiny")
+    chosen = [tiny.scenes.index(scene) for scene in default_scenes(tiny)]
+    assert chosen == [12, 36]
+    assert labels((Path("a/x"), Path("a/y"))) == ["x", "y"]
+    assert labels((Path("a/x"), Path("b/x"))) == ["a/x", "b/x"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"values": (0.5, 1.5)}, r"--values 0.5 1.5: expected at least one number, all in \[0, 1\]"),
+        ({"values": ()}, "expected at least one number"),
+        ({"values": (0.5, 0.5)}, "none of them twice"),
+        ({"kinds": ()}, "--kinds: expected at least one of metallic"),
+        ({"scenes": ("a", "a")}, "--scenes a a"),
+        ({"lights": 0}, "--lights 0"),
+        ({"spp": 0}, "--spp 0"),
+    ],
+)
+def test_what_cannot_be_drawn_is_a_usage_error(options: dict, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        Figures(**options).run()
+
+
+def test_an_unknown_scene_or_checkpoint_is_named_and_nothing_is_written(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="has no scene 'none'"):
+        Figures(out=tmp_path / "out", scenes=("none",)).run()
+    with pytest.raises(UnirenderError, match="nowhere"):
+        Figures(out=tmp_path / "out", checkpoint=(tmp_path / "nowhere",)).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_draws_a_strangers_method_without_our_model(tmp_path: Path, suite: Suite) -> None:
+    (tmp_path / "theirs.py").write_text(
+        "class Theirs:\n"
+        "    name, config = 'theirs', {'theirs': 1}\n"
+        "    def decompose(self, image_srgb, mask, camera):\n"
+        "        from unirender import Intrinsics\n"
+        "        return Intrinsics(albedo=image_srgb, mask=mask, camera=camera)\n"
+    )
+    method = (f"{tmp_path / 'theirs.py'}:Theirs",)
+    figures = Figures(out=tmp_path / "out", suite=str(suite.spec.path), kinds=("comparison",), method=method)
+    assert figures.run() == 0
+    assert Image.open(tmp_path / "out" / "comparison.png").width > 3 * SIZE
+    (subject,) = figures.subjects()
+    assert subject.label == "theirs"
+    assert subject.can("decompose")
+    assert not subject.can("edit")
+
+
+def test_the_command_is_light_to_import() -> None:
+    code = "import sys, unirender_evaluation.figures_command; print({'torch', 'mitsuba', 'PIL'} & sys.modules.keys())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"

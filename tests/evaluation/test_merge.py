@@ -1,0 +1,142 @@
+"""Merging: halves of a run give the whole run's tables, rivals keep apart, and what cannot be compared is refused."""
+
+import re
+from dataclasses import replace
+
+import pytest
+from small_results import METHODS, small_results
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.merge import check_comparable, differences, merge, obstacles
+from unirender_evaluation.results_data import Results
+from unirender_evaluation.table_formats import to_markdown
+from unirender_evaluation.tables import Table, build_tables
+
+
+def tables(*files: Results) -> list[Table]:
+    run, records = merge(files)
+    return build_tables(records, run)
+
+
+def without_origin(made: list[Table]) -> list[str]:
+    """The tables' text with the rows and notes as if they had been measured in one run."""
+    texts = []
+    for table in made:
+        rows = tuple(replace(row, stored=None) for row in table.rows)
+        notes = tuple(note for note in table.notes if "stored, not measured" not in note)
+        texts.append(to_markdown(replace(table, rows=rows, notes=notes)))
+    return texts
+
+
+def changed(results: Results, by: float, source: str) -> Results:
+    """The same run, with other values of its first row, as a rival would have them."""
+    records = tuple(
+        replace(r, values={k: v + by for k, v in r.values.items()}) if r.method == "ours-mean" else r
+        for r in results.records
+    )
+    return replace(results, records=records, source=source)
+
+
+def test_one_file_is_as_it_was() -> None:
+    results = small_results()
+    assert merge([results]) == (results.run, list(results.records))
+    assert "(stored)" not in to_markdown(tables(results)[0])
+
+
+def test_halves_by_row_and_halves_by_sample_give_the_whole_runs_tables() -> None:
+    whole = without_origin(tables(small_results()))
+    rows = [small_results("a.json", ("ours-mean",)), small_results("b.json", ("input-as-albedo", "noise-ceiling"))]
+    assert without_origin(tables(*rows)) == whole
+    full = small_results()
+    samples = [
+        replace(full, source=f"{name}.json", records=tuple(r for r in full.records if r.object == name))
+        for name in ("ball-0", "ball-1")
+    ]
+    assert without_origin(tables(*samples)) == whole
+    assert without_origin(tables(samples[0])) != whole
+    assert without_origin(tables(full, replace(full, source="copy.json"))) == whole  # nothing counts twice
+
+
+def test_a_merged_row_says_where_it_is_from() -> None:
+    text = to_markdown(tables(small_results("mine.json"), small_results("theirs.json", ("ours-mean",)))[1])
+    assert "| Ours (mean) (stored) |" in text
+    origin = "mine, 2026-01-31, suite 0123456789ab, code abc"
+    assert f"Ours (mean); input as albedo; Noise ceiling: stored, not measured in this run ({origin})" in text
+
+
+@pytest.mark.parametrize("by", [0.01, 3.0])
+def test_rivals_of_one_name_stand_side_by_side(by: float) -> None:
+    mine, theirs = small_results("mine.json"), changed(small_results(), by, "theirs.json")
+    run, records = merge([mine, theirs])
+    assert [info.key for info in run.methods] == [*(info.key for info in METHODS), "ours-mean-from-theirs"]
+    labels = [info.label for info in run.methods]
+    assert (labels[0], labels[3]) == ("Ours (mean) (mine)", "Ours (mean) (theirs)")
+    counts = {info.key: sum(r.method == info.key for r in records) for info in run.methods}
+    assert counts == {"ours-mean": 8, "input-as-albedo": 8, "noise-ceiling": 4, "ours-mean-from-theirs": 8}
+    rows = [row for row in tables(mine, theirs)[1].rows if row.label.startswith("Ours")]
+    means = [row.cells[0].measured.mean for row in rows if row.cells[0].measured]
+    assert means[1] - means[0] == pytest.approx(by)
+    assert [row.cells[0].measured_rank for row in rows] == [2, 1]
+
+
+def test_another_configuration_is_another_row_and_another_cpus_rounding_is_not() -> None:
+    mine, theirs = small_results("mine.json"), changed(small_results(), 1e-7, "theirs.json")
+    assert len(merge([mine, theirs])[0].methods) == 3
+    infos = (replace(METHODS[0], config={"checkpoint": "b"}), *METHODS[1:])
+    other = replace(theirs, run=replace(theirs.run, methods=infos))
+    assert len(merge([mine, other])[0].methods) == 4
+
+
+def test_files_of_one_name_are_told_apart_by_their_paths() -> None:
+    a, b = small_results("x/out.json"), changed(small_results(), 1.0, "y/out.json")
+    labels = [info.label for info in merge([a, b])[0].methods]
+    assert "Ours (mean) (x/out.json)" in labels
+    assert "Ours (mean) (y/out.json)" in labels
+
+
+def test_a_partial_run_watermarks_all() -> None:
+    made = tables(small_results("a.json", ("ours-mean",)), small_results("b.json", ("input-as-albedo",), limit=2))
+    assert all(table.watermark == "--limit 2: a partial run, not a result" for table in made)
+
+
+def test_the_protocol_line_has_what_both_say() -> None:
+    other = small_results("b.json", ("input-as-albedo",), code="def", date="2026-02-01", seeds=(3, 0), lpips=("alex",))
+    run, _ = merge([small_results("a.json", ("ours-mean",)), other])
+    found = (run.code, run.date, run.seeds, run.lpips, run.limit)
+    assert found == ("abc and def", "2026-01-31 and 2026-02-01", (0, 3), ("alex",), None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"suite_hash": "f" * 64}, "the suites' truth differs: 0123456789ab in a.json, ffffffffffff in b.json"),
+        ({"resolution": 64}, "the suites' resolution differs: 32 in a.json, 64 in b.json"),
+        ({"mitsuba": "3.8.0"}, "the Mitsuba that rendered the truth differs: 3.9.1 in a.json, 3.8.0 in b.json"),
+        ({"exposure": "per image"}, "the exposure differs"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_with_the_reason(changes: dict, said: str) -> None:
+    a, b = small_results(), small_results("b.json")
+    assert obstacles(a, b) == differences(a, b) == []
+    with pytest.raises(UnirenderError, match=re.escape(said)):
+        merge([a, small_results("b.json", **changes)])
+
+
+def test_other_definitions_and_other_code() -> None:
+    a, b = small_results(), small_results("b.json", code="def", limit=1, environment={"mitsuba": "3.9.2"})
+    protocols = {**b.definitions.protocols, "single-image": "two images"}
+    other = replace(b, definitions=replace(b.definitions, protocols=protocols))
+    assert obstacles(a, other) == ["the protocol 'single-image' is defined otherwise in the two files"]
+    assert obstacles(a, b) == []
+    assert differences(a, b) == [
+        "code: abc in a.json, def in b.json",
+        "scenes: all in a.json, --limit 1 in b.json",
+        "Mitsuba of the run: - in a.json, 3.9.2 in b.json",
+    ]
+
+
+def test_nothing_and_the_same_file_twice_are_refused() -> None:
+    with pytest.raises(UnirenderError, match="got no results"):
+        merge([])
+    with pytest.raises(UnirenderError, match=r"a\.json: given twice"):
+        check_comparable([small_results(), small_results()])

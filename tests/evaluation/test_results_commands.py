@@ -1,0 +1,186 @@
+"""`unirender bench ls | validate | tables | compare` on the command line: what they print, and their exit statuses."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from small_results import HASH, small_document, small_results, written
+
+from unirender.cli import main
+from unirender.errors import UnirenderError
+from unirender_evaluation.benchmark import GROUPS
+from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
+from unirender_evaluation.results_compare import Rank, chosen_pairs, compare_pair, rank
+from unirender_evaluation.results_listing import LISTINGS, METHOD_GROUPS
+from unirender_evaluation.statistics import paired_difference
+from unirender_evaluation.table_list import ALL_TABLES
+
+KEY = "albedo.psnr@masked-srgb-raw"
+
+
+@pytest.fixture
+def bench(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Runs `unirender bench ...`; returns exit status, standard output and standard error."""
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def run(*words: str | Path) -> tuple[object, str, str]:
+        with pytest.raises(SystemExit) as stopped:
+            main(["bench", *map(str, words)])
+        printed = capsys.readouterr()
+        return stopped.value.code, printed.out, printed.err
+
+    return run
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    """Two valid files; in the second our row is 1 to 4 dB better, sample by sample."""
+    better = small_document()
+    for i, entry in enumerate(e for e in better["records"] if e["method"] == "ours-mean" and e["table"] == "inverse"):
+        entry["values"][KEY] += 1 + i
+    return written(tmp_path / "a.json", small_document()), written(tmp_path / "b.json", better)
+
+
+def test_ls_names_everything(bench) -> None:
+    status, out, _ = bench("ls")
+    assert status == 0
+    for name in ("tiny: ", "protocol from-image-hdri", "psnr: PSNR (dB), higher is better", "scale: raw, aligned"):
+        assert name in out
+    assert all(f"{name}\n" in out for name in LISTINGS)
+    assert all(spec in out for spec in ALL_TABLES)
+    status, out, _ = bench("ls", "variants")
+    assert (status, out.splitlines()[0]) == (0, "variants")
+    assert bench("ls", "suits")[0] == 2
+    assert METHOD_GROUPS.keys() == set(GROUPS)
+
+
+def test_validate_has_a_line_for_every_file_and_every_problem(bench, files: tuple[Path, Path], tmp_path: Path) -> None:
+    status, out, _ = bench("validate", *files)
+    assert (status, out.count(": valid, 3 rows, 20 records; suite ball 0123456789ab")) == (0, 2)
+    bad = small_document()
+    bad["run"]["coverage"], bad["records"][0]["method"] = 2, 7
+    status, out, _ = bench("validate", files[0], written(tmp_path / "bad.json", bad), tmp_path / "gone.json")
+    assert status == 1
+    assert "bad.json: not valid, 2 problems\n  run.coverage: got 2" in out
+    assert "not valid: " in out
+    assert "gone.json: no such file" in out
+    status, _, err = bench("validate")
+    assert (status, err) == (
+        2,
+        "unirender: error: bench validate: got no file, expected a results.json, or the folder of a run\n",
+    )
+
+
+def test_tables_in_every_format(bench, files: tuple[Path, Path]) -> None:
+    status, out, _ = bench("tables", files[0], "--table", "inverse", "--format", "markdown")
+    assert status == 0
+    assert out.count("### ") == 2  # whole beside the published values, and masked
+    assert "| Ours (mean) |" in out
+    assert "Relighting" not in out
+    status, out, _ = bench("tables", *files, "--format", "json", "--variant", "masked-srgb-raw")
+    made = json.loads(out)
+    assert status == 0
+    assert [table["name"] for table in made] == ["inverse", "relighting"]
+    assert {row["label"] for row in made[0]["rows"]} >= {"Ours (mean) (a)", "Ours (mean) (b)", "Noise ceiling"}
+    assert r"\begin{table*}" in bench("tables", files[0], "--format", "latex")[1]
+    assert "Inverse rendering" in bench("tables", files[0])[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["--table", "invers"], 2, "--table invers: no such table, did you mean 'inverse'?"),
+        (["--variant", "mask"], 2, "--variant mask: variant 'mask': got 'mask', expected one word per axis of masked"),
+        (["--table", "physics"], 1, "the files have no values of physics"),
+        (["nowhere.json"], 1, "nowhere.json: no such file"),
+    ],
+)
+def test_what_tables_refuses(bench, files: tuple[Path, Path], words: list[str], status: int, said: str) -> None:
+    found, out, err = bench("tables", files[0], *words)
+    assert (found, out) == (status, "")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_compare_prints_both_means_the_difference_and_the_ranks_in_80_columns(bench, files: tuple[Path, Path]) -> None:
+    status, out, _ = bench("compare", *files, "--method", "ours-mean")
+    assert status == 0
+    assert "inverse/single-image: Ours (mean)" in out
+    line, below = next(
+        (a, b) for a, b in zip(out.splitlines(), out.splitlines()[1:], strict=False) if "Albedo PSNR" in a
+    )
+    assert [word for word in line.split() if "." in word] == ["20.75", "23.25", "-2.50"]
+    assert "[-3.50, -1.50]" in below
+    assert "by B" in " ".join(out.split())
+    assert "…" not in out
+    assert max(map(len, out.splitlines()[3:])) <= 80
+    status, out, _ = bench("compare", files[0], files[0], "--method", "ours-mean=input-as-albedo")
+    assert "A: Ours (mean), B: input as albedo" in out
+    assert "A beats B" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        (["--method", "ours-men"], 1, "compare: A has no row 'ours-men'; did you mean ours-mean?"),
+        (["--method", "ours-mean=mine"], 1, "compare: B has no row 'mine'; it has ours-mean, input-as-albedo"),
+        (["--method", "=ours-mean"], 2, "--method =ours-mean: expected KEY, a row of both files, or KEY=KEY"),
+        (["--method", "ours-mean="], 2, "--method ours-mean=: expected KEY"),
+        (["--variant", "best"], 2, "--variant best: "),
+        (["--method", "noise-ceiling", "--variant", "masked-linear-raw", "x"], 2, "x"),
+    ],
+)
+def test_what_compare_refuses(bench, files: tuple[Path, Path], words: list[str], status: int, said: str) -> None:
+    found, _, err = bench("compare", *files, *words)
+    assert found == status
+    assert said in err
+
+
+def test_compare_says_why_two_results_cannot_be_compared(bench, files: tuple[Path, Path], tmp_path: Path) -> None:
+    other = json.loads(json.dumps(small_document()).replace(HASH, "f" * 64))
+    status, out, err = bench("compare", files[0], written(tmp_path / "c.json", other))
+    assert (status, out) == (1, "")
+    assert "cannot be compared: the suites' truth differs: 0123456789ab in " in err
+
+
+def test_the_comparison_is_the_paired_one_on_shared_samples() -> None:
+    a = small_results("a.json")
+    b = small_results("b.json")
+    b = replace(b, records=tuple(replace(r, values={k: v - 1 for k, v in r.values.items()}) for r in b.records[1:]))
+    (pair,) = chosen_pairs(a.run, b.run, ["ours-mean"])
+    albedo = next(iter(compare_pair(a, b, *pair, DEFAULT_VARIANT))).columns[0]
+    values = [
+        {r.sample: r.values[KEY] for r in file.records if r.method == "ours-mean" and KEY in r.values}
+        for file in (a, b)
+    ]
+    objects = {r.sample: r.object for r in a.records}
+    assert albedo.comparison is not None
+    assert albedo.comparison.difference == paired_difference(values[0], values[1], objects)
+    assert (albedo.only_a, albedo.only_b) == (1, 0)
+    assert albedo.mean_a - albedo.mean_b == pytest.approx(1)
+    assert (albedo.verdict, albedo.rank_a) == ("A beats B", Rank(1, 2))
+
+
+def test_ranks_are_on_rounded_means_of_rows_on_all_samples() -> None:
+    results = small_results()
+    records = [r for r in results.records if r.table == "inverse"]
+    ranked = {key: rank(records, results.run, METRICS["psnr"], KEY, key) for key in ("ours-mean", "input-as-albedo")}
+    assert ranked == {"ours-mean": Rank(1, 2), "input-as-albedo": Rank(2, 2)}
+    assert rank(records, results.run, METRICS["psnr"], KEY, "noise-ceiling") is None
+    assert rank(records[1:], results.run, METRICS["psnr"], KEY, "ours-mean") is None  # fewer samples than another row
+    close = [replace(r, values={KEY: 20 + 0.001 * (r.method == "ours-mean")}) for r in records]
+    assert rank(close, results.run, METRICS["psnr"], KEY, "input-as-albedo") == Rank(1, 2)
+
+
+def test_identical_pictures_are_not_compared_and_rows_without_a_common_name_are_named() -> None:
+    a = small_results()
+    exact = replace(a, records=tuple(replace(r, values={KEY: math.inf}) for r in a.records if r.table == "inverse"))
+    (pair,) = chosen_pairs(a.run, a.run, ["ours-mean"])
+    found = next(iter(compare_pair(exact, exact, *pair, DEFAULT_VARIANT))).columns[0]
+    assert (found.comparison, found.verdict) == (None, "not compared: an identical picture has an infinite PSNR")
+    with pytest.raises(
+        UnirenderError, match="no row of the same name; name two with --method KEY=KEY: A has ours-mean;"
+    ):
+        chosen_pairs(small_results("a", ("ours-mean",)).run, small_results("b", ("noise-ceiling",)).run, ())
