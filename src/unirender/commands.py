@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 MAX_STOPS = 32
+MUCH_COARSE = 0.05  # share of the object, from which a notice is due
 
 ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a light file
 
@@ -207,6 +208,11 @@ class Edit:
             meta = {"command": "edit", "input": self.input.picture, "clipped": picture.clipped, **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
+        if result.coarse_share > MUCH_COARSE:
+            notice(
+                f"the predicted light is too coarse to show what roughness {self.roughness:g} reflects on "
+                f"{result.coarse_share:.0%} of the object: its highlights stay as wide as they were"
+            )
         print(f"{self.out.output}")
         return 0
 

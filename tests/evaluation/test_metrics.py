@@ -173,7 +173,8 @@ def test_what_the_option_asks_for() -> None:
     assert chosen_variants(["all"]) == ALL_VARIANTS
     assert len({variant.label for variant in ALL_VARIANTS}) == 12
     assert chosen_variants(["linear", "masked-linear"]) == (Variant("masked", "linear"),)  # the same one, once
-    found = chosen_variants(["whole", "all"]) or ()
+    found = chosen_variants(["whole", "all"])
+    assert found is not None
     assert found[0] == Variant("whole")
     assert set(found) == set(ALL_VARIANTS)
     assert len(found) == 12

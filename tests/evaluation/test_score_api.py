@@ -36,7 +36,8 @@ PICTURES = [(level * rng.random((16, 16, 3)) * MASK).astype(np.float32) for leve
 
 def test_it_is_what_the_benchmark_computes() -> None:
     assert score(FOUND, TRUE) == score_maps(FOUND, TRUE)
-    assert score(*PICTURES, mask=MASK, quantity="relit") == score_image(*PICTURES, MASK)
+    found, true = PICTURES
+    assert score(found, true, mask=MASK, quantity="relit") == score_image(found, true, MASK)
     assert len(score(FOUND, TRUE)) > 25
     assert score(TRUE, TRUE)["albedo.psnr@masked-srgb-raw"] == float("inf")
 
@@ -69,7 +70,7 @@ def test_lpips_on_request_at_the_protocols_scale() -> None:
     large = [np.repeat(np.repeat(x, 4, 0), 4, 1) for x in (*PICTURES, MASK)]
     found = score(large[0], large[1], "masked-srgb-aligned", mask=large[2], lpips=["alex"])
     assert 0 < found["image.lpips_alex@masked-aligned"] < 2
-    assert not any("lpips" in key for key in score(*large[:2], mask=large[2]))
+    assert not any("lpips" in key for key in score(large[0], large[1], mask=large[2]))
 
 
 def bytes_of(picture: np.ndarray) -> np.ndarray:

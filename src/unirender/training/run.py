@@ -27,7 +27,7 @@ class Train:
     data: Path
     """Folder that `unirender dataset` wrote."""
     preset: str = "tiny"
-    """Row of `unirender.training.presets.PRESETS`."""
+    """Row of `unirender.training.presets.PRESETS`: tiny, small, sd15, sd21, paper, and ablations of tiny by name."""
     init: Path | None = None
     """Begin with the weights of this pipeline folder instead of random ones; its network must be the preset's."""
     init_from: Path | None = None
