@@ -18,6 +18,7 @@ from typing import Any
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Composite, Image, quantise
+from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.physics_stage import Stage
 from unirender_evaluation.physics_tests import TESTS, PhysicsTest, true_maps
 from unirender_evaluation.physics_tracer import PathTracer
@@ -82,13 +83,14 @@ def _found(decompose: Callable[..., Intrinsics], stage: Stage, _: Material, imag
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the table: `rows` by name; `refused`: whether the twin fails the test, `n` scenes."""
+    """One line of the table: a test, and what each row that answers it scores, by the row's name."""
 
     test: PhysicsTest
     rows: dict[str, Estimate]
 
     @property
     def refused(self) -> bool:
+        """Whether the test tells its twin from Mitsuba."""
         return self.test.fails(self.rows[TWIN].mean, self.rows[MITSUBA].mean)
 
 
@@ -132,7 +134,6 @@ def _cell(estimate: Estimate | None, decimals: int) -> str:
 def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[Finding]:
     """Writes both files; returns the table's lines."""
     found = findings(values)
-    out.mkdir(parents=True, exist_ok=True)
     tests = [
         {
             "name": f.test.name,
@@ -147,6 +148,5 @@ def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[
         for f in found
     ]
     text = json.dumps({"settings": settings, "tests": tests, "values": [asdict(v) for v in values]}, indent=1)
-    (out / "physics.json").write_text(text + "\n", encoding="utf-8")
-    (out / "physics.md").write_text(markdown(found, settings), encoding="utf-8")
+    write_files(out, {"physics.json": text + "\n", "physics.md": markdown(found, settings)})
     return found

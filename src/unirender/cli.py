@@ -163,7 +163,7 @@ def run(command: Any) -> int:
 def quick_start() -> Iterator[None]:
     """For a process of our own that ends with what is done inside: a lean start, and a quick end.
 
-    Importing torch makes some 200,000 objects that live as long as the process. Python, which looks among all of them
+    Importing torch makes a multitude of objects that live as long as the process. Python, which looks among all of them
     for cycles that nobody uses any more, does so seldom here, and at the end of the process no more.
     """
     gc.set_threshold(OBJECTS)

@@ -124,7 +124,8 @@ def test_the_strip_cuts_everything_out_by_its_own_mask(scene: MultiviewScene, sm
     assert ring.any()
     for name, panel in found.items():
         assert (panel[ring] > 0.95).all(), name
-        assert (true[name][ring] < 1).any(), name
+        if name != "albedo":  # this object's own is white
+            assert (true[name][ring] < 0.99).any(), name
     picture = found_strip(scene, smaller_looks)
     assert picture.width > 6 * 100
     assert picture.height > 4 * 100

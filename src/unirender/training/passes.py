@@ -8,9 +8,9 @@ alike. Hence the loss depends on the number of parts alone, and on that through 
 
     term = sum over parts p of  mass_p / mass * term_p,      mass_p = weight of the part's rows in the term's mean
 
-On a CPU that others use too, two passes on one thread each are far faster than one pass on two threads, which wait for
-each other at every operation (measured: 10 against 0.5 samples/s under load): hence parts side by side. On a GPU parts
-one after the other save memory.
+On a CPU, two passes on one thread each do not wait for each other at every operation, as the threads of one pass do;
+the more others use the cores, the longer that wait: hence parts side by side (`samples_per_s` in the log, with
+`--parallel 1` and without, shows what it is worth). On a GPU parts one after the other save memory.
 """
 
 import dataclasses
