@@ -20,9 +20,9 @@ class Subsets:
     sample: int | None = 4
     shade: int | None = 12
     physics: int | None = 12
-    optimise: int | None = 4
+    optimise: int | None = 3
     pictures: int | None = 2
-    views: int | None = 4
+    views: int | None = 3
     mitsuba: int | None = 4
 
 

@@ -270,17 +270,24 @@ class Conditioning:
         if not self.physics_prior:
             return Extras(common, common, None, light)
         known = given[:, [TRIPLETS.index(name) for name in self.physics_prior.triplets]].all(dim=1)
-        if maps is None:
-            if known.any():
-                raise ValueError("extras: the flags say that the maps of the prior are given, but maps is None")
-            prior = mask.new_zeros(b, self.codec.channels, h, w)
-        else:
-            prior = (
-                self.codec.encode(prior_picture(self.physics_prior, maps, mask, camera))
-                * known.to(mask)[:, None, None, None]
-            )
+        prior = self._prior(self.physics_prior, known, maps, mask, camera)
         flag = known.to(mask)[:, None, None, None].expand(-1, -1, h, w)
         return Extras(common, torch.cat([common, prior, flag], dim=1), prior, light)
+
+    def _prior(
+        self, prior: Prior, known: Bool[Tensor, " b"], maps: Maps | None, mask: Float[Tensor, "b 1 H W"], camera: Camera
+    ) -> Float[Tensor, "b c h w"]:
+        """Latents of the closed-form image in the rows that are known, made for those alone; zeros in the others."""
+        factor = self.codec.factor
+        latents = mask.new_zeros(len(mask), self.codec.channels, mask.shape[-2] // factor, mask.shape[-1] // factor)
+        rows = known.nonzero()[:, 0]
+        if not len(rows):
+            return latents
+        if maps is None:
+            raise ValueError("extras: the flags say that the maps of the prior are given, but maps is None")
+        of_rows = {name: value[rows] for name, value in maps.items()}
+        encoded = self.codec.encode(prior_picture(prior, of_rows, mask[rows], camera))
+        return latents.index_copy(0, rows, encoded.to(latents))
 
     def _light(self, given: Bool[Tensor, "b 6"], maps: Maps | None, like: Tensor) -> Float[Tensor, "b 4 eh ew"]:
         """What the light's encoder sees: the packed light and a flag; zeros for a light that is not given."""
