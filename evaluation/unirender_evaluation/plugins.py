@@ -3,8 +3,9 @@
     entry point      group `unirender.methods` of an installed distribution: a row of every run
     --method SPEC    module:Class, among what is installed or in the current directory; or path/to/file.py:Class
 
-Each names a class, or any callable without arguments that returns a method, or a method itself (see `methods`). The
-current directory and the folder of a file are searched last: a stranger's `copy.py` never stands in for Python's.
+Each names a class, or any callable that returns a method, or a method itself (see `methods`). After a `?` a SPEC has
+arguments for the callable, `name=value` with `&` between: `my_method.py:Retinex?sigma=4&name=wide`. The current
+directory and the folder of a file are searched last: a stranger's `copy.py` never stands in for Python's.
 """
 
 import hashlib
@@ -12,18 +13,20 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from types import MappingProxyType, ModuleType, NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.methods import CAPABILITIES, capabilities
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
+ARGUMENTS = "?name=value&name=value"
+BOOLEANS = {"true": True, "false": False}
 
 
 @dataclass(frozen=True)
@@ -58,13 +61,14 @@ def named_plugin(spec: str) -> Plugin:
     """The method of one `--method`.
 
     Raises:
-        UnirenderError: the text has another form, there is no such file, module or name, its import or construction
-            fails, or it is not a method.
+        UnirenderError: the text has another form, there is no such file, module or name, it takes other arguments, its
+            import or construction fails, or it is not a method.
     """
-    place, separator, name = spec.rpartition(":")
-    if not (separator and place and name.isidentifier()):
-        raise UsageError(f"--method {spec}: expected {FORM}")
     what = f"--method {spec}"
+    target, has_arguments, query = spec.partition("?")
+    place, separator, name = target.rpartition(":")
+    if not (separator and place and name.isidentifier()):
+        raise UsageError(f"{what}: expected {FORM}, then {ARGUMENTS} if it takes arguments")
     is_file = place.endswith(".py") or "/" in place or "\\" in place
     module = _module_of_file(Path(place), what) if is_file else _module_of_name(place, what)
     if not hasattr(module, name):
@@ -73,7 +77,47 @@ def named_plugin(spec: str) -> Plugin:
             f"{what}: {module.__file__ or place} has no {name!r}; with one of {', '.join(CAPABILITIES)} it has "
             f"{', '.join(defined) or 'nothing'}"
         )
-    return _plugin(getattr(module, name), what)
+    found = getattr(module, name)
+    arguments = _arguments(found, query, what) if has_arguments else {}
+    return _plugin(found, what, arguments)
+
+
+def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
+    """The arguments behind the `?`, each of the type that the callable's signature says.
+
+    Raises:
+        UsageError: another form, an argument that the callable does not take, twice, or of another type.
+    """
+    if not callable(found):
+        raise UsageError(f"{what}: takes no arguments, expected nothing behind its name")
+    signature = _attempt(what, "read its arguments", lambda: inspect.signature(found, eval_str=True))
+    taken = {n: p for n, p in signature.parameters.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    arguments: dict[str, Any] = {}
+    for entry in query.split("&"):
+        name, separator, text = entry.partition("=")
+        if not separator or name in arguments:
+            raise UsageError(f"{what}: got {entry!r}, expected {ARGUMENTS}, each name once")
+        if name not in taken:
+            raise UsageError(f"{what}: no argument {name!r}, expected some of {', '.join(taken) or 'none'}")
+        arguments[name] = _value(text, taken[name].annotation, f"{what}: {name}")
+    return arguments
+
+
+def _value(text: str, annotation: Any, what: str) -> Any:
+    """A text as the type of an annotation, None apart; as it is where there is no annotation."""
+    united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    kinds = [kind for kind in united if kind is not NoneType]
+    kind = str if kinds == [inspect.Parameter.empty] else kinds[0] if len(kinds) == 1 else None
+    if kind is bool and text in BOOLEANS:
+        return BOOLEANS[text]
+    if kind in (int, float, str, Path):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    elif kind is not bool:
+        raise UsageError(f"{what} is {annotation}: expected a number, text, path or true/false in a SPEC")
+    raise UsageError(f"{what} is {text!r}, expected {'true or false' if kind is bool else f'one {kind.__name__}'}")
 
 
 def _module_of_file(path: Path, what: str) -> ModuleType:
@@ -120,14 +164,17 @@ def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
     """Runs foreign code; whatever it raises becomes one clear line."""
     try:
         return run()
+    except UnirenderError as error:  # written to be read: one of ours
+        raise UnirenderError(f"{what}: could not {task}: {error}") from error
     except (Exception, SystemExit) as error:
         raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
 
 
-def _plugin(found: Any, what: str) -> Plugin:
+def _plugin(found: Any, what: str, arguments: Mapping[str, Any] = MappingProxyType({})) -> Plugin:
     """The method that `found` is, or that it returns when it is called."""
     is_method = not inspect.isclass(found) and any(callable(getattr(found, name, None)) for name in CAPABILITIES)
-    method: Any = found if is_method or not callable(found) else _attempt(what, "construct it", found)
+    as_it_is = not arguments and (is_method or not callable(found))
+    method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
     try:
         capabilities(method)
     except UnirenderError as error:

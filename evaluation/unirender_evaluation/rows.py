@@ -207,11 +207,16 @@ def prediction_rows(folders: Mapping[str, Path]) -> list[Row]:
 
 
 def plugin_rows(plugins: Sequence[Plugin]) -> list[Row]:
-    """Rows of other people's methods; what they import of unirender is not known, so that all of it counts."""
+    """Rows of other people's methods; what they import of unirender is not known, so that all of it counts.
+
+    Whole numbers of the names `steps`, `samples` and `seed` in a method's configuration stand in the protocol line.
+    """
     rows = []
     for plugin in plugins:
         row = make_row(plugin.method, "external", uses=frozenset({MODEL}))
-        rows.append(replace(row, info=replace(row.info, config={**row.info.config, "source": plugin.source})))
+        config = row.info.config
+        stated = {name: config[name] for name in ("steps", "samples", "seed") if type(config.get(name)) is int}
+        rows.append(replace(row, info=replace(row.info, config={**config, "source": plugin.source}, **stated)))
     return rows
 
 

@@ -32,6 +32,10 @@ class Broken(Grey):
         raise RuntimeError("no weights")
 
 
+class Sampler(Grey):
+    config = {"steps": 4, "samples": "many", "seed": 7}
+
+
 class Unwritable(Grey):
     config = {"weights": object()}
 
@@ -57,6 +61,13 @@ def test_a_file_with_its_neighbours(folder: Path, name: str) -> None:
     plugin = named_plugin(f"{folder / 'my_method.py'}:{name}")
     assert plugin.method.name == "grey"
     assert len(plugin.source) == 64
+
+
+def test_steps_and_seed_of_a_method_are_stated(folder: Path) -> None:
+    """What is no whole number is not taken for one."""
+    sampler, grey = plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{name}") for name in ("Sampler", "Grey")])
+    assert (sampler.info.steps, sampler.info.samples, sampler.info.seed) == (4, None, 7)
+    assert (grey.info.steps, grey.info.samples, grey.info.seed) == (None, None, None)
 
 
 def test_a_module_of_the_current_directory(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
