@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from synthetic_shards import write_dataset
 
-from unirender.cli import main
+from unirender.cli import main, read_light
 from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
@@ -290,6 +290,17 @@ def test_the_working_directory_is_no_output(
     assert run("decompose", ball, "--output", "out") == 0
 
 
+def test_negative_radiance_of_a_light_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pixels = np.ones((16, 32, 3), np.float32)
+    write_exr(tmp_path / "light.exr", image_channels(pixels))
+    read_light(tmp_path / "light.exr")
+    assert not capsys.readouterr().err
+    pixels[8, 10] = -3
+    write_exr(tmp_path / "light.exr", image_channels(pixels))
+    assert read_light(tmp_path / "light.exr").min() == 0
+    assert "of its radiance is negative and was set to 0" in capsys.readouterr().err
+
+
 USAGE = {
     "no argument": (["decompose"], "required"),
     "no such command": (["bake"], "bake"),
@@ -311,6 +322,10 @@ USAGE = {
     "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
     "minutes": (["train", "--data", "FOLDER", "--minutes", "0"], "more than 0"),
     "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
+    "best of another": (
+        ["train", "--data", "FOLDER", "--out", "OUT", "--validate", "1", "--keep-best", "albedo.snr"],
+        "expected one of: albedo.psnr, normal.cosine, metallic.mse, roughness.mse, render.psnr, edit.psnr",
+    ),
     "pairs": (["dataset", "--pairs", "5", "--out", "OUT"], "expected 3 x lights"),
 }
 FAILURES = {
@@ -389,6 +404,9 @@ def test_train_writes_a_pipeline_that_decompose_loads(
         "higher_is_better": True,
     }
     checkpoint = tmp_path / "run" / "pipeline"
+    assert json.loads((checkpoint / "training.json").read_text())["data"]["folder"] == "data"
+    assert run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", *length) == 0
+    assert "finished at step 2 of 2: nothing to train; pass --steps (more than 2)" in capsys.readouterr().out
     assert run("decompose", ball, "--checkpoint", checkpoint, "--output", tmp_path / "out") == 0
     assert read_exr(tmp_path / "out" / "intrinsics.exr")[1]["checkpoint"] == "pipeline"
 

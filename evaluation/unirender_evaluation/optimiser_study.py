@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender_evaluation.engine import content_key
 from unirender_evaluation.multiview_scenes import MultiviewScene, multiview_scenes, suite_scene
 from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
@@ -121,9 +122,7 @@ def open_folder(path: Path) -> Path:
 def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Writes texts (UTF-8) and pictures, each moved into place when complete."""
     for name, content in files.items():
-        temporary = folder / f".{name}.part"
-        temporary.write_bytes(content if isinstance(content, bytes) else content.encode())
-        os.replace(temporary, folder / name)
+        replace_file(folder / name, content)
 
 
 def work_through(jobs: Mapping[str, Callable[[], None]], console: Console, title: str) -> None:

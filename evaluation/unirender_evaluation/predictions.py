@@ -14,6 +14,7 @@ own name of the picture):
     <picture>/relight_l1_hdri.exr|png   the same, the light given
     <picture>/render_given.exr|png      the picture from true maps, s and d; `render_given-light`: from maps and light
 
+A mask in `intrinsics.exr` (`mask.Y`) is the method's own, and whole-frame figures of its maps are taken with it.
 Rendered pictures are premultiplied: black outside the object. EXR is linear, PNG sRGB-encoded. Other habits are
 declared in a `conventions.toml` (see `conventions`). Absent files are absent numbers, never errors; a file that is
 there and unreadable, of another size or not finite is an error, which `prediction_check` finds before a run begins.
@@ -96,7 +97,8 @@ class PredictionFolder:
         maps: dict[str, np.ndarray] = {}
         for file in files:
             maps = self.read_maps(file, task.mask, camera) | maps
-        return image, Intrinsics(**{**maps, "mask": task.mask}, camera=camera)
+        own = self.read_mask(files[0])
+        return image, Intrinsics(**maps, mask=task.mask if own is None else own, camera=camera)
 
     def _picture(self, task: Task) -> Path | None:
         for suffix in SUFFIXES:
@@ -132,6 +134,10 @@ class PredictionFolder:
             return self._read_exr_maps(path, mask, camera) if path.suffix == ".exr" else self._read_png_map(path, mask)
         except UnirenderError as error:
             raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
+
+    def read_mask(self, path: Path) -> Mask | None:
+        """The method's own mask, from a file of maps; None: it has none, and the true one is pasted."""
+        return intrinsics_from_channels(read_exr(path)[0]).mask if path.suffix == ".exr" else None
 
     def _read_exr_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
         read = intrinsics_from_channels(read_exr(path)[0], camera=camera)

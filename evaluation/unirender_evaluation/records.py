@@ -15,13 +15,13 @@ import dataclasses
 import io
 import json
 import math
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 
 SCHEMA_VERSION = 1
 
@@ -139,7 +139,7 @@ class RunInfo:
 
 def write_records(path: Path, records: Iterable[Record]) -> None:
     """Writes records as JSONL, atomically (temporary file, fsync, rename)."""
-    write_atomic(path, "".join(record.to_json() + "\n" for record in records))
+    replace_file(path, "".join(record.to_json() + "\n" for record in records))
 
 
 def write_csv(path: Path, records: Iterable[Record]) -> None:
@@ -151,7 +151,7 @@ def write_csv(path: Path, records: Iterable[Record]) -> None:
     for record in records:
         for metric, value in sorted(record.values.items()):
             writer.writerow((*(getattr(record, name) for name in names), metric, repr(float(value))))
-    write_atomic(path, buffer.getvalue())
+    replace_file(path, buffer.getvalue())
 
 
 def append_record(path: Path, record: Record) -> None:
@@ -194,7 +194,7 @@ def read_records(path: Path, *, torn_tail: Literal["raise", "drop"] = "raise") -
 
 def write_run(path: Path, run: RunInfo) -> None:
     """Writes a `RunInfo` as JSON, atomically."""
-    write_atomic(path, json.dumps(dataclasses.asdict(run), indent=2, sort_keys=True, allow_nan=False) + "\n")
+    replace_file(path, json.dumps(dataclasses.asdict(run), indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def read_run(path: Path) -> RunInfo:
@@ -250,13 +250,3 @@ def _check_value(name: str, value: Any) -> None:
         raise UnirenderError(
             f"value of {name!r} is {value!r}, expected a number that is not NaN; leave out what does not exist"
         )
-
-
-def write_atomic(path: Path, text: str) -> None:
-    """Writes a text file by way of a temporary one, so that a reader never meets half of it."""
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)

@@ -8,7 +8,6 @@ of a finished run again.
 """
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -18,6 +17,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.gallery import GalleryItem, hero, shelves, shown_width
 from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
@@ -109,13 +109,7 @@ def write_report(
         samples_json=_inline(json.dumps(samples, separators=(",", ":"), allow_nan=False, ensure_ascii=False)),
         json=_inline(to_json(tables)),
     )
-    temporary = path.with_name(path.name + ".tmp")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(page)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
-    return path
+    return replace_file(path, page)
 
 
 def _inline(data: str) -> Markup:

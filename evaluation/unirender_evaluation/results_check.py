@@ -60,12 +60,12 @@ def remarks(results: Results) -> list[str]:
 
 def installed_suite_hash(name: str) -> str | None:
     """The truth's sha256 of a bundled suite; None where no suite of that name is installed, or has no truth."""
-    from unirender_evaluation.suite_spec import read_spec
+    from unirender_evaluation.suite_home import found_spec
 
     if not re.fullmatch(r"[\w-]+", name):  # a path: somebody's own suite
         return None
     try:
-        return read_spec(name).truth_sha256 or None
+        return found_spec(name).truth_sha256 or None
     except UnirenderError:
         return None
 

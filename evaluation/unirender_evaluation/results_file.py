@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender_evaluation.records import (
     SCHEMA_VERSION,
     Record,
@@ -24,7 +25,6 @@ from unirender_evaluation.records import (
     read_records,
     read_run,
     run_from_plain,
-    write_atomic,
 )
 from unirender_evaluation.results_check import content_problems
 from unirender_evaluation.results_data import NAME, Definitions, Results, definitions
@@ -53,7 +53,7 @@ def write_results(path: Path, run: RunInfo, records: Sequence[Record]) -> None:
     from_document(document, str(path))
     lines = [json.dumps(record, sort_keys=True, allow_nan=False) for record in document.pop("records")]
     head = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False).removesuffix("\n}")
-    write_atomic(path, head + ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n")
+    replace_file(path, head + ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n")
 
 
 def to_document(run: RunInfo, records: Sequence[Record], meaning: Definitions) -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """What `unirender bench ls` prints: one function for each list, a line for each entry."""
 
 from collections.abc import Callable, Iterator, Mapping
-from importlib import metadata, resources
-from pathlib import Path
+from importlib import metadata
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import MASKS, SCALES, SPACES
 from unirender_evaluation.plugins import ENTRY_POINT_GROUP
 from unirender_evaluation.specs import PROTOCOLS
-from unirender_evaluation.suite_spec import read_spec
+from unirender_evaluation.suite_home import found_spec, truth_command
+from unirender_evaluation.suite_spec import SuiteSpec, read_spec, suite_folder
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 
 METHOD_GROUPS = {
@@ -20,18 +20,45 @@ METHOD_GROUPS = {
 
 
 def suites() -> Iterator[str]:
-    """The bundled suites, and whether their truth is here."""
-    folder = Path(str(resources.files("unirender_evaluation"))) / "data" / "suites"
-    for path in sorted(folder.glob("*.toml")):
+    """The bundled suites, what is in them, and whether their truth is here."""
+    for path in sorted(suite_folder().glob("*.toml")):
         try:
             spec = read_spec(path)
         except UnirenderError as error:
             yield f"{path.stem}: {error}"
             continue
-        make = f"not made: unirender bench truth --suite {spec.name}"
-        truth = f"truth {spec.truth_sha256[:12]}" if spec.truth_path.is_file() and spec.truth_sha256 else make
-        yield f"{spec.name}: {spec.title}; {len(spec.objects)} objects, {spec.resolution} px, {truth}"
+        yield f"{spec.name}: {spec.title}"
+        yield f"  objects: {_objects(spec)}; lights: {_lights(spec)}; {spec.resolution} px"
+        yield f"  {_truth(spec)}"
     yield "your own: a TOML file like these, by its path"
+
+
+def _objects(spec: SuiteSpec) -> str:
+    counts = [group.count for group in spec.meshes]
+    meshes = "all" if None in counts else str(sum(count or 0 for count in counts))
+    parts = [f"{len(spec.objects)} procedural"] if spec.objects else []
+    return " + ".join([*parts, f"{meshes} meshes of a folder"] if counts else parts)
+
+
+def _lights(spec: SuiteSpec) -> str:
+    files = spec.light_files
+    counts = {
+        "bundled": spec.bundled_lights,
+        "procedural": len(spec.procedural_lights),
+        "of a folder": 0 if files is None else files.count or "all",
+    }
+    parts = " + ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    return f"{parts}, {spec.lights_per_object} for each object"
+
+
+def _truth(spec: SuiteSpec) -> str:
+    try:
+        found = found_spec(spec.path)
+    except UnirenderError as error:
+        return str(error)
+    if not found.truth_sha256 or not found.truth_path.is_file():
+        return f"no truth here: make it with {truth_command(spec)}"
+    return f"truth {found.truth_sha256[:12]}: {found.truth_path}"
 
 
 def tables() -> Iterator[str]:

@@ -15,6 +15,7 @@ from typing import Any
 
 from rich.progress import Progress
 
+from unirender.files import replace_file
 from unirender_evaluation import bounds
 from unirender_evaluation.engine import Prediction, Store, content_key, record_of, score
 from unirender_evaluation.records import MethodInfo, Record
@@ -79,7 +80,7 @@ def run_check(
     for record, scene in records:
         store.add(record) if scene in here.scenes else store.lay_by(record)
     check["records"] = {record.key: scene.key for record, scene in records}
-    _write(request.path, json.dumps(check, indent=1) + "\n")
+    replace_file(request.path, json.dumps(check, indent=1) + "\n")
     return check
 
 
@@ -149,9 +150,3 @@ def _records(outcome: TruthCheck, info: MethodInfo, here: Run) -> list[tuple[Rec
                 values = score(task, Prediction(image, maps), here.backbones)
                 found.append((record_of(task, info, values, key), task.scene))
     return found
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

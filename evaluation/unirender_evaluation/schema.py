@@ -14,8 +14,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from unirender.files import replace_file
 from unirender_evaluation.metrics import METRICS
-from unirender_evaluation.records import SCHEMA_VERSION, MethodInfo, Record, RunInfo, write_atomic
+from unirender_evaluation.records import SCHEMA_VERSION, MethodInfo, Record, RunInfo
 
 FORMAT = "unirender-results"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
@@ -158,4 +159,4 @@ def schema_text() -> str:
 
 
 if __name__ == "__main__":
-    write_atomic(shipped_schema_path(), schema_text())
+    replace_file(shipped_schema_path(), schema_text())

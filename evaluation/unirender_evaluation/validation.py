@@ -19,6 +19,8 @@ from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.tasks import scene_ids, tasks
 
 MAP_SCORES = (("albedo", "psnr"), ("normal", "cosine"), ("metallic", "mse"), ("roughness", "mse"))
+IMAGE_SCORES = (("render", "psnr"), ("edit", "psnr"))
+SCORES = tuple(f"{name}.{metric}" for name, metric in (*MAP_SCORES, *IMAGE_SCORES))
 
 
 def suite_validation(suite: str = "tiny", scenes: int = 4) -> Callable[[Any], dict[str, Score]]:
@@ -66,7 +68,8 @@ def score_scene(pipeline: Any, suite: Suite, scene: Scene, number: int) -> dict[
         "render": (pipeline.render(given.inputs["render"]["intrinsics"]), given),
         "edit": (pipeline.edit(**edit.inputs["edit"]).image_linear, edit),
     }
-    for name, (image, task) in images.items():
+    for name, metric in IMAGE_SCORES:
+        image, task = images[name]
         scores = score_image(image, task.truth_image, task.mask, quantity=name)
-        values[name, "psnr"] = scores[metric_key(name, "psnr", DEFAULT_VARIANT)]
+        values[name, metric] = scores[metric_key(name, metric, DEFAULT_VARIANT)]
     return values

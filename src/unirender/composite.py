@@ -136,7 +136,7 @@ def _integrate_lobes(
     squared = np.square(np.maximum(n_l, 1e-6))
     g1 = np.where(n_l > 0, 2 / (1 + np.sqrt(1 + alpha**2 * (1 - squared) / squared)), 0)
     away = np.clip(1 - v_h, 0, 1)
-    schlick = np.square(np.square(away)) * away  # the 5th power, five times as fast
+    schlick = np.square(np.square(away)) * away  # the 5th power; `**` is slower
     return np.mean((1 - schlick) * g1, axis=(1, 2)), np.mean(schlick * g1, axis=(1, 2))
 
 

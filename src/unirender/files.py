@@ -133,6 +133,28 @@ def _move_into_place(temporary: Path, path: Path) -> None:
     shutil.rmtree(aside)
 
 
+def replace_file(path: Path, content: str | bytes) -> Path:
+    """Writes a file, text as UTF-8, and its folder where there is none; returns the path.
+
+    It is written aside, synced and renamed: whoever reads `path`, after a crash too, finds the old content or the new.
+
+    Raises:
+        OSError: it cannot be written; what was there stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        with temporary.open("wb") as file:
+            file.write(content if isinstance(content, bytes) else content.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    return path
+
+
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
     """Display values in [0, 1], 1, 3 or 4 channels, as an 8-bit PNG."""
     pixels = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)

@@ -8,16 +8,14 @@ listed, and the others are done. Light to import.
 
 import hashlib
 import json
-import os
 import re
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import META_FILE, new_folder, write_png, write_result
+from unirender.files import META_FILE, new_folder, replace_file, write_png, write_result
 from unirender.pictures import Picture
 
 if TYPE_CHECKING:
@@ -210,8 +208,4 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
 def write_summary(output: Path, result: FolderResult, facts: Mapping[str, Any]) -> None:
     """Writes `summary.json`, whole: what was asked for, the figures of each picture, and why others failed."""
     record = {**facts, "pictures": result.figures, "failed": result.failed}
-    handle, temporary = tempfile.mkstemp(prefix=f".{SUMMARY_FILE}.", dir=output)
-    with os.fdopen(handle, "w") as file:
-        file.write(json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")
-    os.chmod(temporary, 0o644)
-    os.replace(temporary, output / SUMMARY_FILE)
+    replace_file(output / SUMMARY_FILE, json.dumps(record, indent=2, sort_keys=True, default=str) + "\n")

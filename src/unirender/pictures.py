@@ -15,6 +15,7 @@ from unirender.exr import channels_rgb, read_exr
 MAX_PIXELS = 100_000_000
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 DISPLAY_MAX_16_BIT = 65535  # display white of 16-bit grey
+NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
 
 
 @dataclass(frozen=True)
@@ -25,11 +26,13 @@ class Picture:
         image_srgb: display values in [0, 1], not premultiplied.
         mask: coverage; None where the file has no alpha channel.
         name: what to call it in messages.
+        negative: share of the file's radiance that was negative, and is 0 here; display formats have none.
     """
 
     image_srgb: Float[np.ndarray, "h w 3"]
     mask: Float[np.ndarray, "h w 1"] | None
     name: str
+    negative: float = 0.0
 
     @property
     def clipped(self) -> float:
@@ -42,7 +45,8 @@ def read_picture(path: str | Path) -> Picture:
     """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied).
 
     Raises:
-        UnirenderError: the file is missing, no picture, broken, too large, or an EXR with NaN or infinite values.
+        UnirenderError: the file is missing, no picture, broken, too large, or an EXR with NaN or infinite values or
+            with more negative radiance than `NEGATIVE_MOST`.
     """
     path = Path(path)
     if not path.exists():
@@ -136,6 +140,37 @@ def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
     return values[..., :3].mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
 
 
+def check_finite(pixels: Float[np.ndarray, "h w c"], name: str) -> None:
+    """Looks for values that are no numbers.
+
+    Raises:
+        UnirenderError: there is one; the message has their number and the first one's place.
+    """
+    bad = ~np.isfinite(pixels).all(axis=-1)
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise UnirenderError(
+            f"{name}: {int(bad.sum())} of {bad.size} pixels are NaN or infinite (the first in row {row}, column "
+            f"{column}, counted from 0), expected finite radiance; repair them first"
+        )
+
+
+def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
+    """Sum of the negative values over that of all absolute values: what is lost where they are set to 0.
+
+    Raises:
+        UnirenderError: it is above `NEGATIVE_MOST`.
+    """
+    total = np.abs(radiance).sum(dtype=np.float64)
+    negative = float(-np.minimum(radiance, 0).sum(dtype=np.float64) / max(total, 1e-30))
+    if negative > NEGATIVE_MOST:
+        raise UnirenderError(
+            f"{name}: {negative:.0%} of the radiance is negative, expected values >= 0 "
+            f"(up to {NEGATIVE_MOST:.0%} pass as ringing of a filter); repair the file"
+        )
+    return negative
+
+
 def _read_display_picture(path: Path) -> Picture:
     pixels = display_values(open_picture(path), str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
@@ -150,14 +185,10 @@ def _read_exr_picture(path: Path) -> Picture:
         )
     rgb = channels_rgb(channels)
     alpha = channels.get("A")
-    bad = ~np.isfinite(rgb).all(axis=-1) | (~np.isfinite(alpha) if alpha is not None else False)
-    if bad.any():
-        raise UnirenderError(
-            f"{path}: {int(bad.sum())} of {bad.size} pixels are NaN or infinite, expected finite radiance; "
-            "repair them first"
-        )
+    check_finite(rgb if alpha is None else np.dstack([rgb, alpha]), str(path))
+    negative = negative_share(rgb, str(path))
     mask = None
     if alpha is not None:
         mask = check_mask(alpha[..., None], f"{path} (A)")
         rgb = unpremultiply(rgb, mask)
-    return Picture(image_srgb(rgb), mask, path.name)
+    return Picture(image_srgb(rgb), mask, path.name, negative)

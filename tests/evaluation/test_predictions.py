@@ -10,6 +10,7 @@ from tiny_suites import make_suite
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
+from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.conventions import Conventions, read_conventions
 from unirender_evaluation.export import export_inputs
@@ -50,6 +51,28 @@ def test_png_predictions_and_broken_files(suite: Suite, tmp_path: Path) -> None:
     (folder / "albedo.png").write_text("no picture")
     with pytest.raises(UnirenderError, match="not a readable PNG"):
         row.predictions.answer(task)
+
+
+def test_a_mask_among_the_maps_is_the_methods_own(suite: Suite, tmp_path: Path) -> None:
+    task = first(suite, "inverse", "single-image")
+    folder = tmp_path / "mine" / task.folder
+    folder.mkdir(parents=True)
+    truth = suite.intrinsics(task.scene, task.scene.materials[0])
+    albedo = Intrinsics(albedo=truth.require("albedo")["albedo"])
+
+    def values(maps: Intrinsics) -> dict[str, float]:
+        write_exr(folder / "intrinsics.exr", intrinsics_channels(maps))
+        row = prediction_rows({"mine": tmp_path / "mine"})[0]
+        return engine.score(task, engine.answer(row, task), ())
+
+    whole, masked = "albedo.psnr@whole-srgb-raw", "albedo.psnr@masked-srgb-raw"
+    pasted = values(albedo)
+    assert "mask.iou" not in pasted
+    assert values(albedo.replace(mask=task.mask)) == pasted  # that it was handed
+    own = values(albedo.replace(mask=np.ones_like(task.mask)))
+    assert own["mask.iou"] == pytest.approx(float(task.mask.mean()), rel=1e-3)
+    assert own[masked] == pasted[masked]
+    assert own[whole] < pasted[whole] - 10
 
 
 def answer_all(suite: Suite, folder: Path) -> None:

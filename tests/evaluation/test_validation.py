@@ -12,7 +12,7 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.validation import suite_validation
+from unirender_evaluation.validation import SCORES, suite_validation
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,7 @@ def test_scores_are_the_benchmarks_own_means_with_their_directions(suite: str) -
         "render.psnr": True,
         "edit.psnr": True,
     }
+    assert set(SCORES) == found.keys()
     by_hand = []
     for number, scene in enumerate(loaded.scenes):
         task = list(tasks(loaded, "inverse", "single-image", [scene]))[number]

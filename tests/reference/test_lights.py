@@ -187,7 +187,7 @@ def test_exr_that_is_not_finite_is_refused(tmp_path, value):
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, dict.fromkeys("RGB", pixels)).write(
         str(tmp_path / "map.exr")
     )  # our own writer refuses
-    with pytest.raises(UnirenderError, match=r"map\.exr: 3 values are NaN or infinite"):
+    with pytest.raises(UnirenderError, match=r"map\.exr: 1 of 512 pixels are NaN .*\(the first in row 3, column 4,"):
         lights.load_light(tmp_path / "map.exr")
 
 
@@ -325,7 +325,7 @@ def test_errors_say_what_to_do(tmp_path):
     with pytest.raises(UnirenderError, match="not a readable"):
         lights.load_light(bad_file(tmp_path, "text.exr", b"hello"))
     write_exr(tmp_path / "square.exr", image_channels(np.ones((16, 16, 3), np.float32)))
-    with pytest.raises(UnirenderError, match="photograph=True"):
+    with pytest.raises(UnirenderError, match=r"is a PNG or JPG file \(in Python .*photograph=True"):
         lights.load_light(tmp_path / "square.exr")
     assert lights.load_light(tmp_path / "square.exr", photograph=True).environment.shape == (128, 256, 3)
     write_exr(tmp_path / "black.exr", image_channels(np.zeros((8, 16, 3), np.float32)))
@@ -335,7 +335,7 @@ def test_errors_say_what_to_do(tmp_path):
     pixels[0, 0, 0] = np.nan
     header = b"PF\n4 2\n1.0\n"
     assert struct.calcsize(">24f") == len(pixels.tobytes())
-    with pytest.raises(UnirenderError, match="NaN"):
+    with pytest.raises(UnirenderError, match=r"1 of 8 pixels are NaN or infinite \(the first in row \d, column 0"):
         lights.load_light(bad_file(tmp_path, "nan.pfm", header + pixels.tobytes()))
     with pytest.raises(UnirenderError, match="expected seed >= 0"):
         lights.make_light(-1, "train")

@@ -10,7 +10,7 @@ import pytest
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import intrinsics_channels, read_exr, write_exr
-from unirender.files import checkpoint_sha256, new_folder, read_result, write_result
+from unirender.files import checkpoint_sha256, new_folder, read_result, replace_file, write_result
 from unirender.intrinsics import Intrinsics
 
 RNG = np.random.default_rng(0)
@@ -179,3 +179,27 @@ def test_damaged_results_are_named(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "none", "no folder and no EXR"), (tmp_path, r"has no intrinsics\.exr")):
         with pytest.raises(UnirenderError, match=words):
             read_result(path)
+
+
+def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "deep" / "file"
+    assert replace_file(path, "old ä").read_text(encoding="utf-8") == "old ä"
+    seen, sync = [], os.fsync
+
+    def look(handle: int) -> None:
+        seen.append(path.read_text(encoding="utf-8"))
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", look)
+    replace_file(path, b"new")
+    assert seen == ["old ä"]  # while the new content reached the disk the old one was there
+    assert path.read_bytes() == b"new"
+
+    def fail(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="No space"):
+        replace_file(path, "newer")
+    assert path.read_bytes() == b"new"
+    assert [file.name for file in path.parent.iterdir()] == ["file"]

@@ -3,12 +3,14 @@
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
+from unirender.options import read_input
 from unirender.pictures import MAX_PIXELS, read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -55,6 +57,35 @@ def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
     np.testing.assert_allclose(picture.image_srgb[0, :2, 0], srgb_encode(np.full(2, 0.2)), atol=1e-3)
     assert picture.image_srgb[0, 0, 2] == pytest.approx(1)
     assert picture.clipped == pytest.approx(1)
+
+
+def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:
+    """NumPy writes it here: `write_exr` refuses."""
+    pixels = np.full((4, 5, 4), 0.5, np.float32)
+    for channel, value in ((1, np.nan), (3, np.inf)):
+        broken = pixels.copy()
+        broken[2, 3:, channel] = value
+        channels = {name: np.ascontiguousarray(broken[..., i]) for i, name in enumerate("RGBA")}
+        OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "a.exr"))
+        with pytest.raises(UnirenderError, match=r"2 of 20 pixels are NaN or infinite \(the first in row 2, column 3,"):
+            read_picture(tmp_path / "a.exr")
+
+
+def test_a_little_negative_radiance_passes_and_is_told(tmp_path: Path) -> None:
+    pixels = np.full((4, 5, 3), 0.5, np.float32)
+    write_exr(tmp_path / "a.exr", image_channels(pixels))
+    assert read_picture(tmp_path / "a.exr").negative == 0
+    assert "negative" not in read_input(tmp_path / "a.exr", None)[1]
+    pixels[0, 0] = (-0.25, -0.25, 0)
+    write_exr(tmp_path / "a.exr", image_channels(pixels))
+    picture, remarks = read_input(tmp_path / "a.exr", None)
+    assert picture.negative == pytest.approx(0.5 / (0.5 + 19 * 1.5))
+    assert remarks["negative"] == "2% of the picture's radiance is negative and was set to 0"
+    assert picture.image_srgb.min() == 0
+    pixels[:2] = -0.5  # a normal map, or what else is no picture
+    write_exr(tmp_path / "a.exr", image_channels(pixels))
+    with pytest.raises(UnirenderError, match="50% of the radiance is negative"):
+        read_picture(tmp_path / "a.exr")
 
 
 def test_clipped_is_the_share_of_the_object_at_display_white(tmp_path: Path) -> None:

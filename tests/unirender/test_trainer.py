@@ -4,6 +4,8 @@ import dataclasses
 import io
 import json
 import math
+import os
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -32,9 +34,10 @@ from unirender.training.checkpoint import (
 )
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
-from unirender.training.live import live_report
+from unirender.training.live import live_report, standing
 from unirender.training.presets import PRESETS, LossConfig, OptimizerConfig, TrainConfig, get_preset
 from unirender.training.reader import BatchReader
+from unirender.training.run import Train, train
 from unirender.training.source import ShardSource
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import RunConfig, Trainer, learning_rate
@@ -398,6 +401,57 @@ def test_a_terminal_sees_one_live_line_and_a_file_all_of_them() -> None:
     assert "\x1b[" in live  # redrawn in place
 
 
+def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> None:
+    said: list[str] = []
+    for steps in (1, 2, 2):
+        trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=steps), CPU, torch.float32)
+        trainer.fit(SyntheticSource(), say=said.append)
+    assert said == [  # and nothing of the new run
+        "resumed at step 1 of 2",
+        "finished at step 2 of 2: nothing to train; pass --steps (more than 2) to go on from there",
+    ]
+    assert standing(7, 1.25, None, 5.0) == "resumed at step 7, after 1.2 of 5 minutes"
+    both = standing(8, 5.5, 8, 5.0)
+    assert both.startswith("finished at step 8 of 8, after 5.5 of 5 minutes: nothing to train")
+    assert "pass --steps (more than 8) and --minutes (more than 5)" in both
+    assert "--steps" not in standing(7, 5.5, 8, 5.0)
+
+
+def test_a_batch_that_cannot_be_made_is_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = write_dataset(tmp_path, size=32)
+    whole = ShardSource(data, 2, 0, workers=0)
+    batches = [whole.next()["image"] for _ in range(2)]
+    for workers in (0, 1):
+        source = ShardSource(data, 2, 0, workers=workers)
+        assert torch.equal(source.next()["image"], batches[0])
+        with monkeypatch.context() as broken:
+            broken.setattr("unirender.training.reader.make_batch", lambda *_: 1 / 0)
+            for _ in range(2):
+                with pytest.raises(ZeroDivisionError):
+                    source.next()
+        assert source.consumed == 2
+        if not workers:  # what a thread failed at it has failed at for good
+            assert torch.equal(source.next()["image"], batches[1])
+        source.close()
+
+
+def test_a_run_that_fails_ends_its_threads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, scored, before = write_dataset(tmp_path / "data", size=32), list[int](), set(threading.enumerate())
+
+    def fail_at_the_end(pipeline: UniRenderPipeline) -> dict[str, Score]:
+        scored.append(1)
+        if len(scored) == 2:
+            raise RuntimeError
+        return {"error": Score(1.0, higher_is_better=False)}
+
+    options = Train(data=data, steps=1, parallel=1, device="cpu")
+    with pytest.raises(RuntimeError) as stopped:
+        train(options, TRAIN, tmp_path / "run", fail_at_the_end)
+    assert stopped.tb  # keeps the reader, whose threads end with it
+    assert not {thread.name for thread in set(threading.enumerate()) - before}
+    assert ", one pass at a time\n" in capsys.readouterr().out
+
+
 def test_growing_folder(tmp_path: Path) -> None:
     """New shards are taken in at a refresh; a resumed run keeps the shards that it had."""
     data = write_dataset(tmp_path, shards=1)
@@ -506,13 +560,16 @@ def test_the_config_of_a_run_survives_a_kill_while_it_is_written(
 ) -> None:
     Trainer(TRAIN, RunConfig(tmp_path, steps=1), CPU, torch.float32).fit(SyntheticSource())
     before = json.loads((tmp_path / "config.json").read_text())
-    write = Path.write_text
 
-    def killed(self: Path, text: str) -> None:
-        write(self, text[:10])
-        raise KeyboardInterrupt
+    synced, sync = [], os.fsync
 
-    monkeypatch.setattr(Path, "write_text", killed)
+    def killed(handle: int) -> None:
+        synced.append(handle)
+        if len(synced) == 2:  # the first is that of the log
+            raise KeyboardInterrupt
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", killed)
     with pytest.raises(KeyboardInterrupt):
         Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
     assert json.loads((tmp_path / "config.json").read_text()) == before

@@ -26,7 +26,7 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
 from unirender.lighting import resample_environment
-from unirender.pictures import display_values, open_picture
+from unirender.pictures import check_finite, display_values, negative_share, open_picture
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
@@ -34,7 +34,6 @@ KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
 WINDOW_DEG, FADE_DEG = 45.0, 30.0
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
-NEGATIVE_MOST = 0.05  # share of the total up to which negative values pass as ringing
 
 
 def load_light(
@@ -66,11 +65,7 @@ def load_light(
         raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
     hdr = path.suffix.lower() in HDR_SUFFIXES
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
-    if not np.isfinite(pixels).all():
-        raise UnirenderError(
-            f"light {path}: {(~np.isfinite(pixels)).sum()} values are NaN or infinite, expected finite radiance; "
-            "repair the file"
-        )
+    check_finite(pixels, f"light {path}")
     as_photograph = photograph if photograph is not None else not hdr
     provenance = {"source": "file", "file": path.name, "rule": "lat-long"}
     if as_photograph:
@@ -80,22 +75,15 @@ def load_light(
         h, w = pixels.shape[:2]
         if h < 2 or abs(w / h - 2) > 0.02:
             raise UnirenderError(
-                f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; "
-                "pass photograph=True for an ordinary picture"
+                f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; an ordinary photograph is "
+                "a PNG or JPG file (in Python also any other, with photograph=True)"
             )
         if on_pole_grid(attributes):
             provenance["rule"] = "lat-long on the contract's grid"
             environment = pixels if shape in (None, (h, w)) else resample_environment(pixels, shape)
         else:
             environment = area_resampled(pixels, shape or (h, w))
-    total = np.abs(environment).sum(dtype=np.float64)
-    negative = float(-np.minimum(environment, 0).sum(dtype=np.float64) / max(total, 1e-30))
-    if negative > NEGATIVE_MOST:
-        raise UnirenderError(
-            f"light {path}: {negative:.0%} of the radiance is negative, expected values >= 0 "
-            f"(up to {NEGATIVE_MOST:.0%} pass as ringing of a filter); repair the file"
-        )
-    if negative > 0:
+    if negative := negative_share(environment, f"light {path}"):
         provenance["negative_share"] = f"{negative:.2e}"
     environment = np.maximum(environment, 0)
     mean = mean_luminance(environment, f"light {path}")

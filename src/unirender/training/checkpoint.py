@@ -46,15 +46,6 @@ def load_state(folder: Path) -> dict[str, Any] | None:
         ) from error
 
 
-def replace_text(path: Path, text: str) -> Path:
-    """Writes a text file, its folders too; whoever reads it finds the old text or the new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f"{path.name}.partial")
-    partial.write_text(text)
-    partial.replace(path)
-    return path
-
-
 def plain(config: TrainConfig) -> dict[str, Any]:
     """The config as a state holds it: what JSON knows."""
     return json.loads(json.dumps(dataclasses.asdict(config)))

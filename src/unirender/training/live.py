@@ -49,6 +49,25 @@ def progress_line(line: dict[str, Any], steps: int | None, minutes: float | None
     return Group(row, Text(words(losses), style="dim"))
 
 
+def standing(step: int, done_minutes: float, steps: int | None, minutes: float | None) -> str:
+    """Where a run that is taken up again stands, and what would prolong it if it is over.
+
+    Args:
+        step: steps done.
+        done_minutes: of training.
+        steps: length of the run, if it has one in steps.
+        minutes: the same in minutes.
+    """
+    place = f"step {step}" + (f" of {steps}" if steps else "")
+    place += f", after {done_minutes:.1f} of {minutes:g} minutes" if minutes else ""
+    ends = {f"--steps (more than {steps})": bool(steps and step >= steps)}
+    ends |= {f"--minutes (more than {minutes or 0:g})": bool(minutes and done_minutes >= minutes)}
+    reached = [option for option, end in ends.items() if end]
+    if not reached:
+        return f"resumed at {place}"
+    return f"finished at {place}: nothing to train; pass {' and '.join(reached)} to go on from there"
+
+
 def words(line: dict[str, Any]) -> str:
     """`name value  name value ...`, numbers to four digits."""
     parts: list[str] = []

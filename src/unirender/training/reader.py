@@ -54,12 +54,19 @@ class BatchReader(Iterator[Batch]):
         self._executor = ThreadPoolExecutor(workers, thread_name_prefix="unirender-data") if workers else None
 
     def __next__(self) -> Batch:
-        """The next batch; where none was read ahead, that is done now."""
+        """The next batch; where none was read ahead, that is done now.
+
+        After an error it is the same batch that is asked for again: none is left out.
+        """
         if self._executor is None:
-            return self._make(self._begin())
+            batch = self._make(self._first)
+            self._begin()
+            return batch
         if not self._pending:
             self.read_ahead()
-        return self._pending.popleft().result()
+        batch = self._pending[0].result()
+        self._pending.popleft()
+        return batch
 
     def read_ahead(self) -> None:
         """Lets the threads begin until one batch is ready beside each in the making; returns at once."""

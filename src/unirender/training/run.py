@@ -1,9 +1,10 @@
 """`unirender train`: its options, and the run that they describe. Torch is imported only when training begins."""
 
+import contextlib
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from unirender.training.validation import Validate
 
 MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
+ScoreNames = Callable[[], Sequence[str]]  # names of the scores that such a function gives
 
 
 @dataclass(frozen=True)
@@ -133,12 +135,14 @@ class Train:
                 "needs; pass --init-from with a Stable Diffusion folder (or --init with a pipeline of this preset)"
             )
 
-    def run(self, make_validation: MakeValidation) -> int:
+    def run(self, make_validation: MakeValidation, score_names: ScoreNames) -> int:
         """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status.
 
         Under torchrun this is one of several processes, of which the first one writes and speaks.
         """
         config = self.check()
+        if self.keep_best is not None and self.keep_best not in (names := score_names()):
+            raise UsageError(f"--keep-best {self.keep_best}: no such score, expected one of: {', '.join(names)}")
         if not self.data.is_dir():
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
@@ -206,16 +210,18 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""
     say = functools.partial(Console().print, soft_wrap=True, highlight=False, markup=False)
-    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {trainer.split.at_once} passes side by side")
+    at_once = trainer.split.at_once
+    passes = "one pass at a time" if at_once == 1 else f"{at_once} passes side by side"
+    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}")
     if processes.is_main:
         say(f"memory: {training_bytes(trainer.model)}")
     resumed = (out / STATE_FILE).is_file()
-    with (
-        live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,
-        tracking(trackers, config, resumed, show) as report,
-    ):
-        trainer.fit(source, report, validate)
-    pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
-    source.close()
+    with contextlib.closing(source):
+        with (
+            live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,
+            tracking(trackers, config, resumed, show) as report,
+        ):
+            trainer.fit(source, report, validate, lambda sentence: say(f"{out}: {sentence}"))
+        pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
     processes.close()
     return pipeline

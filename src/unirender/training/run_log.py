@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from unirender.training.checkpoint import replace_text
+from unirender.files import replace_file
 from unirender.training.live import Report
 from unirender.training.processes import Processes
 
@@ -53,4 +53,4 @@ class RunLog:
             return
         lines = self.path.read_text().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
-        replace_text(self.path, "".join(kept))
+        replace_file(self.path, "".join(kept))

@@ -83,8 +83,9 @@ class ShardSource:
             self._batches = BatchReader(
                 self.open(), self.batch_size, self.seed, self.consumed, self.workers, self.augmentation, self.rows
             )
+        batch = next(self._batches)
         self.consumed += self.batch_size
-        return next(self._batches)
+        return batch
 
     def read_ahead(self) -> None:
         if self._batches is not None:

@@ -24,12 +24,13 @@ from torch import nn
 
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
-from unirender.training.checkpoint import differences, load_state, plain, replace_text, save_state
+from unirender.training.checkpoint import differences, load_state, plain, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
-from unirender.training.live import Report
+from unirender.training.live import Report, standing
 from unirender.training.losses import LossFunction
 from unirender.training.passes import BatchGradient, Split, laid_out_like
 from unirender.training.pictures import save_sheet, training_sheet
@@ -141,18 +142,27 @@ class Trainer:
         self.step += 1
         return terms | {"grad_norm": float(norm), "lr": rate}
 
-    def fit(self, source: BatchSource, report: Report = lambda line: None, validate: Validate | None = None) -> None:
+    def fit(
+        self,
+        source: BatchSource,
+        report: Report = lambda line: None,
+        validate: Validate | None = None,
+        say: Callable[[str], None] = lambda sentence: None,
+    ) -> None:
         """Trains to the end of the run, resuming where the folder's state stands.
 
         Args:
             source: of this process's rows of the batches.
             report: is told every line of the log.
             validate: scores a pipeline of the averaged weights, at the start, with every picture and at the end.
+            say: is told where a run stands that is not new.
         """
         self.source = source
-        self.resume(source, report)
+        resumed = self.resume(source, report)
         self._start_alike(source)
         main = self.processes.is_main
+        if resumed and main:
+            say(standing(self.step, self.seconds / 60, self.run.steps, self.run.minutes))
         self._write_config()
         validation = Validation(validate, self.run.keep_best) if validate else None
         fixed: Maps | None = None
@@ -308,4 +318,4 @@ class Trainer:
             return
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        replace_text(self.run.out / "config.json", text + "\n")
+        replace_file(self.run.out / "config.json", text + "\n")
