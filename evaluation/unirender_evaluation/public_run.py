@@ -1,0 +1,179 @@
+"""`bench public`: a public test set x rows -> per-sample records and tables in one folder.
+
+    records.jsonl records.csv           every value, with its content key
+    run.json                            the rows
+    tables.md tables.tex tables.json    with the protocol line
+    missing.txt                         what a folder of predictions has no answer to, a line each
+
+Running the same command again reuses what is done: a record depends on the content of its sample's files, the row's
+configuration, the resolution and the code that measures.
+"""
+
+import hashlib
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from unirender.files import replace_file
+from unirender_evaluation import lpips
+from unirender_evaluation.engine import KEY_PREFIX, Store
+from unirender_evaluation.optimiser_study import open_folder
+from unirender_evaluation.prediction_check import PredictionError, folder_problems
+from unirender_evaluation.public_answers import asked, questions, read_answer, takes_part
+from unirender_evaluation.public_sets import PublicSet, Sample
+from unirender_evaluation.public_tables import public_tables
+from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
+from unirender_evaluation.rows import Row, evenly
+from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+from unirender_evaluation.tables import Table
+from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
+
+
+@dataclass(frozen=True)
+class PublicRun:
+    """What is scored.
+
+    Attributes:
+        public: the set.
+        rows: the rows.
+        out: folder of the run; an earlier run in it is continued.
+        limit: samples, evenly spaced; the tables are then watermarked.
+        backbones: of LPIPS.
+        versions: of the code.
+    """
+
+    public: PublicSet
+    rows: tuple[Row, ...]
+    out: Path
+    limit: int | None
+    backbones: tuple[str, ...]
+    versions: Versions
+
+    @classmethod
+    def of(cls, public: PublicSet, rows: Sequence[Row], out: Path, limit: int | None = None) -> "PublicRun":
+        """With the LPIPS weights that are here, where the set asks for LPIPS."""
+        uses = any(column.metric.name.startswith("lpips_") for spec in public.tables for column in spec.columns)
+        backbones = tuple(lpips.available()) if uses else ()
+        return cls(public, tuple(rows), out, limit, backbones, versions(backbones))
+
+    def key(self, row: Row, content: str) -> str:
+        """The content key of a record; it begins with the core's version, as `Store` wants it.
+
+        Args:
+            row: whose record.
+            content: hash of the sample.
+        """
+        own = modules_version(*self.public.modules, "public_answers")
+        uses = row.uses | ({LPIPS} if self.backbones else set())
+        code = f"{self.versions.of(uses)}{SEPARATOR}public {own}"
+        text = json.dumps([content, self.public.resolution, row.config, code], sort_keys=True)
+        core = hashlib.sha256(self.versions.core.encode()).hexdigest()
+        return core[:KEY_PREFIX] + hashlib.sha256(text.encode()).hexdigest()[KEY_PREFIX:]
+
+
+@dataclass(frozen=True)
+class PublicResult:
+    """What a run has found; `computed` counts the records that were not there before."""
+
+    records: tuple[Record, ...]
+    tables: tuple[Table, ...]
+    missing: dict[str, list[str]]
+    computed: int
+
+
+def run(what: PublicRun, console: Console) -> PublicResult:
+    """Scores what is missing, prints and writes the tables.
+
+    Args:
+        what: the run.
+        console: for progress and tables.
+
+    Raises:
+        PublicSetError: the folder is not the set; nothing has run then.
+        PredictionError: a folder of predictions has other files than the set asks for; nothing has run then.
+        UnirenderError: a file of the set is broken, or a method fails; a second run continues from there.
+    """
+    every = what.public.samples()
+    check_folders(what)
+    samples = evenly(every, what.limit)
+    missing = {
+        row.info.label: [f"{sample.table}/{sample.key}" for sample in samples if not takes_part(row, sample)]
+        for row in what.rows
+        if row.predictions is not None
+    }
+    store = Store.open(open_folder(what.out) / "records.jsonl")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    contents, computed = [], 0
+    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+        bar = progress.add_task(what.public.name, total=len(samples))
+        for sample in samples:
+            contents.append(sample.sha256())
+            computed += _work(what, sample, contents[-1], store)
+            progress.update(bar, advance=1, description=f"{what.public.name}: {sample.key}")
+    records = [record for record in store.close() if record.values]
+    info = _info(what, records, contents)
+    write_run(what.out / "run.json", info)
+    write_csv(what.out / "records.csv", records)
+    lines = [f"{label}: {name}\n" for label, names in missing.items() for name in names]
+    replace_file(what.out / "missing.txt", "".join(lines))
+    tables = public_tables(what.public, records, info, missing)
+    replace_file(what.out / "tables.md", "\n\n".join(map(to_markdown, tables)) + "\n")
+    replace_file(what.out / "tables.tex", "\n\n".join(map(to_latex, tables)) + "\n")
+    replace_file(what.out / "tables.json", to_json(tables))
+    for table in tables:
+        print_table(console, table)
+    console.print(f"{computed} new records of {len(records)}; {what.out / 'tables.md'}, .tex, .json", highlight=False)
+    return PublicResult(tuple(records), tuple(tables), missing, computed)
+
+
+def check_folders(what: PublicRun) -> None:
+    """Reads every file of the rows that are folders.
+
+    Raises:
+        PredictionError: there is a problem; all of them at once.
+    """
+    folders = [row.predictions for row in what.rows if row.predictions is not None]
+    wanted = questions(what.public) if folders else {}
+    problems = [line for folder in folders for line in folder_problems(folder, wanted, what.public.name)]
+    if problems:
+        raise PredictionError(problems)
+
+
+def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> int:
+    """Scores the rows that have no record of the sample; returns how many."""
+    rows = {what.key(row, content): row for row in what.rows if takes_part(row, sample)}
+    due = {key: row for key, row in rows.items() if not store.has(key)}
+    inputs = what.public.inputs(sample) if any(row.predictions is None for row in due.values()) else {}
+    networks = [lpips.load(name) for name in what.backbones] if due else []
+    for key, row in due.items():
+        if row.predictions is not None:
+            answer, seconds = read_answer(row.predictions, sample, *what.public.frame(sample)), None
+        else:
+            answer, seconds = asked(row, sample, inputs)
+        values = what.public.score(sample, answer, networks)
+        name = row.info.key
+        store.add(Record(sample.table, sample.protocol, name, sample.key, sample.object, values, key, seconds=seconds))
+    return len(due)
+
+
+def _info(what: PublicRun, records: Sequence[Record], contents: Sequence[str]) -> RunInfo:
+    used = {record.method for record in records}
+    return RunInfo(
+        suite=what.public.name,
+        suite_hash=hashlib.sha256("".join(contents).encode()).hexdigest(),
+        resolution=what.public.resolution,
+        methods=tuple(row.info for row in what.rows if row.info.key in used),
+        exposure="of the photographs",
+        lpips=what.backbones,
+        code=what.versions.code[:12],
+        date=datetime.now(UTC).date().isoformat(),
+        limit=what.limit,
+        environment={name: installed_version(name) for name in ("unirender", "torch", "numpy")}
+        | {"cpu": platform.machine(), "python": platform.python_version()},
+    )

@@ -1,0 +1,218 @@
+"""Public test sets in a user's own folder: what each must offer to be scored, and what their readers share.
+
+A set is a list of `Sample`s. A sample is one question about one photograph: `decompose` (maps) or `relight` (the object
+under another light). Methods are asked with `inputs`; a folder of predictions answers by the names `folder` and
+`answer`. What a set says of its truth stays inside its module.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
+from unirender.pictures import display_values, open_picture
+from unirender_evaluation.lpips import Lpips
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.specs import TableSpec
+
+MAPS = "intrinsics"  # the answer to `decompose`, as a folder of predictions has it
+MOST_PROBLEMS = 40  # lines of an error: a folder in another layout has thousands
+Asks = Literal["decompose", "relight"]
+
+
+class PublicSetError(UnirenderError):
+    """A folder that is not the set it is said to be; `problems` has a line for each reason."""
+
+    def __init__(self, name: str, problems: Sequence[str]) -> None:
+        shown = list(problems[:MOST_PROBLEMS])
+        more = [f"and {len(problems) - len(shown)} more"] if len(problems) > len(shown) else []
+        count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        super().__init__("\n".join([f"{name}: {count}, nothing was run", *shown, *more]))
+        self.problems = tuple(problems)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One question about one photograph.
+
+    Attributes:
+        table: of the record.
+        key: of the record: unique in its table.
+        object: what the bootstrap draws: samples of one object or scene are not independent.
+        asks: what of a method.
+        folder: name of the subfolder in which a folder of predictions answers it.
+        answer: name of the answer's file there, without suffix.
+        files: all that the question and its truth are read from.
+        one_picture: whether a single photograph suffices to answer it: else only folders of predictions may.
+    """
+
+    table: str
+    key: str
+    object: str
+    asks: Asks
+    folder: str
+    answer: str
+    files: tuple[Path, ...]
+    one_picture: bool = True
+
+    @property
+    def protocol(self) -> str:
+        """As records name it."""
+        return "single-image" if self.asks == "decompose" else "from-image-hdri"
+
+    def sha256(self) -> str:
+        """Over names and contents of its files: what makes its records outdated."""
+        digest = hashlib.sha256(f"{self.table}/{self.key}/{self.object}".encode())
+        for path in self.files:
+            digest.update(path.name.encode() + file_sha256(path).encode())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method or a folder says to a sample; what it does not say is None."""
+
+    maps: Intrinsics | None = None
+    image: Float[np.ndarray, "h w 3"] | None = None
+    depth: Float[np.ndarray, "h w 1"] | None = None
+
+
+@runtime_checkable
+class PublicSet(Protocol):
+    """A reader of one public test set.
+
+    Attributes:
+        name: on the command line and in the protocol.
+        tables: what is printed.
+        modules: that measure, part of the records' keys.
+        variant: what of a picture counts, for the tables' headings.
+        resolution: of what methods are handed, pixels (see each reader); part of the keys.
+    """
+
+    name: str
+    tables: tuple[TableSpec, ...]
+    modules: tuple[str, ...]
+    variant: Variant
+    resolution: int
+
+    def samples(self) -> tuple[Sample, ...]:
+        """Every question. Raises `PublicSetError` with all that is wrong with the folder's layout."""
+        ...
+
+    def inputs(self, sample: Sample) -> dict[str, Any]:
+        """What a method is handed. Raises UnirenderError where a file is broken."""
+        ...
+
+    def frame(self, sample: Sample) -> tuple[tuple[int, int], Camera]:
+        """Rows and columns that a prediction must have, and the camera."""
+        ...
+
+    def score(self, sample: Sample, answer: Answer, lpips: Sequence[Lpips]) -> dict[str, float]:
+        """Metric key -> value. Raises UnirenderError where a file of the truth is broken."""
+        ...
+
+    def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
+        """(what, value) pairs: what exactly the table of that name measures."""
+        ...
+
+
+def file_sha256(path: Path) -> str:
+    """Of a file's content.
+
+    Raises:
+        UnirenderError: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def need_folder(path: Path, name: str, layout: str) -> None:
+    """Raises `PublicSetError` where the path is no folder."""
+    if not path.is_dir():
+        raise PublicSetError(name, [f"{path}: no such folder, expected {layout}"])
+
+
+def missing_files(paths: Iterable[Path], what: str) -> Iterator[str]:
+    """A line for each path that is no file."""
+    for path in paths:
+        if not path.is_file():
+            yield f"{path}: no such file, expected {what}"
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Rows and columns of a picture, from its header.
+
+    Raises:
+        UnirenderError: no readable picture.
+    """
+    try:
+        with Image.open(path) as file:
+            width, height = file.size
+    except (OSError, ValueError, SyntaxError) as error:
+        raise UnirenderError(f"{path}: not a readable picture ({error}), expected PNG or JPG") from error
+    return height, width
+
+
+def read_display(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
+    """Values in [0, 1] of a PNG or JPG, alpha dropped; grey is the mean of the channels.
+
+    Raises:
+        UnirenderError: no readable picture.
+    """
+    values = display_values(open_picture(path), str(path))[..., :3]
+    return values if channels == 3 else values.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
+    """A map of a NumPy file, `[h w]` or `[h w c]`.
+
+    Raises:
+        UnirenderError: no such array, another number of channels, or values that are not finite.
+    """
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise UnirenderError(f"{path}: not a readable NumPy array ({error})") from error
+    value = found[..., None] if getattr(found, "ndim", 0) == 2 else found
+    if getattr(value, "ndim", 0) != 3 or value.shape[-1] != channels or value.dtype.kind not in "fiu":
+        shape = getattr(found, "shape", type(found).__name__)
+        raise UnirenderError(f"{path}: got an array of {shape}, expected numbers of (h, w, {channels})")
+    if not np.isfinite(value).all():
+        raise UnirenderError(f"{path}: has NaN or infinite values, expected finite ones")
+    return value.astype(np.float32)
+
+
+def block_mean(value: Float[np.ndarray, "h w c"], width: int, name: str) -> Float[np.ndarray, "h2 w2 c"]:
+    """Means over square blocks, so many that `width` columns are left.
+
+    Raises:
+        UnirenderError: the size is no multiple.
+    """
+    side, rest = divmod(value.shape[1], width)
+    if rest or not side or value.shape[0] % side:
+        got = f"{value.shape[1]} x {value.shape[0]}"
+        raise UnirenderError(f"{name}: is {got} pixels, expected a multiple of {width} columns; pass --resolution")
+    height = value.shape[0] // side
+    return value.reshape(height, side, width, side, -1).mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
+
+
+def shrunk(linear: Float[np.ndarray, "h w 3"], longest: int) -> Float[np.ndarray, "h2 w2 3"]:
+    """A linear picture of at most `longest` pixels a side, by area; a smaller one stays as it is."""
+    height, width = linear.shape[:2]
+    if max(height, width) <= longest:
+        return linear
+    size = [max(1, round(n * longest / max(height, width))) for n in (width, height)]
+    planes = [Image.fromarray(np.ascontiguousarray(linear[..., c])) for c in range(3)]
+    resized = [np.asarray(plane.resize((size[0], size[1]), Image.Resampling.BOX)) for plane in planes]
+    return np.stack(resized, axis=-1).astype(np.float32)

@@ -1,0 +1,82 @@
+"""Tables of a run on a public test set: the benchmark's own table code under the set's protocol line."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from unirender_evaluation.public_orb_scoring import FLOORED
+from unirender_evaluation.public_sets import PublicSet
+from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.statistics import CONFIDENCE, RESAMPLES, SEED
+from unirender_evaluation.tables import Table, build_table
+
+SHOWN = 5  # names of photographs without a prediction, in a note; `missing.txt` has all
+
+
+def public_tables(
+    public: PublicSet, records: Sequence[Record], run: RunInfo, missing: Mapping[str, Sequence[str]]
+) -> list[Table]:
+    """A table for each question that has records.
+
+    Args:
+        public: the set.
+        records: of the run.
+        run: its rows.
+        missing: label of a row of predictions -> "table/sample" that it has no answer to.
+    """
+    tables = []
+    for spec in public.tables:
+        chosen = [record for record in records if record.table == spec.name]
+        if chosen:
+            (protocol,) = spec.protocols
+            here = replace(spec, columns=tuple(c for c in spec.columns if _backbone(c) in (None, *run.lpips)))
+            table = build_table(here, records, run, protocol=protocol, variant=public.variant)
+            line = protocol_line(public, spec, chosen, run)
+            notes = (*table.notes, *_floors(chosen, run), *_gaps(spec, missing))
+            tables.append(replace(table, protocol_label=table.title, protocol=line, notes=notes))
+    return tables
+
+
+def protocol_line(
+    public: PublicSet, spec: TableSpec, records: Sequence[Record], run: RunInfo
+) -> tuple[tuple[str, str], ...]:
+    """(what, value) pairs: everything one must know to compare a number with one's own."""
+    samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
+    wanted = list(dict.fromkeys(name for column in spec.columns if (name := _backbone(column))))
+    absent = "".join(f"; {name}: no weights here, no column" for name in wanted if name not in run.lpips)
+    return (
+        ("set", f"{public.name}, from a user's folder, content {run.suite_hash[:12]}"),
+        *public.protocol(spec.name),
+        *((("LPIPS backbones", f"{', '.join(run.lpips) or 'none'}{absent}"),) if wanted else ()),
+        ("n", f"{len(samples)} samples of {len(objects)} objects or scenes; means over samples"),
+        ("interval", f"{CONFIDENCE:.0%} bootstrap over objects or scenes, {RESAMPLES} draws, seed {SEED}"),
+        ("reader", "layout and metrics from the set's own code, checked on made data"),
+        ("code", f"{run.code}, {run.date}"),
+    )
+
+
+def _backbone(column: Column) -> str | None:
+    """The backbone of an LPIPS column; None for others."""
+    name = column.metric.name
+    return name.removeprefix("lpips_") if name.startswith("lpips_") else None
+
+
+def _floors(records: Sequence[Record], run: RunInfo) -> list[str]:
+    """How many PSNRs of each row stand at the benchmark's floor."""
+    found = []
+    for key in dict.fromkeys(record.method for record in records):
+        flags = [v for r in records if r.method == key for name, v in r.values.items() if FLOORED in name]
+        if sum(flags):
+            found.append(f"{run.method(key).label}: {sum(flags):.0f} of {len(flags)} PSNRs are the benchmark's floor.")
+    return found
+
+
+def _gaps(spec: TableSpec, missing: Mapping[str, Sequence[str]]) -> list[str]:
+    """Which questions a row of predictions left open."""
+    found = []
+    for label, names in missing.items():
+        here = [name.removeprefix(f"{spec.name}/") for name in names if name.startswith(f"{spec.name}/")]
+        if here:
+            more = f" and {len(here) - SHOWN} more (missing.txt)" if len(here) > SHOWN else ""
+            found.append(f"{label}: no prediction for {len(here)}: {', '.join(here[:SHOWN])}{more}.")
+    return found
