@@ -39,13 +39,15 @@ class PlannedRow:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run has to do; `check_date` is that of the truth check that it would reuse, None = Mitsuba renders."""
+    """What a run has to do; `check_date` is that of the truth check that it would reuse, None = Mitsuba renders; `jobs`
+    processes of this machine, or those of a `cluster`."""
 
     out: Path
     rows: tuple[PlannedRow, ...]
     check_scenes: int
     check_date: str | None
     jobs: int
+    cluster: str | None = None
 
 
 def planned(config: BenchConfig) -> Plan:
@@ -64,6 +66,7 @@ def planned(config: BenchConfig) -> Plan:
         check_scenes=config.check_scenes,
         check_date=None if check is None else str(check["date"]),
         jobs=config.jobs,
+        cluster=config.cluster,
     )
 
 
@@ -104,5 +107,5 @@ def print_plan(plan: Plan, console: Console) -> None:
             "Seconds: the mean of the answers that are stored, in the process that gave them; scoring is not in them.",
             highlight=False,
         )
-    processes = "this process" if plan.jobs == 0 else f"{plan.jobs} processes"
+    processes = plan.cluster or ("this process" if plan.jobs == 0 else f"{plan.jobs} processes")
     console.print(f"Dry run: {missing} records for {processes} in {plan.out}; nothing was computed.", highlight=False)

@@ -35,9 +35,11 @@ class BenchPhysics:
 
         from unirender_evaluation.benchmark import BenchConfig, build_rows
         from unirender_evaluation.claims import OURS
+        from unirender_evaluation.physics_ambiguity import POSTERIOR
         from unirender_evaluation.physics_run import markdown, measure, write
         from unirender_evaluation.physics_stage import SWEEP_SPP, Stage
         from unirender_evaluation.physics_tests import TESTS
+        from unirender_evaluation.rows import SAMPLE_STEPS
         from unirender_evaluation.suites import load_suite
         from unirender_evaluation.tasks import scene_ids
         from unirender_evaluation.versions import versions
@@ -60,6 +62,7 @@ class BenchPhysics:
             "scenes": ", ".join(scene.key for scene in scenes),
             "path tracer": f"{self.spp} spp",
             "pictures that the suite does not store": f"{SWEEP_SPP} spp",
+            "ours": f"mode mean; ambiguity: {POSTERIOR} samples of {SAMPLE_STEPS} steps",
             "truth": f"Mitsuba {suite.provenance['mitsuba']}",
             "interval": "95% bootstrap over objects",
             "code": versions().code[:12],

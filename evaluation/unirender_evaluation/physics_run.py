@@ -5,7 +5,8 @@
                    test refuses its twin
 
 Rows: *Mitsuba* renders with its path tracer and decomposes into its own buffers; *shade (true maps)* is one bounce and
-one point per pixel, and the loops' ceiling; *ours* and *composite* are the rows of `bench run`.
+one point per pixel, and the loops' ceiling; *ours* and *composite* are the rows of `bench run`. The ambiguity is asked
+of Mitsuba's own posterior and of our samples (mode `sample`); who has none has no value.
 """
 
 import json
@@ -15,17 +16,24 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Composite, Image, quantise
 from unirender_evaluation.optimiser_study import write_files
+from unirender_evaluation.physics_ambiguity import POSTERIOR, Points, material_point
+from unirender_evaluation.physics_questions import Posterior, true_maps
 from unirender_evaluation.physics_stage import Stage
-from unirender_evaluation.physics_tests import TESTS, PhysicsTest, true_maps
+from unirender_evaluation.physics_tests import TESTS, PhysicsTest
 from unirender_evaluation.physics_tracer import PathTracer
+from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
 from unirender_evaluation.suites import Material, Scene, Suite
+from unirender_evaluation.truth_render import item_seed
 
-MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours (mean)", "composite", "broken twin"
+MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
+HEADING = "### What each row scores"
 ROWS = (MITSUBA, SHADE, OURS, COMPOSITE, TWIN)
 
 
@@ -46,21 +54,29 @@ def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Itera
     Args:
         suite: the suite.
         scenes: whose objects the generator makes here as the truth shows them.
-        ours: our method, with `render` and `decompose`.
+        ours: our method, with `render` and `decompose`; its `pipeline` samples.
         spp: samples per pixel of Mitsuba's path tracer.
     """
+    sampler = Sampler(ours.pipeline)
     for scene in scenes:
         stage = Stage(suite, scene)
         tracer = PathTracer(stage, spp)
         for test in TESTS.values():
             yield [
                 Value(test.name, row, scene.key, scene.object, test.run(subject, stage))
-                for row, subject in subjects(test, tracer, ours).items()
+                for row, subject in subjects(test, tracer, ours, sampler).items()
             ]
 
 
-def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any) -> dict[str, Any]:
-    """Who answers a test: name of the row -> renderer or decomposer."""
+def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any, sampler: Posterior | None = None) -> dict[str, Any]:
+    """Who answers a test: name of the row -> renderer, decomposer or posterior.
+
+    Args:
+        test: the test.
+        tracer: Mitsuba on the scene.
+        ours: our method.
+        sampler: our posterior; None: we have none.
+    """
     if test.asks == "render":
         return {
             MITSUBA: tracer.render,
@@ -69,6 +85,8 @@ def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any) -> dict[str, Any]
             COMPOSITE: Composite().render,
             TWIN: test.twin,
         }
+    if test.asks == "sample":
+        return {MITSUBA: _perfect, **({} if sampler is None else {OURS: sampler}), TWIN: test.twin}
     return {MITSUBA: _buffers, SHADE: true_maps, OURS: partial(_found, ours.decompose), TWIN: test.twin}
 
 
@@ -78,7 +96,37 @@ def _buffers(stage: Stage, material: Material, _: Image) -> Intrinsics:
 
 def _found(decompose: Callable[..., Intrinsics], stage: Stage, _: Material, image: Image) -> Intrinsics:
     """What a method finds: it is handed what a camera would store, nothing else."""
-    return decompose(image_srgb=quantise(image, stage.mask), mask=stage.mask, camera=stage.suite.spec.camera)
+    return decompose(**_shown(stage, image))
+
+
+def _shown(stage: Stage, image: Image) -> dict[str, Any]:
+    return {"image_srgb": quantise(image, stage.mask), "mask": stage.mask, "camera": stage.suite.spec.camera}
+
+
+def _perfect(stage: Stage, *_: object) -> Points:
+    return stage.explanations.posterior
+
+
+class Sampler:
+    """The materials of a pipeline's samples; a scene's are drawn once, since several tests ask.
+
+    Args:
+        pipeline: a `UniRenderPipeline`.
+    """
+
+    def __init__(self, pipeline: Any) -> None:
+        self._pipeline = pipeline
+        self._drawn: dict[str, Points] = {}
+
+    def __call__(self, stage: Stage, _: Material, image: Image) -> Points:
+        if stage.scene.key not in self._drawn:
+            import torch
+
+            generator = torch.Generator().manual_seed(item_seed("posterior", stage.scene.key))
+            steps = {"mode": "sample", "num_inference_steps": SAMPLE_STEPS, "num_samples": POSTERIOR}
+            found = self._pipeline.decompose(**_shown(stage, image), **steps, generator=generator)
+            self._drawn[stage.scene.key] = np.stack([material_point(maps, stage.mask) for maps in found.samples])
+        return self._drawn[stage.scene.key]
 
 
 @dataclass(frozen=True)
@@ -110,12 +158,14 @@ def findings(values: Sequence[Value]) -> list[Finding]:
 def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
     """The table with its protocol."""
     lines = [
+        HEADING,
+        "",
         "| Test | expected | " + " | ".join(ROWS) + " | twin refused |",
         "| :-- | --: | " + "--: | " * len(ROWS) + ":-- |",
     ]
     for finding in found:
         test = finding.test
-        expected = "true maps' loop" if test.expected is None else f"{test.expected:g}"
+        expected = test.expected if isinstance(test.expected, str) else f"{test.expected:g}"
         cells = [_cell(finding.rows.get(row), test.metric.decimals) for row in ROWS]
         verdict = "PASS" if finding.refused else "FAIL"
         heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"

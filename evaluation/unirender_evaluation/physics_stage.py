@@ -14,6 +14,7 @@ from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.mitsuba_method import MitsubaScene
 from unirender_evaluation.physics import composite_shader
+from unirender_evaluation.physics_ambiguity import Explanations
 from unirender_evaluation.suites import Material, Scene, Suite
 
 Shader = Literal["shade", "composite"]
@@ -67,6 +68,18 @@ class Stage:
     def pictures(self) -> tuple[Material, ...]:
         """Materials whose pictures are stored under both lights."""
         return tuple(dict.fromkeys((self.suite.spec.base, *self.suite.spec.edits)))
+
+    @property
+    def own_material(self) -> Material:
+        """One of the scene's stratified materials: over a suite's objects, roughly uniform on the unit square."""
+        from unirender_evaluation.multiview_scenes import scene_material  # the optimiser
+
+        return scene_material(self.suite, self.scene)
+
+    @cached_property
+    def explanations(self) -> Explanations:
+        """Which materials explain the picture of `own_material`."""
+        return Explanations(self.mitsuba, self.own_material)
 
     def true_maps(self, material: Material) -> Intrinsics:
         """The stored surface in a material, without light."""

@@ -1,8 +1,9 @@
 """The physics tests as a registry: formula, unit, direction, what a perfect renderer scores, and a twin that must fail.
 
-A *renderer* test asks a function `maps -> image`, a *decomposer* test a function `(stage, material, picture) -> maps`
-(a method sees the picture alone; Mitsuba and the twins know the rest). A test is sound where its twin (`physics_twins`)
-is worse than Mitsuba on the same scenes by more than its margin.
+A *renderer* test asks a function `maps -> image`, a *decomposer* test a function `(stage, material, picture) -> maps`,
+a *posterior* test the same for samples of the material (a method sees the picture alone; Mitsuba and the twins know the
+rest; see `physics_questions`). A test is sound where its twin (`physics_twins`) is worse than Mitsuba on the same
+scenes by more than its margin.
 """
 
 from collections.abc import Callable
@@ -10,18 +11,23 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
-import numpy as np
-
-from unirender.intrinsics import Intrinsics
-from unirender_evaluation import physics, physics_twins
-from unirender_evaluation.methods import Image
+from unirender_evaluation import physics, physics_region, physics_twins
 from unirender_evaluation.metrics import METRICS, Metric, metric_key
-from unirender_evaluation.physics_stage import LEVELS, ROUGH, Light, Shader, Stage
+from unirender_evaluation.physics_ambiguity import EXPLANATIONS, POSTERIOR
+from unirender_evaluation.physics_questions import (
+    loop,
+    loss,
+    region_volume,
+    rough_loop,
+    rough_loss,
+    roughness_response,
+    share_inside,
+    tau,
+)
+from unirender_evaluation.physics_stage import ROUGH, Light, Shader, Stage
 from unirender_evaluation.specs import Column, TableSpec
-from unirender_evaluation.suites import Material
 
-Decompose = Callable[[Stage, Material, Image], Intrinsics]
-PSNR, PSNR_KEY = METRICS["psnr"], metric_key("loop", METRICS["psnr"])
+PSNR = METRICS["psnr"]
 
 
 def _metric(name: str, label: str, unit: str, higher: bool, perfect: float, decimals: int, formula: str) -> Metric:
@@ -32,6 +38,8 @@ RELATIVE = _metric("relative", "rel. error", "", False, 0.0, 4, "sum |difference
 CORRELATION = _metric("correlation", "corr.", "", True, 1.0, 3, "Pearson, masked pixels, linear light")
 LOSS = _metric("loss", "loss", "dB", False, 0.0, 2, "masked sRGB PSNR of the true maps' loop minus that of the row's")
 TAU = _metric("tau", "tau", "", True, 1.0, 3, "Kendall's tau-b over 11 renders")
+SHARE = _metric("share", "share", "", True, physics_region.perfect_share(POSTERIOR), 2, "of what explains the input")
+VOLUME = _metric("volume", "volume", "", False, 0.0, 4, "share of the unit cube (metallic, roughness, luminance)")
 
 
 @dataclass(frozen=True)
@@ -43,10 +51,10 @@ class PhysicsTest:
         label: as in tables.
         formula: one line; notation of `physics`.
         metric: unit, direction and decimals.
-        expected: value of a perfect renderer or decomposer, noise apart; None: that of the true maps' loop.
+        expected: value of a perfect renderer, decomposer or posterior, noise apart; in words where it is the scene's.
         asks: what it asks of.
-        run: (renderer or decomposer, stage) -> value.
-        twin: a broken renderer or decomposer.
+        run: (renderer, decomposer or posterior, stage) -> value.
+        twin: a broken renderer, decomposer or posterior.
         twin_is: what is broken, in words.
         margin: how much worse than Mitsuba on the same scenes counts as failing.
         in_run: whether `bench run` measures it, or `bench physics` alone.
@@ -56,8 +64,8 @@ class PhysicsTest:
     label: str
     formula: str
     metric: Metric
-    expected: float | None
-    asks: Literal["render", "decompose"]
+    expected: float | str
+    asks: Literal["render", "decompose", "sample"]
     run: Callable[[Any, Stage], float]
     twin: Any
     twin_is: str
@@ -82,66 +90,10 @@ class PhysicsTest:
         return (mitsuba - value if self.metric.higher_is_better else value - mitsuba) > self.margin
 
 
-def _roughness_response(render: physics.Render, stage: Stage) -> float:
-    suite, scene, m = stage.suite, stage.scene, stage.suite.spec.base[0]
-    low, high = (m, min(suite.spec.specular_roughness)), (m, max(suite.spec.specular_roughness))
-    return physics.roughness_response(
-        render,
-        suite.intrinsics(scene, low),
-        suite.intrinsics(scene, high),
-        suite.image(scene, low),
-        suite.image(scene, high),
-    )
-
-
-def decomposition(decompose: Decompose, stage: Stage, material: Material) -> Intrinsics:
-    """What is found in the true picture of a material."""
-    return decompose(stage, material, stage.image(material))
-
-
-def loop(shader: Shader, light: Light, decompose: Decompose, stage: Stage) -> float:
-    """dB of the closed loop of the base material's picture."""
-    return _loop_psnr(decompose, stage, shader, light, stage.suite.spec.base)
-
-
-def _loop_psnr(decompose: Decompose, stage: Stage, shader: Shader, light: Light, material: Material) -> float:
-    maps = decomposition(decompose, stage, material)
-    return stage.loop_values(maps, shader, light, material, "loop")[PSNR_KEY]
-
-
-def true_maps(stage: Stage, material: Material, _: Image) -> Intrinsics:
-    """The decomposer whose closed loop is the ceiling of all others."""
-    return stage.true_maps(material)
-
-
-def loss(light: Light, decompose: Decompose, stage: Stage) -> float:
-    """dB that the found maps lose against the true ones in Mitsuba's loop of the base material's picture."""
-    return loop("shade", light, true_maps, stage) - loop("shade", light, decompose, stage)
-
-
-def rough_loop(rough: bool, decompose: Decompose, stage: Stage) -> float:
-    """Mean dB of Mitsuba's loops under both lights, over the stored pictures whose roughness is (not) >= `ROUGH`."""
-    materials = [m for m in stage.pictures if (m[1] >= ROUGH) == rough]
-    lights: tuple[Light, ...] = ("input", "heldout")
-    return float(np.mean([_loop_psnr(decompose, stage, "shade", light, m) for m in materials for light in lights]))
-
-
-def rough_loss(decompose: Decompose, stage: Stage) -> float:
-    """dB that the found maps lose against the true ones in the primary closed loop."""
-    return rough_loop(True, true_maps, stage) - rough_loop(True, decompose, stage)
-
-
-def tau(parameter: Literal["metallic", "roughness"], decompose: Decompose, stage: Stage) -> float:
-    """Kendall's tau of the found against the true parameter over the 11 pictures of its sweep."""
-    m, r = stage.suite.spec.base
-    sweep = [(level, r) if parameter == "metallic" else (m, level) for level in LEVELS]
-    found = [physics.map_mean(decomposition(decompose, stage, at), parameter, stage.mask) for at in sweep]
-    return physics.kendall_tau(LEVELS, found)
-
-
+CEILING = "true maps' loop"
 GRADIENT = "a left-to-right gradient on the picture"
 GAMMA = "radiance to the power 0.8"
-ALBEDO = "true maps with half the albedo"
+NORMALS = "true maps with dents for bumps"
 CONSTANT = "metallic and roughness 0.5 for every picture"
 _RENDERER = (
     PhysicsTest(
@@ -223,7 +175,7 @@ _RENDERER = (
         CORRELATION,
         1.0,
         "render",
-        _roughness_response,
+        roughness_response,
         physics_twins.blind_to_roughness,
         "s replaced by d: blind to roughness",
         0.5,
@@ -242,11 +194,11 @@ _BASE_LOOPS = tuple(
         label,
         _LOOP.format("Mitsuba" if shader == "shade" else "the composite", "input" if light == "input" else "held-out"),
         PSNR,
-        None,
+        CEILING,
         "decompose",
         partial(loop, shader, light),
-        physics_twins.half_albedo,
-        ALBEDO,
+        physics_twins.dents_for_bumps,
+        NORMALS,
         1.0,
     )
     for name, (label, shader, light) in _LOOPS.items()
@@ -260,8 +212,8 @@ _LOSSES = tuple(
         0.0,
         "decompose",
         partial(loss, light),
-        physics_twins.half_albedo,
-        ALBEDO,
+        physics_twins.dents_for_bumps,
+        NORMALS,
         1.0,
     )
     for light in ("input", "heldout")
@@ -272,11 +224,11 @@ _ROUGH_LOOPS = (
         f"Closed loop, roughness >= {ROUGH}",
         f"mean of Mitsuba's closed loops over base and edits of roughness >= {ROUGH}, both lights: the primary figure",
         PSNR,
-        None,
+        CEILING,
         "decompose",
         partial(rough_loop, True),
-        physics_twins.half_albedo,
-        ALBEDO,
+        physics_twins.dents_for_bumps,
+        NORMALS,
         1.0,
         in_run=False,
     ),
@@ -288,8 +240,8 @@ _ROUGH_LOOPS = (
         0.0,
         "decompose",
         rough_loss,
-        physics_twins.half_albedo,
-        ALBEDO,
+        physics_twins.dents_for_bumps,
+        NORMALS,
         1.0,
         in_run=False,
     ),
@@ -298,11 +250,11 @@ _ROUGH_LOOPS = (
         f"Closed loop, roughness < {ROUGH}",
         "as the primary figure, over the smoother pictures: one point per pixel is not a render of them",
         PSNR,
-        None,
+        CEILING,
         "decompose",
         partial(rough_loop, False),
-        physics_twins.half_albedo,
-        ALBEDO,
+        physics_twins.dents_for_bumps,
+        NORMALS,
         1.0,
         in_run=False,
     ),
@@ -323,8 +275,37 @@ _TAUS = tuple(
     )
     for parameter in ("roughness", "metallic")
 )
+_AMBIGUITY = (
+    PhysicsTest(
+        "ambiguity_share",
+        "Ambiguity: explanations inside",
+        f"share of {EXPLANATIONS} materials that re-render within 2 sigma of the input, inside the 90 % region of "
+        f"{POSTERIOR} samples; below the expected: too sure, above: too broad",
+        SHARE,
+        SHARE.perfect,
+        "sample",
+        share_inside,
+        physics_twins.too_sure,
+        "a posterior shrunk to a tenth",
+        0.3,
+        in_run=False,
+    ),
+    PhysicsTest(
+        "ambiguity_volume",
+        "Ambiguity: volume of the region",
+        "of the unit cube (metallic, roughness, albedo luminance): what the share was bought with",
+        VOLUME,
+        "Mitsuba's",
+        "sample",
+        region_volume,
+        physics_twins.anything,
+        "any material, whatever the picture",
+        0.3,
+        in_run=False,
+    ),
+)
 TESTS: dict[str, PhysicsTest] = {
-    test.name: test for test in (*_RENDERER, *_BASE_LOOPS, *_LOSSES, *_ROUGH_LOOPS, *_TAUS)
+    test.name: test for test in (*_RENDERER, *_BASE_LOOPS, *_LOSSES, *_ROUGH_LOOPS, *_TAUS, *_AMBIGUITY)
 }
 
 

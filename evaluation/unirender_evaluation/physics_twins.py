@@ -1,11 +1,13 @@
-"""What each physics test must refuse: the composite, or the true maps, broken in one place."""
+"""What each physics test must refuse: the composite, the true maps or Mitsuba's posterior, broken in one place."""
 
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.physics_ambiguity import POSTERIOR, Points
 from unirender_evaluation.physics_stage import Stage
 from unirender_evaluation.suites import Material
+from unirender_evaluation.truth_render import item_seed
 
 _PERFECT = Composite().render
 
@@ -36,12 +38,23 @@ def blind_to_roughness(maps: Intrinsics) -> Image:
     return _PERFECT(maps.replace(specular=maps.require("diffuse")["diffuse"]))
 
 
-def half_albedo(stage: Stage, material: Material, _: Image) -> Intrinsics:
-    """The true maps with half the albedo."""
+def dents_for_bumps(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    """The true maps, each normal turned by half a turn about the view axis: lit from the other side."""
     maps = stage.true_maps(material)
-    return maps.replace(albedo=0.5 * maps.require("albedo")["albedo"])
+    return maps.replace(normal=maps.require("normal")["normal"] * np.array([-1, -1, 1], np.float32))
 
 
 def constant_material(stage: Stage, material: Material, _: Image) -> Intrinsics:
     """The true albedo and normal, metallic and roughness 0.5 whatever the picture."""
     return stage.true_maps((0.5, 0.5)).replace(albedo=stage.true_maps(material).albedo)
+
+
+def too_sure(stage: Stage, *_: object) -> Points:
+    """Mitsuba's posterior, shrunk to a tenth about its mean."""
+    samples = stage.explanations.posterior
+    return samples.mean(axis=0) + 0.1 * (samples - samples.mean(axis=0))
+
+
+def anything(stage: Stage, *_: object) -> Points:
+    """Any material, whatever the picture."""
+    return np.random.default_rng(item_seed("anything", stage.scene.key)).random((POSTERIOR, 3))

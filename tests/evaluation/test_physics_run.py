@@ -6,13 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_models import make_pipeline
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.symmetries import turn_rotation
 from unirender_evaluation import physics, physics_run
 from unirender_evaluation.methods import Composite
-from unirender_evaluation.physics_run import COMPOSITE, MITSUBA, ROWS, TWIN, Value, findings, markdown, write
+from unirender_evaluation.physics_ambiguity import POSTERIOR
+from unirender_evaluation.physics_run import (
+    COMPOSITE,
+    MITSUBA,
+    OURS,
+    ROWS,
+    TWIN,
+    Sampler,
+    Value,
+    findings,
+    markdown,
+    write,
+)
 from unirender_evaluation.physics_stage import Stage
 from unirender_evaluation.physics_tests import TESTS
 from unirender_evaluation.physics_tracer import MIRROR, PathTracer, moved
@@ -46,7 +59,7 @@ def test_a_blind_test_is_said_to_fail(tmp_path: Path) -> None:
 
 
 def test_rows_of_a_test(tmp_path: Path) -> None:
-    """Composite has no decomposition; everybody else answers both kinds."""
+    """Composite has no decomposition; everybody else answers both kinds. Only who samples has a posterior."""
     suite = make_suite(tmp_path, objects=1)
     stage = Stage(suite, suite.scenes[0])
     tracer, ours = PathTracer.__new__(PathTracer), Composite()
@@ -55,6 +68,23 @@ def test_rows_of_a_test(tmp_path: Path) -> None:
     assert tuple(physics_run.subjects(render, tracer, ours)) == ROWS
     ours.decompose = lambda **_: None  # type: ignore[attr-defined]  # a method's
     assert set(ROWS) - set(physics_run.subjects(decompose, tracer, ours)) == {COMPOSITE}
+    posterior = TESTS["ambiguity_share"]
+    assert set(physics_run.subjects(posterior, tracer, ours)) == {MITSUBA, TWIN}
+    sampled = physics_run.subjects(posterior, tracer, ours, lambda *_: np.zeros((POSTERIOR, 3)))
+    assert set(sampled) == {MITSUBA, OURS, TWIN}
+
+
+def test_our_samples_are_drawn_once_for_a_scene(tmp_path: Path) -> None:
+    """Nineteen materials in the cube that differ; the second test that asks has the same."""
+    suite = make_suite(tmp_path, objects=1)
+    stage, sampler = Stage(suite, suite.scenes[0]), Sampler(make_pipeline())
+    image = stage.image(stage.own_material)
+    drawn = sampler(stage, stage.own_material, image)
+    assert drawn.shape == (POSTERIOR, 3)
+    assert 0 <= drawn.min() <= drawn.max() <= 1
+    assert np.ptp(drawn, axis=0).min() > 1e-4
+    assert sampler(stage, stage.own_material, image) is drawn
+    assert (Sampler(make_pipeline())(stage, stage.own_material, image) == drawn).all(), "seeded by the scene"
 
 
 def test_moved_meshes_stay_outside_out() -> None:

@@ -1,0 +1,113 @@
+"""`bench run --cluster` on `dask.distributed` workers, separate processes over TCP: the run of this machine alone."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.progress import Progress
+from tiny_suites import write_suite
+
+from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.benchmark import BenchConfig, _work, build_rows, prepare
+from unirender_evaluation.bounds import CEILING_KEY
+from unirender_evaluation.commands import BenchRun
+from unirender_evaluation.engine import Job, Store
+from unirender_evaluation.subsets import Subsets
+from unirender_evaluation.suites import Scene
+from unirender_evaluation.versions import Versions
+from unirender_evaluation.workers import Order, Run, cluster_scene
+
+SMALL = Subsets(sample=0, optimise=0, views=0, shade=1, physics=1, mitsuba=0)
+RENDERED = ("physics", "shade")  # labels of records that Mitsuba makes
+
+
+@pytest.fixture
+def scheduler(tmp_path: Path) -> Iterator[str]:
+    """The address of a scheduler with two workers, which run in another folder than this process."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        protocol="tcp",
+        dashboard_address=":0",
+        local_directory=str(tmp_path / "dask"),
+        silence_logs=logging.CRITICAL,
+    ) as local:
+        yield local.scheduler_address
+
+
+def trivial(folder: Path) -> tuple[BenchConfig, Run]:
+    """A run of the trivial rows on two closed-form objects."""
+    suite = folder / "suite" / "ball.toml"
+    if not suite.is_file():
+        write_suite(suite.parent)
+    config = BenchConfig(suite=str(suite), out=folder / "out", methods=("trivial",), subsets=SMALL)
+    return config, prepare(config)
+
+
+def quick(run: Run, scene: Scene) -> list[Job]:
+    return [job for job in run.jobs(scene) if not job.label.startswith(RENDERED)]
+
+
+def wanted_of(run: Run) -> dict[str, frozenset[str]]:
+    return {scene.key: frozenset(job.key for job in quick(run, scene)) for scene in run.scenes}
+
+
+@pytest.mark.slow
+def test_records_and_pictures_are_those_of_one_machine(
+    tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the suite was named by a relative path. What is stored is not computed again."""
+    config, run = trivial(tmp_path)
+    here = [job.make() for scene in run.scenes for job in quick(run, scene)]
+    pictures = {path.name: path.read_bytes() for path in run.pictures.iterdir()}
+    assert len(here) > 50
+    assert len(pictures) > 20
+    elsewhere, store = replace(run, pictures=tmp_path / "elsewhere"), Store.open(tmp_path / "records.jsonl")
+    stored = next(record for record in here if record.method == CEILING_KEY)
+    store.lay_by(stored)
+    monkeypatch.chdir(tmp_path)
+    _work(elsewhere, replace(config, suite="suite/ball.toml", cluster=scheduler), store, Progress(disable=True))
+    found = store.used
+    assert all(found[r.key] == replace(r, seconds=found[r.key].seconds) for r in here)
+    assert any(record.table == "physics" and record.values for record in found.values()), "Mitsuba's, too"
+    assert stored.key not in store.path.read_text()
+    made = {path.name: path.read_bytes() for path in elsewhere.pictures.iterdir()}
+    assert made.items() >= pictures.items()
+    assert not [name for name in made if not name.endswith(".png")]
+
+
+def test_a_worker_that_is_not_like_this_machine_is_refused(tmp_path: Path) -> None:
+    """Other code, another truth, other rows: what a worker would say, said here."""
+    config, run = trivial(tmp_path)
+    order = Order.of(run, partial(build_rows, config), config.suite)
+    scene, wanted = next(iter(wanted_of(run).items()))
+    for wrong, message in (
+        (replace(order, versions=Versions("other")), "a worker has other code"),
+        (replace(order, suite_sha256="other"), "a worker has another truth"),
+    ):
+        with pytest.raises(UnirenderError, match=message):
+            cluster_scene(replace(wrong, name=message), scene, wanted)
+    poor = replace(order, name="poor", build=partial(build_rows, replace(config, methods=())))
+    with pytest.raises(UnirenderError, match=f"does not know .* of the records of {scene}"):
+        cluster_scene(poor, scene, wanted)
+    records, _ = cluster_scene(replace(order, name="good"), scene, wanted)
+    assert {record.key for record in records} == wanted
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"cluster": "tcp://here:8786", "jobs": 2}, UsageError, "--jobs 2: expected none with --cluster"),
+        ({"cluster": "somewhere"}, UnirenderError, "cluster: got 'somewhere', expected tcp://host:port"),
+    ],
+)
+def test_options(options: dict[str, Any], error: type[UnirenderError], message: str) -> None:
+    with pytest.raises(error, match=message):
+        BenchRun(**options).run()
