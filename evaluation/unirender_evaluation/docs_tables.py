@@ -1,19 +1,25 @@
 """Copies the tables and plots of studies into the documentation, so that no number is typed.
 
-    python -m unirender_evaluation.docs_tables results/speed results/sampling [--docs docs] [--check]
+    python -m unirender_evaluation.docs_tables results/speed results/sampling [--docs docs] [--check] [--partial]
 
 Each folder is one that a study's command wrote. A page of the documentation includes a study's tables from a file of
 their own, whose name begins with an underscore; plots go to `_static/`. `--check` writes nothing and says what differs.
+A study that was run without some of its rows is refused, unless with `--partial`; `--piece NAME` gives a second run of
+a study, say on other data, a file of its own.
 """
 
 import argparse
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.optimiser_study import write_files
+from unirender_evaluation.optimiser_study_ingredients import ingredients
+from unirender_evaluation.speed_study_parts import PARTS
+from unirender_evaluation.training_study import training_choices
 
 PLOT_FOLDER = "_static"
 HEADING = "### "  # of a table: pages include it below a heading of the second level
@@ -46,15 +52,25 @@ class Study:
         tables: file of its tables, in the folder that it writes; no two studies have the same.
         piece: file of the documentation that a page includes.
         plots: below the tables.
+        rows: gives the names of all rows, or parts, that options can choose from; None: there are no such options.
     """
 
     tables: str
     piece: str
     plots: tuple[Plot, ...] = ()
+    rows: Callable[[], Sequence[str]] | None = None
+
+
+def _choices() -> list[str]:
+    return [choice.name for choice in training_choices()]
+
+
+def _ingredients() -> list[str]:
+    return [ingredient.name for ingredient in ingredients()]
 
 
 STUDIES = (
-    Study("speed.md", "_speed.md"),
+    Study("speed.md", "_speed.md", rows=lambda: PARTS),
     Study(
         "sampling.md",
         "_sampling.md",
@@ -73,8 +89,9 @@ STUDIES = (
         ),
     ),
     Study("derived_light.md", "_derived_light.md"),
-    Study("training.md", "_training_choices.md"),
-    Study("ingredients.md", "_optimization_ingredients.md"),
+    Study("physics.md", "_physics.md"),
+    Study("training.md", "_training_choices.md", rows=_choices),
+    Study("ingredients.md", "_optimization_ingredients.md", rows=_ingredients),
     Study("race.md", "_optimization_race.md"),
     Study("unknown_mesh.md", "_optimization_unknown_mesh.md"),
     Study("warm_start.md", "_optimization_warm_start.md"),
@@ -95,11 +112,34 @@ def study_of(folder: Path) -> Study:
     return found[0]
 
 
-def pieces(folder: Path) -> dict[str, str | bytes]:
-    """What the documentation shows of a study: path below the documentation's folder -> content.
+def missing(folder: Path, study: Study) -> list[str]:
+    """The rows that a study was run without, by the JSON that it writes beside its tables.
 
     Raises:
-        UnirenderError: the folder is no study's, its tables are none, or a plot is missing.
+        UnirenderError: the JSON is missing or broken.
+    """
+    if study.rows is None:
+        return []
+    path = (folder / study.tables).with_suffix(".json")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        rows = content.get("rows", content)
+        found = {row["name"] for row in rows} if isinstance(rows, list) else set(rows)
+    except (OSError, ValueError, AttributeError, TypeError, KeyError) as error:
+        raise UnirenderError(f"{path}: cannot be read as what the study wrote ({error}); run it again") from error
+    return [name for name in study.rows() if name not in found]
+
+
+def pieces(folder: Path, partial: bool = False, piece: str | None = None) -> dict[str, str | bytes]:
+    """What the documentation shows of a study: path below the documentation's folder -> content.
+
+    Args:
+        folder: that the study wrote.
+        partial: take a study that was run without some of its rows, and say below the tables which they are.
+        piece: file of the documentation that the tables go to; None: the study's.
+
+    Raises:
+        UnirenderError: the folder is no study's, its tables are none, a plot is missing, or, without `partial`, a row.
     """
     study = study_of(folder)
     text = (folder / study.tables).read_text(encoding="utf-8")
@@ -108,7 +148,14 @@ def pieces(folder: Path) -> dict[str, str | bytes]:
             f"{folder / study.tables}: got {text[:40]!r}, expected a table below a heading {HEADING!r}; "
             "run the study again"
         )
-    found: dict[str, str | bytes] = {study.piece: "\n".join([text, *(plot.markdown() for plot in study.plots)])}
+    absent = ", ".join(missing(folder, study))
+    if absent and not partial:
+        raise UnirenderError(
+            f"{folder}: a part of the study, without {absent}; run it without options that choose, or pass --partial"
+        )
+    left_out = [f"Not measured in this run: {absent}.\n"] if absent else []
+    shown = [text, *left_out, *(plot.markdown() for plot in study.plots)]
+    found: dict[str, str | bytes] = {piece or study.piece: "\n".join(shown)}
     for plot in study.plots:
         path = folder / plot.file
         if not path.is_file():
@@ -134,10 +181,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", type=Path, nargs="+", help="that `unirender bench speed` and the others wrote")
     parser.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the documentation's sources")
+    parser.add_argument("--partial", action="store_true", help="also studies that were run without some of their rows")
+    parser.add_argument("--piece", help="file that the tables of a single folder go to, instead of the study's own")
     parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if anything differs")
     arguments = parser.parse_args(argv)
     try:
-        content = {name: value for folder in arguments.folders for name, value in pieces(folder).items()}
+        if arguments.piece is not None and len(arguments.folders) > 1:
+            raise UsageError(f"--piece {arguments.piece}: got {len(arguments.folders)} folders, expected one")
+        found = [pieces(folder, arguments.partial, arguments.piece) for folder in arguments.folders]
+        content = {name: value for of_one in found for name, value in of_one.items()}
         changed = differing(arguments.docs, content)
         if arguments.check:
             for name in changed:

@@ -1,10 +1,15 @@
 """`unirender bench training`. Light to import."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
 from unirender.options import Device, at_least
+
+if TYPE_CHECKING:
+    from unirender_evaluation.training_study import Choice
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,8 @@ class BenchTraining:
     steps: int = 1000
     """Of every training."""
     choices: tuple[str, ...] = ()
-    """Rows by name, or by the question that they answer. None: all."""
+    """Rows by name, or by the question that they answer. None: all that can be trained on the data (one-at-a-time needs
+    data of that kind)."""
     batch_size: int | None = None
     """Instead of the preset's."""
     parallel: int | None = None
@@ -55,6 +61,7 @@ class BenchTraining:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
+        rows = self._possible(rows)
         from rich.console import Console
 
         from unirender_evaluation.rows import evenly
@@ -65,3 +72,24 @@ class BenchTraining:
         study = TrainingStudy(suite, self.data, self.out, self.steps, self.device, self.parallel)
         run(study, rows, evenly(suite.scenes, self.scenes), Console())
         return 0
+
+    def _possible(self, rows: "Sequence[Choice]") -> "tuple[Choice, ...]":
+        """The rows that can be trained on the data; says which are left out.
+
+        Raises:
+            UnirenderError: one of those asked for by name cannot.
+        """
+        from unirender.training.contrasts import ContrastDataset
+
+        possible = []
+        for row in rows:
+            try:
+                if row.config.group_size > 1:
+                    ContrastDataset(self.data, run_length=row.config.group_size)
+            except UnirenderError as error:
+                if self.choices:
+                    raise
+                print(f"{row.name}: left out ({error})")
+            else:
+                possible.append(row)
+        return tuple(possible)

@@ -1,11 +1,14 @@
 """Tables and plots of studies reach the documentation from the folders that the studies wrote, never by hand."""
 
+import json
 import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from unirender.errors import UnirenderError
 from unirender_evaluation import (
     derived_light_study_run,
     sampling_study_run,
@@ -14,9 +17,13 @@ from unirender_evaluation import (
     unknown_mesh_run,
     warm_start_run,
 )
-from unirender_evaluation.docs_tables import HEADING, STUDIES, main
+from unirender_evaluation.docs_tables import HEADING, STUDIES, main, missing, study_of
+from unirender_evaluation.optimiser_study_ingredients import ingredients
 from unirender_evaluation.speed_study import Part
+from unirender_evaluation.speed_study_parts import PARTS, PartName
+from unirender_evaluation.study_rows import StudyRow
 from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.training_study import training_choices
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PIECES = [study.piece for study in STUDIES]
@@ -24,11 +31,14 @@ PENDING = "Not measured yet with this version: run `unirender bench "
 TABLE = TextTable("Milliseconds", ("part", "ms"), ((("decompose", "12.5"),),))
 
 
-def speed(folder: Path) -> Path:
-    """A folder as `unirender bench speed` writes it."""
-    part = Part("network", (TABLE,), {"ms": 12.5})
+def speed(folder: Path, parts: Sequence[PartName] = PARTS) -> Path:
+    """A folder as `unirender bench speed` writes it, by default with all parts."""
+
+    def measured(name: PartName) -> Callable[[], Part]:
+        return lambda: Part(name, (TABLE,), {"ms": 12.5})
+
     with (folder.parent / "console.txt").open("w") as out:
-        speed_study_run.run(folder, {"network": lambda: part}, (("cores", "2"),), Console(file=out))
+        speed_study_run.run(folder, {name: measured(name) for name in parts}, (("cores", "2"),), Console(file=out))
     return folder
 
 
@@ -96,6 +106,45 @@ def test_what_is_no_studys_folder_is_refused_and_nothing_is_written(
     assert "got 'no table', expected a table" in refused()
     (other / "race.md").write_text(TABLE.markdown())
     assert "got sampling.md and race.md, expected" in refused()
+
+
+def test_a_part_of_a_study_is_refused_unless_it_is_asked_for(
+    tmp_path: Path, docs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(speed(tmp_path / "speed", ("network", "start"))), "--docs", str(docs)]
+    assert main(arguments) == 1
+    assert "a part of the study, without mitsuba, training, overfit; run it" in capsys.readouterr().err
+    assert not list(docs.glob("_*.md"))
+    assert main([*arguments, "--partial"]) == 0
+    assert "Not measured in this run: mitsuba, training, overfit." in (docs / "_speed.md").read_text()
+
+
+def test_a_second_run_of_a_study_has_a_file_of_its_own(
+    tmp_path: Path, docs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = speed(tmp_path / "speed")
+    assert main([str(folder), "--docs", str(docs), "--piece", "_other.md"]) == 0
+    assert [path.name for path in docs.glob("_*.md")] == ["_other.md"]
+    assert main([str(folder), str(folder), "--docs", str(docs), "--piece", "_other.md"]) == 1
+    assert "expected one" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "all_rows"), [("training", training_choices()), ("ingredients", ingredients())])
+def test_the_rows_of_a_study_are_those_of_its_json(name: str, all_rows: Sequence[StudyRow], tmp_path: Path) -> None:
+    """Training writes its rows by name, the ingredients as a list."""
+    (tmp_path / f"{name}.md").write_text(TABLE.markdown())
+
+    def without(count: int) -> list[str]:
+        names = [row.name for row in all_rows[count:]]
+        rows = dict.fromkeys(names, 0) if name == "training" else [{"name": row} for row in names]
+        (tmp_path / f"{name}.json").write_text(json.dumps({"rows": rows}))
+        return missing(tmp_path, study_of(tmp_path))
+
+    assert without(0) == []
+    assert without(2) == [row.name for row in all_rows[:2]]
+    (tmp_path / f"{name}.json").write_text("[")
+    with pytest.raises(UnirenderError, match=f"{name}.json: cannot be read as what the study wrote"):
+        missing(tmp_path, study_of(tmp_path))
 
 
 def test_the_names_are_those_that_the_studies_write() -> None:

@@ -11,6 +11,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.presets import ModelConfig
+from unirender_evaluation import training_study_run
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
 from unirender_evaluation.training_study import PLAIN, Choice, training_choices
@@ -119,3 +120,18 @@ def test_values_out_of_range_are_usage_errors(option: dict[str, int], tmp_path: 
 def test_missing_data_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="no such data folder"):
         BenchTraining(data=tmp_path / "none").run()
+
+
+def test_rows_that_the_data_cannot_train_are_left_out_at_the_start(
+    study: TrainingStudy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not after hours, when their turn has come; asked for by name they are refused."""
+    trained: list[str] = []
+    monkeypatch.setattr(training_study_run, "run", lambda _study, rows, *_: trained.extend(row.name for row in rows))
+    BenchTraining(data=study.data, out=study.out).run()
+    assert trained == [row.name for row in training_choices() if row.name != "one-at-a-time"]
+    assert "one-at-a-time: left out" in capsys.readouterr().out
+    trained.clear()
+    with pytest.raises(UnirenderError, match="expected one-at-a-time"):
+        BenchTraining(data=study.data, out=study.out, choices=("batches",)).run()
+    assert not trained
