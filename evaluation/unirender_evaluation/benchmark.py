@@ -11,7 +11,6 @@
 Running the same command again reuses what is done.
 """
 
-import os
 import platform
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import checkpoint_sha256
+from unirender.files import checkpoint_sha256, replace_file
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.engine import Job, Store
@@ -54,7 +53,7 @@ from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth import quality_summary
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import installed_version, versions
-from unirender_evaluation.workers import Run, run_in_workers
+from unirender_evaluation.workers import Run, run_in_workers, run_on_cluster
 
 GROUPS = ("ours", "optimisation", "trivial", "plugins")
 FEW = 100  # records: fewer are not worth starting processes
@@ -85,6 +84,8 @@ class BenchConfig:
         check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
         recheck: render them again also where the folder holds the same check.
         jobs: worker processes, each with one thread; 0 = all in this one.
+        cluster: workers of a cluster instead, see `unirender_reference.cluster.connect`; the truth check and the
+            multi-view table stay in this process.
         device: of our model: auto, cpu, cuda or mps.
         subsets: scenes of the slow parts.
         variants: of the tables (see `tables.build_tables`); records have all of them.
@@ -102,6 +103,7 @@ class BenchConfig:
     check_seed: int | None = None
     recheck: bool = False
     jobs: int = 2
+    cluster: str | None = None
     device: str = "cpu"
     subsets: Subsets = STANDARD
     variants: tuple[Variant, ...] | None = None
@@ -215,22 +217,39 @@ def check_request(config: BenchConfig) -> CheckRequest:
 
 
 def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
-    """Computes the records that are missing, few of them here, many in worker processes."""
+    """Computes the records that are missing: on a cluster if there is one, else few of them here, many in worker
+    processes."""
     missing = {scene.key: [job for job in here.jobs(scene) if not job.is_done(store.has)] for scene in here.scenes}
     scenes = [scene for scene in here.scenes if missing[scene.key]]
     total = sum(map(len, missing.values()))
     bar = progress.add_task("methods", total=total, visible=total > 0)
-    if config.jobs == 0 or total <= FEW:
+    if config.cluster is None and (config.jobs == 0 or total <= FEW):
         for job in (job for scene in scenes for job in missing[scene.key]):
             store.add(job.make())
             progress.update(bar, advance=1, description=job.label)
         return
+    wanted = {scene.key: frozenset(job.key for job in missing[scene.key]) for scene in scenes}
     missing.clear()  # they hold the pictures of all scenes
-    done = frozenset(store.used)
-    for records in run_in_workers(here, partial(build_rows, config), scenes, done, min(config.jobs, len(scenes))):
+    if config.cluster is not None:
+        settings = anywhere(config)
+        found = run_on_cluster(here, partial(build_rows, settings), settings.suite, wanted, config.cluster)
+    else:
+        done = frozenset(store.used)
+        found = run_in_workers(here, partial(build_rows, config), scenes, done, min(config.jobs, len(scenes)))
+    for records in found:
         for record in records:
             store.add(record)
         progress.advance(bar, len(records))
+
+
+def anywhere(config: BenchConfig) -> BenchConfig:
+    """The same with absolute paths, since a cluster's workers may run in another folder; but for those in `method`."""
+    return replace(
+        config,
+        suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
+        checkpoint=None if config.checkpoint is None else config.checkpoint.resolve(),
+        predictions={name: folder.resolve() for name, folder in config.predictions.items()},
+    )
 
 
 def _views_rows(config: BenchConfig) -> list[Row]:
@@ -305,6 +324,4 @@ def write_outputs(out: Path, result: BenchResult) -> None:
         "verdict.txt": lambda: result.verdict + "\n",
     }
     for name, write in writers.items():
-        temporary = out / f"{name}.tmp"
-        temporary.write_text(write(), encoding="utf-8")
-        os.replace(temporary, out / name)
+        replace_file(out / name, write())

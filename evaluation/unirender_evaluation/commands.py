@@ -15,6 +15,7 @@ from unirender_evaluation.crosscheck_command import BenchCrosscheck
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
 from unirender_evaluation.physics_command import BenchPhysics
+from unirender_evaluation.public_command import BenchPublic
 from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
 from unirender_evaluation.sampling_study_command import BenchSampling
 from unirender_evaluation.speed_study_command import BenchSpeed
@@ -39,8 +40,8 @@ class BenchRun:
     """Groups of rows; optimisation: of each picture, and the multi-view table; plugins: what is installed. The trivial
     rows also run whenever there is a row of yours."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class;
-    repeatable."""
+    """Methods without an entry point: module:Class (also from the current directory) or path/to/file.py:Class, then
+    ?name=value&name=value for its arguments; repeatable."""
     predictions: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=FOLDER of somebody's predictions (`unirender bench export` writes the inputs); repeatable."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -64,8 +65,10 @@ class BenchRun:
     """Scenes of the rows that optimise each picture; 0 leaves them out. None: 4, with `--full` all."""
     view_objects: int | None = None
     """Objects of the multi-view table; 0 leaves it out. None: 4, with `--full` all."""
-    jobs: int = 2
-    """Worker processes of one thread each; 0: all in this one."""
+    jobs: int | None = None
+    """Worker processes of one thread each; 0: all in this one. None: 2."""
+    cluster: str | None = None
+    """Compute on a cluster instead: tcp://HOST:PORT of a dask scheduler, slurm, or slurm:JOBS."""
     device: Device = "cpu"
     """Where our model runs. auto: cuda, then mps, then cpu, whichever is there."""
     full: bool = False
@@ -83,6 +86,8 @@ class BenchRun:
         at_least(0, optimise_scenes=self.optimise_scenes, view_objects=self.view_objects)
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
+        if self.cluster is not None and self.jobs is not None:
+            raise UsageError(f"--jobs {self.jobs}: expected none with --cluster, whose workers are its own")
         named_folders(self.predictions)
         asked_variants(self.variant)
 
@@ -101,6 +106,10 @@ class BenchRun:
         from unirender_evaluation.prediction_check import PredictionError
         from unirender_evaluation.table_formats import print_table
 
+        if self.cluster is not None:
+            from unirender_reference.cluster import check_address
+
+            check_address(self.cluster)
         console = Console()
         config = benchmark.BenchConfig(
             suite=self.suite,
@@ -114,7 +123,8 @@ class BenchRun:
             check_scenes=self.check_scenes,
             check_seed=self.check_seed,
             recheck=self.recheck,
-            jobs=self.jobs,
+            jobs=2 if self.jobs is None else self.jobs,
+            cluster=self.cluster,
             device=self.device,
             subsets=self.subsets,
             variants=asked_variants(self.variant),
@@ -173,14 +183,24 @@ class BenchCheck:
 
 @dataclass(frozen=True)
 class BenchTruth:
-    """Make a suite's truth file with Mitsuba; resumes by running the same command again."""
+    """Make a suite's truth with Mitsuba; resumes by running the same command again.
 
-    suite: str
-    """Path of the suite's TOML file; the tar is written beside it and its hash into it."""
+    A suite of one's own gets it beside its TOML file, `standard` and `paper` in `${UNIRENDER_CACHE}/suites`.
+    """
+
+    suite: Annotated[str, tyro.conf.Positional]
+    """A bundled suite, or the path of a suite's TOML file. The truth's hash, and the folders, are written into it, or
+    into its copy beside the truth."""
+    objects: Path | None = None
+    """Folder of meshes, for suites that take some; None: the one that the TOML file names."""
+    lights: Path | None = None
+    """Folder of HDR maps and pictures, likewise."""
+    out: Path | None = None
+    """Folder for the truth and a copy of the TOML file, which is then a suite by its path."""
     work: Path | None = None
     """Folder for finished objects; None: `${UNIRENDER_CACHE}/truth`."""
     workers: int = 2
-    """Processes."""
+    """Processes of one thread each."""
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""
@@ -189,16 +209,26 @@ class BenchTruth:
     def run(self) -> int:
         """Renders what is missing."""
         self.check()
-        from rich.progress import track
+        from rich.console import Console
+        from rich.progress import Progress
 
         from unirender.paths import cache_dir
-        from unirender_evaluation.suites import read_spec
-        from unirender_evaluation.truth import make_truth
+        from unirender_evaluation.suite_home import target
+        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.truth import make_truth, quality_summary
 
-        work = self.work or cache_dir() / "truth"
-        steps = make_truth(self.suite, work, self.workers)
-        for _ in track(steps, "truth", total=len(read_spec(self.suite).objects)):
-            pass
+        work, console = self.work or cache_dir() / "truth", Console()
+        folders = {"out": self.out, "objects": self.objects, "lights": self.lights}
+        with Progress(console=console, transient=not console.is_terminal) as progress:
+            bar = progress.add_task("truth", total=None)
+            for done, total in make_truth(self.suite, work, self.workers, **folders):
+                progress.update(bar, completed=done, total=total)
+        suite = load_suite(target(self.suite, **folders)[0].path)
+        print(f"{suite.spec.path}: {len(suite.scenes)} scenes, truth {suite.sha256[:12]}")
+        for kind, row in quality_summary(suite).items():
+            below = f", {row['share_below_target']:.1%} below the target" if row["share_below_target"] else ""
+            text = f"{kind}: noise ceiling {row['mean_db']:.1f} dB in the mean, least {row['min_db']:.1f} dB"
+            print(f"{text}{below} (n {row['n']}, {row['mean_spp']:.0f} samples a pixel)")
         return 0
 
 
@@ -270,6 +300,7 @@ class Bench:
             | Annotated[BenchCompare, tyro.conf.subcommand("compare")]
             | Annotated[BenchLs, tyro.conf.subcommand("ls")]
             | Annotated[BenchPhysics, tyro.conf.subcommand("physics")]
+            | Annotated[BenchPublic, tyro.conf.subcommand("public")]
             | Annotated[BenchTables, tyro.conf.subcommand("tables")]
             | Annotated[BenchValidate, tyro.conf.subcommand("validate")]
             | Annotated[BenchCrosscheck, tyro.conf.subcommand("crosscheck")]

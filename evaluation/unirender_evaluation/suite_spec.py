@@ -1,6 +1,7 @@
 """What a suite's TOML file says: objects, lights, materials, and how good its truth has to be."""
 
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -9,6 +10,32 @@ from typing import Any, Literal
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.stratification import Material, stratified_materials
+from unirender_evaluation.suite_check import value_problems
+
+RENAMED = {  # keys of the tables -> attributes
+    "truth": {"file": "truth_file", "sha256": "truth_sha256", "cost": "truth_cost"},
+    "folders": {"objects": "objects_folder", "lights": "lights_folder"},
+}
+
+
+@dataclass(frozen=True)
+class Files:
+    """Which files of a folder a suite takes.
+
+    Attributes:
+        files: of meshes: a pattern of their paths below the folder, in which `*` also stands for slashes.
+        holdout: the split "test" has every so many-th, "train" all others: of the files that match, or of the places
+            of a folder of lights (`lights.pool`); 0: all of them, whatever the split.
+        without: paths below the folder that are left out then.
+        count: so many of the rest, drawn by `seed`; None: all. They are used in name order.
+        seed: draws them.
+    """
+
+    files: str = "*"
+    holdout: int = 0
+    without: tuple[str, ...] = ()
+    count: int | None = None
+    seed: int = 0
 
 
 @dataclass(frozen=True)
@@ -16,12 +43,19 @@ class SuiteSpec:
     """The TOML file's content. Materials are (metallic, roughness).
 
     Attributes:
+        objects: seeds of the generator; `meshes` are further objects, of the folder of objects.
+        bundled_lights, procedural_lights: built-in lights of the split; `light_files`: further ones, of the folder of
+            lights.
         spp, max_spp: samples per pixel of an image at first, and at most.
         light_spp: at first, of the specular and diffuse buffers.
         target_db, light_target_db: noise ceiling (masked sRGB PSNR of a noise-free prediction) of images, and of the
             specular and diffuse buffers.
         ceiling_factor: so many times a member's samples for its near-noise-free twin.
-        ceiling_scenes: (object, number of the light) of the scenes whose members have such a twin.
+        ceiling_scenes: (object, number of the light) of the scenes whose members have such a twin; the object by its
+            seed, or its path below the folder of objects.
+        truth_cost: how long making the truth takes, in words; empty: not stated.
+        objects_folder, lights_folder: relative to the TOML file; empty: the file names none.
+        objects_from, lights_from: where to get such a folder, in words.
     """
 
     name: str
@@ -50,7 +84,14 @@ class SuiteSpec:
     target_db: float
     light_target_db: float
     ceiling_factor: int
-    ceiling_scenes: tuple[tuple[int, int], ...]
+    ceiling_scenes: tuple[tuple[int | str, int], ...]
+    truth_cost: str = ""
+    meshes: tuple[Files, ...] = ()
+    light_files: Files | None = None
+    objects_folder: str = ""
+    lights_folder: str = ""
+    objects_from: str = ""
+    lights_from: str = ""
     path: Path = field(default=Path(), compare=False)
 
     @property
@@ -61,11 +102,25 @@ class SuiteSpec:
     def truth_path(self) -> Path:
         return self.path.parent / self.truth_file
 
-    def materials(self) -> list[list[Material]]:
-        """Stratified materials of each scene, objects outermost."""
-        return stratified_materials(
-            len(self.objects) * self.lights_per_object, self.per_scene, self.levels, self.assignment_seed
-        )
+    def folder(self, kind: Literal["objects", "lights"]) -> Path | None:
+        """The folder of meshes or of light files that the file names, None where it names none."""
+        named = self.objects_folder if kind == "objects" else self.lights_folder
+        return self.path.parent / Path(named).expanduser() if named else None
+
+    def materials(self, meshes: int = 0) -> list[list[Material]]:
+        """Stratified materials of each scene, objects outermost; `meshes`: objects beside the procedural ones."""
+        scenes = (len(self.objects) + meshes) * self.lights_per_object
+        return stratified_materials(scenes, self.per_scene, self.levels, self.assignment_seed)
+
+
+def suite_folder() -> Path:
+    """Where the package's own suites lie."""
+    return Path(str(resources.files("unirender_evaluation"))) / "data" / "suites"
+
+
+def is_bundled(path: Path) -> bool:
+    """Whether a suite's file is one of the package's own."""
+    return path.resolve().parent == suite_folder().resolve()
 
 
 def suite_path(name_or_path: str | Path) -> Path:
@@ -73,7 +128,7 @@ def suite_path(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if path.suffix == ".toml":
         return path
-    bundled = Path(str(resources.files("unirender_evaluation"))) / "data" / "suites" / f"{name_or_path}.toml"
+    bundled = suite_folder() / f"{name_or_path}.toml"
     if not bundled.is_file():
         known = ", ".join(sorted(p.stem for p in bundled.parent.glob("*.toml")))
         raise UnirenderError(f"no suite {str(name_or_path)!r}: expected one of {known}, or the path of a .toml file")
@@ -84,50 +139,74 @@ def read_spec(name_or_path: str | Path) -> SuiteSpec:
     """Reads and checks a suite's TOML file.
 
     Raises:
-        UnirenderError: missing file, broken TOML, a missing or unknown key, or values that contradict each other.
+        UnirenderError: missing file, broken TOML, missing or unknown keys, or values that are out of range or
+            contradict each other; all that are wrong at once.
     """
     path = suite_path(name_or_path)
+    return parse_spec(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a suite's TOML file.
+
+    Raises:
+        UnirenderError: it is not there, or no text.
+    """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise UnirenderError(
             f"no suite file {path}: expected a TOML file like the package's data/suites/tiny.toml"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise UnirenderError(f"{path} is not TOML: {error}") from None
-    materials, truth = data.pop("materials", {}), data.pop("truth", {})
-    flat = {
-        **data,
-        **materials,
-        **{{"file": "truth_file", "sha256": "truth_sha256"}.get(k, k): v for k, v in truth.items()},
-    }
-    expected = set(SuiteSpec.__dataclass_fields__) - {"path"}
-    if flat.keys() != expected:
-        missing, unknown = sorted(expected - flat.keys()), sorted(flat.keys() - expected)
+    except OSError as error:
+        raise UnirenderError(f"suite file {path}: cannot be read ({error.strerror}); check the path") from error
+
+
+def parse_spec(text: str, path: Path) -> SuiteSpec:
+    """`read_spec` of a text; `path` is where it lies, or is to lie."""
+    try:
+        flat = _flat(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise UnirenderError(f"{path} is not TOML: {error}") from None
+    fields = {name: f for name, f in SuiteSpec.__dataclass_fields__.items() if name != "path"}
+    required = {name for name in fields if name not in _OPTIONAL}
+    missing, unknown = sorted(required - flat.keys()), sorted(flat.keys() - fields.keys())
+    if missing or unknown:
         raise UnirenderError(
             f"{path}: missing keys {missing}, unknown keys {unknown}; compare with the package's data/suites/tiny.toml"
         )
+    found = value_problems(flat)
+    if found:
+        raise UnirenderError(f"{path}: {'; '.join(found)}")
     for name in ("objects", "procedural_lights", "base", "specular_roughness"):
         flat[name] = tuple(flat[name])
     flat["edits"] = tuple((float(m), float(r)) for m, r in flat["edits"])
-    flat["ceiling_scenes"] = tuple((int(obj), int(light)) for obj, light in flat["ceiling_scenes"])
-    _check_values(path, flat)
+    flat["ceiling_scenes"] = tuple((obj, light) for obj, light in flat["ceiling_scenes"])
+    flat["meshes"] = tuple(_files(group) for group in flat.get("meshes", ()))
+    flat["light_files"] = _files(flat["light_files"]) if "light_files" in flat else None
     return SuiteSpec(**flat, path=path)
 
 
-def _check_values(path: Path, flat: dict[str, Any]) -> None:
-    if flat["split"] not in ("train", "test"):
-        raise UnirenderError(f"{path}: split is {flat['split']!r}, expected 'train' or 'test'")
-    rendered = {r for _, r in (flat["base"], *flat["edits"])}
-    if not set(flat["specular_roughness"]) <= rendered:
-        raise UnirenderError(
-            f"{path}: specular_roughness is {list(flat['specular_roughness'])}, expected some of the base's and the "
-            f"edits' values {sorted(rendered)}"
-        )
-    scenes = {(obj, light) for obj in flat["objects"] for light in range(flat["lights_per_object"])}
-    unknown = [pair for pair in flat["ceiling_scenes"] if pair not in scenes]
-    if unknown:
-        raise UnirenderError(
-            f"{path}: ceiling_scenes has {unknown}, expected pairs of one of `objects` and a light from 0 to "
-            f"{flat['lights_per_object'] - 1}"
-        )
+_OPTIONAL = {
+    *("truth_cost", "meshes", "light_files"),
+    *("objects_folder", "lights_folder", "objects_from", "lights_from"),
+}
+
+
+def _flat(data: dict[str, Any]) -> dict[str, Any]:
+    """The file's keys as attributes: those of its tables beside those at its top."""
+    flat = dict(data)
+    for table in ("materials", "truth", "folders"):
+        inner = flat.pop(table, {})
+        if not isinstance(inner, Mapping):
+            inner = {table: inner}  # a value where a table belongs: an unknown key
+        flat |= {RENAMED.get(table, {}).get(key, key): value for key, value in inner.items()}
+    return flat
+
+
+def _files(group: Mapping[str, Any]) -> Files:
+    values: dict[str, Any] = dict(group)
+    values["without"] = tuple(values.get("without", ()))
+    return Files(**values)

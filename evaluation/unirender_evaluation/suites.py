@@ -1,12 +1,13 @@
 """A suite: which scenes a benchmark run scores, and their truth, read from one hash-checked tar file.
 
 A suite is a TOML file (:class:`~unirender_evaluation.suite_spec.SuiteSpec`) and beside it a tar of OpenEXR members
-(:mod:`~unirender_evaluation.truth_file`). Notation: a *scene* is one object under one light; m, r are metallic and
-roughness.
+(:mod:`~unirender_evaluation.truth_file`); `suite_home` says where they lie. Notation: a *scene* is one object under one
+light; m, r are metallic and roughness.
 """
 
 import hashlib
 import json
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,7 @@ from unirender_evaluation.stratification import (
     roughness_key,
     stratified_materials,
 )
+from unirender_evaluation.suite_home import found_spec, truth_command
 from unirender_evaluation.suite_spec import SuiteSpec, read_spec, suite_path
 from unirender_evaluation.truth_file import (
     CEILING,
@@ -34,11 +36,13 @@ from unirender_evaluation.truth_file import (
     estimate_variance,
     image_member,
     light_member,
+    list_tar,
     member_kind,
-    read_tar,
     shared_member,
     specular_member,
 )
+
+CACHE_BYTES = 512 * 2**20  # of decoded members that a suite keeps
 
 __all__ = [
     "STD_FLOOR",
@@ -72,7 +76,8 @@ class Scene:
 
 
 class Suite:
-    """A suite with its truth in memory. All arrays are float32, linear, exposed (display units).
+    """A suite and its truth, whose members are read as they are asked for. All arrays are float32, linear, exposed
+    (display units).
 
     Raises:
         UnirenderError: the truth file is missing, is not the one that the TOML file names by hash, or is incomplete.
@@ -82,34 +87,35 @@ class Suite:
         self.spec = spec
         path = spec.truth_path
         if not path.is_file():
-            raise UnirenderError(
-                f"suite {spec.name!r} has no truth file {path}: "
-                f"make it with `unirender bench truth --suite {spec.path}`"
-            )
-        data = path.read_bytes()
-        self.sha256 = hashlib.sha256(data).hexdigest()
+            raise UnirenderError(f"suite {spec.name!r} has no truth file {path}: make it with {truth_command(spec)}")
+        with path.open("rb") as stream:
+            self.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
         if self.sha256 != spec.truth_sha256:
             raise UnirenderError(
                 f"the truth of suite {spec.name!r} was changed: {path} has sha256 {self.sha256}, {spec.path} says "
-                f"{spec.truth_sha256 or 'nothing'}; restore the file, or remake it with "
-                f"`unirender bench truth --suite {spec.path}`"
+                f"{spec.truth_sha256 or 'nothing'}; restore the file, or remake it with {truth_command(spec)}"
             )
-        self._members = read_tar(data)
+        self._members = list_tar(path)
         self.provenance: dict = json.loads(self._member("suite.json"))
-        self._cache: dict[str, Channels] = {}
+        self._cache: OrderedDict[str, Channels] = OrderedDict()
+        self._cached_bytes = 0
         self._hashes: dict[str, str] = {}
 
     def _member(self, name: str) -> bytes:
         if name not in self._members:
             raise UnirenderError(
-                f"{self.spec.truth_path} has no member {name!r}: "
-                f"remake it with `unirender bench truth --suite {self.spec.path}`"
+                f"{self.spec.truth_path} has no member {name!r}: remake it with {truth_command(self.spec)}"
             )
-        return self._members[name]
+        return self._members[name].read()
 
     def _channels(self, name: str) -> Channels:
+        """A member decoded; those used last are kept, up to `CACHE_BYTES`."""
         if name not in self._cache:
             self._cache[name] = read_exr_bytes(self._member(name))[0]
+            self._cached_bytes += _bytes(self._cache[name])
+            while self._cached_bytes > CACHE_BYTES and len(self._cache) > 1:
+                self._cached_bytes -= _bytes(self._cache.popitem(last=False)[1])
+        self._cache.move_to_end(name)
         return self._cache[name]
 
     def _mean(self, name: str) -> Float[np.ndarray, "h w 3"]:
@@ -144,7 +150,7 @@ class Suite:
             digest = hashlib.sha256()
             own = (f"{scene.object}.", f"{scene.object}_")
             for name in sorted(n for n in self._members if n.removeprefix(CEILING).startswith(own)):
-                digest.update(name.encode() + hashlib.sha256(self._members[name]).digest())
+                digest.update(name.encode() + hashlib.sha256(self._member(name)).digest())
             for row in (s for s in self.scenes if s.object == scene.object):
                 digest.update(repr(row).encode() + hashlib.sha256(self._member(light_member(row.light))).digest())
             self._hashes[scene.object] = digest.hexdigest()
@@ -217,5 +223,13 @@ class Suite:
 
 
 def load_suite(name_or_path: str | Path = "tiny") -> Suite:
-    """Reads a suite by name (of the package) or TOML path and checks its truth's hash."""
-    return Suite(read_spec(name_or_path))
+    """Reads a suite by name (of the package) or TOML path and checks its truth's hash.
+
+    Raises:
+        UnirenderError: no such suite, or no truth of it: the message says which command makes it.
+    """
+    return Suite(found_spec(name_or_path))
+
+
+def _bytes(channels: Channels) -> int:
+    return sum(channel.nbytes for channel in channels.values())

@@ -8,101 +8,138 @@ import hashlib
 import importlib.metadata
 import json
 import re
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from importlib import resources
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
-from unirender.lighting import resample_environment
-from unirender_evaluation.suite_spec import SuiteSpec, read_spec
+from unirender.files import replace_file
+from unirender_evaluation.suite_home import target
+from unirender_evaluation.suite_lights import SuiteLight, assign_lights, light_sources, load_lights
+from unirender_evaluation.suite_objects import ObjectSource, broken_meshes, suite_sources
+from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.truth_file import Kind, light_member, member_kind, read_tar, write_tar
+from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
 
 CODE = {  # what a rendered part depends on
     "unirender": ("camera.py", "color.py", "exposure.py", "exr.py", "intrinsics.py", "lighting.py"),
     "unirender_reference": ("**/*.py",),
-    "unirender_evaluation": ("truth_object.py", "truth_render.py", "truth_file.py", "ceiling.py"),
+    "unirender_evaluation": (
+        *("truth_object.py", "truth_render.py", "truth_file.py", "ceiling.py"),
+        *("suite_objects.py", "suite_lights.py"),
+    ),
 }
 SHA256_LINE = re.compile(r"""^([ \t]*sha256[ \t]*=[ \t]*)(?:"[^"\n]*"|'[^'\n]*')""", re.MULTILINE)
-Environment = Float[np.ndarray, "h w 3"]
 
 
-def suite_lights(spec: SuiteSpec) -> dict[str, Environment]:
-    """The suite's pool of lights by name, brought to `light_rows`."""
-    from unirender_reference.lights import bundled_lights, make_light
-
-    bundled = sorted(bundled_lights(spec.split), key=lambda light: light.name)[: spec.bundled_lights]
-    lights = bundled + [make_light(seed, spec.split) for seed in spec.procedural_lights]
-    shape = (spec.light_rows, 2 * spec.light_rows)
-    return {light.name: resample_environment(light.environment, shape) for light in lights}
-
-
-def assign_lights(spec: SuiteSpec, names: list[str]) -> list[tuple[str, int]]:
-    """(light, turn in columns) of every scene, objects outermost.
-
-    All lights are used about equally often, those of one object differ, and every scene has its own turn about +y.
-    """
-    per_object, count = spec.lights_per_object, len(spec.objects) * spec.lights_per_object
-    if len(names) < per_object:
-        raise UnirenderError(
-            f"suite {spec.name!r}: got {len(names)} lights, expected at least {per_object} (lights_per_object)"
-        )
-    rng = np.random.default_rng(spec.assignment_seed)
-    while True:
-        order = np.concatenate([rng.permutation(len(names)) for _ in range(-(-count // len(names)))])[:count]
-        if all(len(set(row)) == per_object for row in order.reshape(-1, per_object)):
-            break
-    turns = rng.integers(0, 2 * spec.light_rows, count)
-    return [(names[i], int(turn)) for i, turn in zip(order, turns, strict=True)]
-
-
-def make_truth(suite_toml: str | Path, work: Path, workers: int = 1) -> Iterator[tuple[int, int]]:
-    """Renders a suite's truth, writes the tar beside the TOML file and its hash into it.
+def make_truth(
+    suite: str | Path,
+    work: Path,
+    workers: int = 1,
+    *,
+    out: Path | None = None,
+    objects: Path | None = None,
+    lights: Path | None = None,
+) -> Iterator[tuple[int, int]]:
+    """Renders a suite's truth, writes the tar, and beside it the suite's TOML file with the truth's hash.
 
     Args:
-        suite_toml: the suite, by name or path.
+        suite: by name or path.
         work: folder for the finished objects; running the same command again resumes from it. Parts made by another
-            suite file, other code or another Mitsuba are not used.
+            suite file, from other files, by other code or another Mitsuba are not used.
         workers: processes, each with one thread and its own Mitsuba.
+        out: folder of the truth; None: see `suite_home.target`.
+        objects, lights: folders of meshes and light files in place of those that the suite's file names.
 
     Yields:
         (objects done, objects).
 
     Raises:
-        UnirenderError: the suite's file, its lights or the work folder cannot be used; nothing was rendered then.
+        UnirenderError: the suite's file, its folders, meshes or lights, or the work folder cannot be used; nothing was
+            rendered then. Or objects could not be rendered, all of which are named: the others are kept for the next
+            run, and no truth is written.
     """
-    spec = read_spec(suite_toml)
-    environments = suite_lights(spec)
-    folder = work / _fingerprint(spec, environments)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnirenderError(f"{work}: cannot be written ({error.strerror}); choose another --work") from error
-    lights, materials, n = assign_lights(spec, list(environments)), spec.materials(), spec.lights_per_object
-    jobs = [
-        ObjectJob(
-            spec,
-            seed,
-            tuple(lights[i * n : (i + 1) * n]),
-            environments,
-            tuple(map(tuple, materials[i * n : (i + 1) * n])),
-            folder,
+    spec, text = target(suite, out, objects, lights)
+    with_sha256(text, spec.path, "")  # before hours of rendering: can the hash be written?
+    sources, pool = suite_sources(spec), light_sources(spec)
+    broken = list(broken_meshes(sources, spec))
+    if broken:
+        raise UnirenderError(
+            f"suite {spec.name!r}: {len(broken)} of its meshes cannot be used; repair them, or name them under "
+            "`without` of their group:\n" + "\n".join(f"  {line}" for line in broken)
         )
-        for i, seed in enumerate(spec.objects)
-    ]
-    parts = []
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as pool:
-        for part in pool.map(render_object, jobs):
-            parts.append(part)
+    assigned = assign_lights(spec, list(pool), len(sources))
+    used = load_lights(spec, [name for name, _ in assigned], pool)
+    folder = work / _fingerprint(spec, text, used)
+    for needed in (folder, spec.path.parent):
+        try:
+            needed.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UnirenderError(f"{needed}: cannot be made ({error.strerror}); choose another folder") from error
+    jobs = _jobs(spec, sources, assigned, used, folder)
+    parts: dict[int, Path] = {}
+    failures: list[str] = []
+    for number, outcome in _rendered(jobs, workers):
+        if isinstance(outcome, UnirenderError):
+            failures.append(f"{jobs[number].source.name}: {outcome}")
+        else:
+            parts[number] = outcome
             yield len(parts), len(jobs)
-    pack_truth(spec, parts, environments)
+    if failures:
+        raise UnirenderError(
+            f"suite {spec.name!r}: {len(failures)} of its objects could not be rendered; repair them and run the "
+            "command again (the others are kept), or leave them out (all then get other lights and materials):\n"
+            + "\n".join(f"  {line}" for line in sorted(failures))
+        )
+    pack_truth(spec, text, [parts[number] for number in range(len(jobs))], used)
+
+
+def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Iterator[tuple[int, Path | UnirenderError]]:
+    """The part of each object, or why there is none, as they are done; the numbers are those of the jobs.
+
+    Raises:
+        UnirenderError: a worker process died.
+    """
+    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as executor:
+        numbers = {executor.submit(render_object, job): number for number, job in enumerate(jobs)}
+        try:
+            for future in as_completed(numbers):
+                try:
+                    yield numbers[future], future.result()
+                except UnirenderError as error:
+                    yield numbers[future], error
+        except BrokenProcessPool as error:
+            raise UnirenderError(
+                "a worker process died, perhaps for want of memory; run the same command again, with fewer --workers"
+            ) from error
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _jobs(
+    spec: SuiteSpec,
+    sources: Sequence[ObjectSource],
+    assigned: Sequence[tuple[str, int]],
+    lights: Mapping[str, SuiteLight],
+    folder: Path,
+) -> list[ObjectJob]:
+    """A job for each object; each carries its own lights alone."""
+    n, materials = spec.lights_per_object, spec.materials(len(sources) - len(spec.objects))
+    jobs = []
+    for i, source in enumerate(sources):
+        own = tuple(assigned[i * n : (i + 1) * n])
+        environments = {name: lights[name].environment for name, _ in own}
+        chosen = tuple(map(tuple, materials[i * n : (i + 1) * n]))
+        jobs.append(ObjectJob(spec, source, own, environments, chosen, folder))
+    return jobs
 
 
 def _start_worker() -> None:
@@ -113,11 +150,12 @@ def _start_worker() -> None:
     set_threads(1)
 
 
-def _fingerprint(spec: SuiteSpec, environments: dict[str, Environment]) -> str:
-    """Names the work folder: the suite file but for the truth's hash, the lights, the code, Mitsuba."""
-    digest = hashlib.sha256(with_sha256(spec.path, "").encode())
-    for name, environment in environments.items():
-        digest.update(name.encode() + environment.tobytes())
+def _fingerprint(spec: SuiteSpec, text: str, lights: Mapping[str, SuiteLight]) -> str:
+    """Names the work folder: the suite's file but for the truth's hash, the lights, the code, Mitsuba. (Parts are named
+    after what their object holds.)"""
+    digest = hashlib.sha256(with_sha256(text, spec.path, "").encode())
+    for name, light in lights.items():
+        digest.update(name.encode() + light.environment.tobytes())
     for package, patterns in CODE.items():
         root = Path(str(resources.files(package)))
         for path in sorted({p for pattern in patterns for p in root.glob(pattern)}):
@@ -126,63 +164,71 @@ def _fingerprint(spec: SuiteSpec, environments: dict[str, Environment]) -> str:
     return digest.hexdigest()[:16]
 
 
-def pack_truth(spec: SuiteSpec, parts: Iterable[Path], environments: dict[str, Environment]) -> None:
-    """Packs rendered objects and their lights into the suite's tar and writes its hash into the TOML file."""
+def pack_truth(spec: SuiteSpec, text: str, parts: Iterable[Path], lights: Mapping[str, SuiteLight]) -> None:
+    """Packs rendered objects and their lights into the suite's tar, and writes the TOML file with its hash."""
     from unirender_reference.render import shared_scene_hash
 
-    members: dict[str, bytes] = {}
+    members: dict[str, bytes | Stored] = {}
     scenes: list[dict] = []
     hashes: dict[str, list[str]] = {}
     quality: dict[str, dict] = {}
     objects: dict[str, dict] = {}
     header: dict[str, str] = {}
     for path in parts:
-        members |= read_tar(path.read_bytes())
-        part = json.loads(members.pop(PART))
+        found = list_tar(path)
+        part = json.loads(found.pop(PART).read())
+        members |= found
         header = part["header"]
         scenes += part["scenes"]
         hashes |= part["hashes"]
         quality |= part["quality"]
         objects |= part["object"]
     made = {name: header[name] for name in ("mitsuba", "variant", "camera")}
-    for name, environment in environments.items():
+    for name, light in lights.items():
         lit = [scene for scene in scenes if scene["light"] == name]
-        if lit:
-            attributes = {
-                **made,
-                "light": name,
-                "object": ",".join(dict.fromkeys(scene["object"] for scene in lit)),
-                "scene": shared_scene_hash(h for scene in lit for h in hashes[scene["key"]]),
-                "exposure_factor": "1",
-            }
-            members[light_member(name)] = exr_bytes(image_channels(environment), half=False, attributes=attributes)
+        attributes = {
+            **made,
+            "light": name,
+            "object": ",".join(dict.fromkeys(scene["object"] for scene in lit)),
+            "scene": shared_scene_hash(h for scene in lit for h in hashes[scene["key"]]),
+            "exposure_factor": "1",
+        }
+        members[light_member(name)] = exr_bytes(image_channels(light.environment), half=False, attributes=attributes)
+    files = {name: dict(light.provenance) for name, light in lights.items() if light.provenance}
     provenance = {
         "suite": spec.name,
         **made,
         "batches": spec.batches,
         "objects": objects,
+        **({"lights": files} if files else {}),
         "scenes": scenes,
         "quality": quality,
     }
     members["suite.json"] = json.dumps(provenance, indent=1).encode()
     write_tar(spec.truth_path, members)
-    digest = hashlib.sha256(spec.truth_path.read_bytes()).hexdigest()
-    spec.path.write_text(with_sha256(spec.path, digest), encoding="utf-8")
+    with spec.truth_path.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    replace_file(spec.path, with_sha256(text, spec.path, digest))
 
 
-def with_sha256(path: Path, digest: str) -> str:
+def with_sha256(text: str, path: Path, digest: str) -> str:
     """The text of a suite's TOML file with another hash of its truth; comments and layout stay.
+
+    Args:
+        text: of the file.
+        path: of the file, for the message.
+        digest: the hash.
 
     Raises:
         UnirenderError: there is not exactly one line `sha256 = "..."`.
     """
-    text, count = SHA256_LINE.subn(rf'\g<1>"{digest}"', path.read_text(encoding="utf-8"))
+    changed, count = SHA256_LINE.subn(rf'\g<1>"{digest}"', text)
     if count != 1:
         raise UnirenderError(
             f'{path}: got {count} lines like sha256 = "...", expected exactly one, in [truth], for the hash of the '
             "truth file"
         )
-    return text
+    return changed
 
 
 def quality_summary(suite: Suite) -> dict[str, dict[str, float]]:
@@ -195,14 +241,14 @@ def quality_summary(suite: Suite) -> dict[str, dict[str, float]]:
         "diffuse": spec.light_target_db,
     }
     summary = {}
-    for kind, target in targets.items():
+    for kind, wanted in targets.items():
         rows = [row for member, row in suite.provenance["quality"].items() if member_kind(member) == kind]
         ceilings, spp = (np.array([row[name] for row in rows]) for name in ("ceiling_db", "spp"))
         summary[kind] = {
             "n": len(rows),
             "mean_db": float(ceilings.mean()),
             "min_db": float(ceilings.min()),
-            "share_below_target": float(np.mean(ceilings < target)),
+            "share_below_target": float(np.mean(ceilings < wanted)),
             "mean_spp": float(spp.mean()),
             "max_spp": int(spp.max()),
         }

@@ -19,10 +19,11 @@ from jaxtyping import Float
 
 from unirender.errors import UsageError
 from unirender_evaluation.geometry_check import GeometryTest, compare_geometry, twin_geometry
+from unirender_evaluation.suite_objects import scene_object
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_file import diffuse_member, image_member, specular_member
-from unirender_evaluation.truth_object import object_hash
 from unirender_evaluation.truth_render import good_spp, item_seed
+from unirender_reference.scene_spec import object_hash
 
 LIGHTS = ("specular", "diffuse")
 HALF_ROUNDING = 5e-4  # relative rounding of half floats
@@ -58,8 +59,8 @@ class GeometryCheck:
 class TruthCheck:
     """All re-renders of a run. `passed`: every member and geometry agrees with the shipped truth and no twin does.
 
-    `other_objects` names checked objects whose generator gives another mesh here than where the truth was made:
-    rounding on another CPU, or (when their members fail) a changed generator.
+    `other_objects` names checked objects whose generator or mesh reader gives another mesh here than where the truth
+    was made: rounding on another CPU, or (when their members fail) changed code.
     """
 
     checks: tuple[Check, ...]
@@ -128,7 +129,6 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
         Every check as it is done; at last the :class:`TruthCheck`.
     """
     from unirender_reference.render import Renderer
-    from unirender_reference.shapes import make_object
     from unirender_reference.statistics import FAMILY_ALPHA
 
     checks: list[Check] = []
@@ -140,7 +140,7 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     alpha = FAMILY_ALPHA / sum(len(checked_images(suite, scene, seed)) + len(LIGHTS) for scene in chosen)
     for scene in chosen:
         made = suite.provenance["objects"][scene.object]
-        obj = make_object(int(made["seed"]), spec.split)
+        obj = scene_object(suite, scene)
         if object_hash(obj) != made["sha256"]:
             others.append(scene.object)
         renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)

@@ -1,6 +1,7 @@
 """The file format of a suite's truth: a tar of OpenEXR members with the contract's channel names, and `suite.json`.
 
-    suite.json                                     how it was made: samples, noise ceilings, exposures, materials
+    suite.json                                     how it was made: samples, noise ceilings, exposures, materials;
+                                                   seeds, or files with their sha256, of objects and lights
     light_<name>.exr                               R,G,B: a light as rendered, before exposure and turn (float32)
     <object>.shared.exr                            albedo.R/G/B, normal.X/Y/Z, mask.Y
     <object>_l<k>.diffuse.exr                      diffuse.R/G/B (d)                        and std.R/G/B
@@ -26,12 +27,14 @@ import os
 import tarfile
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.errors import UnirenderError
 from unirender.exr import Channels
 from unirender_evaluation.stratification import Material, material_key, roughness_key
 
@@ -111,16 +114,49 @@ def _half(value: Rgb) -> Rgb:
     return value.astype(np.float16).astype(np.float32)
 
 
-def write_tar(path: Path, members: Mapping[str, bytes]) -> None:
+@dataclass(frozen=True)
+class Stored:
+    """A member of a tar file, read when it is asked for: the truth of a large suite does not fit into memory.
+
+    Attributes:
+        path: of the tar file.
+        offset, size: of the member, bytes.
+        state: (inode, time of the last change) of the tar file when it was listed.
+    """
+
+    path: Path
+    offset: int
+    size: int
+    state: tuple[int, int]
+
+    def read(self) -> bytes:
+        """The member's bytes.
+
+        Raises:
+            UnirenderError: the tar file was replaced or removed since it was listed.
+        """
+        try:
+            with self.path.open("rb") as stream:
+                if _state(stream) == self.state:
+                    stream.seek(self.offset)
+                    return stream.read(self.size)
+        except FileNotFoundError:
+            pass
+        raise UnirenderError(f"{self.path} was replaced while it was in use; run the command again")
+
+
+def write_tar(path: Path, members: Mapping[str, bytes] | Mapping[str, bytes | Stored]) -> None:
     """Writes a reproducible tar (sorted, no times or owners), moved into place when complete."""
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as stream:
             with tarfile.open(fileobj=stream, mode="w") as tar:
                 for name in sorted(members):
+                    member = members[name]
+                    data = member.read() if isinstance(member, Stored) else member
                     info = tarfile.TarInfo(name)
-                    info.size = len(members[name])
-                    tar.addfile(info, io.BytesIO(members[name]))
+                    info.size = len(data)
+                    tar.addfile(info, io.BytesIO(data))
             stream.flush()
             os.fsync(stream.fileno())
         Path(temporary).chmod(0o644)
@@ -130,7 +166,20 @@ def write_tar(path: Path, members: Mapping[str, bytes]) -> None:
         raise
 
 
-def read_tar(data: bytes) -> dict[str, bytes]:
-    """The members of a tar file by name."""
-    with tarfile.open(fileobj=io.BytesIO(data)) as tar:
-        return {m.name: data[m.offset_data : m.offset_data + m.size] for m in tar.getmembers()}
+def list_tar(path: Path) -> dict[str, Stored]:
+    """The members of a tar file by name.
+
+    Raises:
+        UnirenderError: it is no tar file.
+    """
+    try:
+        with path.open("rb") as stream, tarfile.open(fileobj=stream) as tar:
+            state = _state(stream)
+            return {m.name: Stored(path, m.offset_data, m.size, state) for m in tar.getmembers()}
+    except tarfile.TarError as error:
+        raise UnirenderError(f"{path}: is no tar file ({error}); remove it, and make it again") from error
+
+
+def _state(stream: BinaryIO) -> tuple[int, int]:
+    found = os.fstat(stream.fileno())
+    return found.st_ino, found.st_mtime_ns

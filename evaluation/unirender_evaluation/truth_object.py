@@ -1,6 +1,5 @@
 """Renders everything that a suite's truth holds of one object; what one worker process does."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender_evaluation.stratification import Material
+from unirender_evaluation.suite_objects import ObjectSource
 from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.truth_file import (
@@ -26,6 +26,9 @@ from unirender_evaluation.truth_file import (
 )
 from unirender_evaluation.truth_render import good_spp, item_seed, render_to_ceiling, stored_ceiling_db
 from unirender_reference.noise import noise_floor_db
+from unirender_reference.scene_spec import object_hash
+
+__all__ = ["PART", "ObjectJob", "object_hash", "render_object"]
 
 PART = "part.json"
 Environment = Float[np.ndarray, "eh ew 3"]
@@ -33,11 +36,12 @@ Environment = Float[np.ndarray, "eh ew 3"]
 
 @dataclass(frozen=True)
 class ObjectJob:
-    """Everything that one worker needs: `lights` are (name, turn in columns) and `materials` the stratified ones of
-    each scene; `environments` are the lights by name; the finished part goes to the folder `out`."""
+    """Everything that one worker needs: where the object is from; `lights` are (name, turn in columns) and `materials`
+    the stratified ones of each scene; `environments` are its lights by name; the finished part goes to the folder
+    `out`."""
 
     spec: SuiteSpec
-    seed: int
+    source: ObjectSource
     lights: tuple[tuple[str, int], ...]
     environments: dict[str, Environment]
     materials: tuple[tuple[Material, ...], ...]
@@ -55,22 +59,17 @@ class _Buffer:
     has_twin: bool = False  # a near-noise-free one, for scenes in `ceiling_scenes`
 
 
-def object_hash(obj: Any) -> str:
-    """sha256 over an object's geometry and texture."""
-    digest = hashlib.sha256()
-    for array in (obj.vertices, obj.faces, obj.normals, obj.uv, obj.albedo):
-        digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
 def render_object(job: ObjectJob) -> Path:
-    """Renders all members of one object into `<out>/<seed>-<object hash>.tar`; returns at once if that file exists."""
+    """Renders all members of one object into `<out>/<object>-<object hash>.tar`; returns at once if that file exists.
+
+    Raises:
+        UnirenderError: the object cannot be loaded, or not be seen.
+    """
     from unirender_reference.render import Renderer, renderer_provenance, shared_scene_hash
-    from unirender_reference.shapes import make_object
 
     spec = job.spec
-    obj = make_object(job.seed, spec.split)
-    path = job.out / f"{job.seed}-{object_hash(obj)[:12]}.tar"
+    obj = job.source.load()
+    path = job.out / f"{obj.name}-{object_hash(obj)[:12]}.tar"
     if path.exists():
         return path
     renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
@@ -86,7 +85,7 @@ def render_object(job: ObjectJob) -> Path:
         scene, environment, hash_of = _light_scene(renderer, job, key, light, turn, job.materials[index])
         scenes.append(asdict(scene))
         hashes[key] = list(hash_of.values())
-        twins = (job.seed, index) in spec.ceiling_scenes
+        twins = (job.source.name, index) in spec.ceiling_scenes
         for buffer in _buffers(renderer, spec, scene, environment, hash_of):
             first = item_seed(spec.name, buffer.name)
             found, channels = render_to_ceiling(buffer.render, mask, spec, first, buffer.kind)
@@ -110,7 +109,7 @@ def render_object(job: ObjectJob) -> Path:
         "scenes": scenes,
         "hashes": hashes,
         "quality": quality,
-        "object": {name: {"seed": job.seed, "sha256": object_hash(obj)}},
+        "object": {name: {**job.source.provenance(), "sha256": object_hash(obj)}},
     }
     members[PART] = json.dumps(part).encode()
     write_tar(path, members)

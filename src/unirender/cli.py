@@ -33,6 +33,7 @@ from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.figures_command import Figures
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
+from unirender_evaluation.public_command import BenchPublic
 from unirender_evaluation.sampling_study_command import BenchSampling
 from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
@@ -108,6 +109,7 @@ RESUMABLE = (
     BenchTruth,
     BenchDerivedLight,
     BenchIngredients,
+    BenchPublic,
     BenchRace,
     BenchSampling,
     BenchTraining,
@@ -120,7 +122,10 @@ def read_light(path: Path) -> "np.ndarray":
     """Radiance `[h w 3]` of a light file as it stands there: lat-long HDR or EXR, or a photograph."""
     from unirender_reference.lights import load_light
 
-    return load_light(path, normalise=False).environment
+    light = load_light(path, normalise=False)
+    if share := light.provenance.get("negative_share"):
+        notice(f"light {path}: {100 * float(share):.1g}% of its radiance is negative and was set to 0")
+    return light.environment
 
 
 def make_validation(suite: str, scenes: int) -> "Validate":
@@ -128,6 +133,13 @@ def make_validation(suite: str, scenes: int) -> "Validate":
     from unirender_evaluation.validation import suite_validation
 
     return suite_validation(suite, scenes)
+
+
+def score_names() -> tuple[str, ...]:
+    """Names of the scores that `make_validation` gives."""
+    from unirender_evaluation.validation import SCORES
+
+    return SCORES
 
 
 def predict_maps(image_srgb: "np.ndarray", mask: "np.ndarray", camera: "Camera") -> "Intrinsics":
@@ -153,7 +165,7 @@ def run(command: Any) -> int:
     if isinstance(command, Render | Relight):
         return command.run(read_light)
     if isinstance(command, Train):
-        return command.run(make_validation)
+        return command.run(make_validation, score_names)
     if isinstance(command, Optimize):
         return command.run(predict_maps)
     return command.run()

@@ -1,5 +1,6 @@
 """The shipped truth of the tiny suite: noise ceilings, the EXR contract, and Mitsuba's second opinion."""
 
+import hashlib
 import io
 import re
 
@@ -10,6 +11,8 @@ import pytest
 from unirender.color import image_srgb, unpremultiply
 from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
 from unirender_evaluation.metrics import psnr
+from unirender_evaluation.suite_lights import assign_lights, light_sources
+from unirender_evaluation.suite_objects import suite_sources
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import quality_summary
 from unirender_evaluation.truth_check import _check_image, chosen_scenes, member_test
@@ -48,6 +51,20 @@ def test_shipped_truth_reaches_its_noise_ceiling(tiny: Suite) -> None:
         assert row["min_db"] >= 45
         assert row["share_below_target"] == 0
     assert tiny.spec.truth_path.stat().st_size < 12e6
+
+
+def test_the_suite_is_the_one_that_earlier_results_scored(tiny: Suite) -> None:
+    """Content keys hold the scenes' hashes, so that records of earlier versions stay comparable; and the rules that
+    give scenes their lights, turns and materials still give the shipped ones."""
+    assert tiny.sha256 == "f14c67def87195c07cf63786d863478089f581b9badf3ea225732e60c6657590"
+    hashes = "".join(tiny.scene_hash(scene) for scene in tiny.scenes)
+    assert hashlib.sha256(hashes.encode()).hexdigest() == (
+        "08ad56839e43871f37556b3590523057c94af14d6b9859ee21db7bb411f4175d"
+    )
+    sources, lights = suite_sources(tiny.spec), list(light_sources(tiny.spec))
+    assert [source.name for source in sources] == [row["seed"] for row in tiny.provenance["objects"].values()]
+    assert assign_lights(tiny.spec, lights, len(sources)) == [(s.light, s.turn_columns) for s in tiny.scenes]
+    assert tiny.spec.materials() == [list(scene.materials) for scene in tiny.scenes]
 
 
 def test_stated_ceilings_follow_from_what_is_stored(tiny: Suite) -> None:

@@ -64,7 +64,7 @@ def test_changed_truth_is_refused(tmp_path: Path) -> None:
 
 
 def test_broken_suite_files_are_named(tmp_path: Path) -> None:
-    with pytest.raises(UnirenderError, match="expected one of tiny"):
+    with pytest.raises(UnirenderError, match="expected one of paper, standard, tiny, or"):
         suite_path("no-such-suite")
     with pytest.raises(UnirenderError, match="no suite file"):
         read_spec(tmp_path / "none.toml")

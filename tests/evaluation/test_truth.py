@@ -7,15 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from PIL import Image
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
 from unirender_evaluation.ceiling import similarity_ceiling
 from unirender_evaluation.scoring import score_image
-from unirender_evaluation.suites import load_suite, read_spec, suite_path
+from unirender_evaluation.suite_objects import file_sha256, scene_object
+from unirender_evaluation.suites import Suite, load_suite, read_spec, suite_path
 from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
+from unirender_evaluation.truth_object import object_hash
 from unirender_evaluation.truth_render import good_spp, render_to_ceiling, stored_ceiling_db
 from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
 
@@ -111,7 +115,7 @@ def test_similarity_ceiling_lies_between_a_noisy_render_and_a_perfect_score(tmp_
 def test_the_hash_is_written_however_the_line_is_set(line: str, tmp_path: Path) -> None:
     path = tmp_path / "suite.toml"
     path.write_text(f'[truth]\nfile = "it.tar"\n{line}\n# sha256 = "a comment"\n')
-    text = with_sha256(path, "new")
+    text = with_sha256(path.read_text(), path, "new")
     assert tomllib.loads(text) == {"truth": {"file": "it.tar", "sha256": "new"}}
     assert text == path.read_text().replace("'old'", '"old"').replace("old", "new")
 
@@ -121,7 +125,7 @@ def test_a_suite_whose_hash_cannot_be_written_is_refused(body: str, count: int, 
     path = tmp_path / "suite.toml"
     path.write_text(body)
     with pytest.raises(UnirenderError, match=rf"suite.toml: got {count} lines like .* expected exactly one"):
-        with_sha256(path, "new")
+        with_sha256(body, path, "new")
 
 
 def test_nothing_is_rendered_for_a_suite_whose_hash_cannot_be_written(tmp_path: Path) -> None:
@@ -180,3 +184,61 @@ def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) 
     list(make_truth(path, tmp_path / "work", workers=1))
     assert len(list((tmp_path / "work").glob("*/*.tar"))) == 2
     assert (tmp_path / "mini.tar").read_bytes() != first
+
+
+@pytest.mark.slow
+def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: Path) -> None:
+    """Two GLB files and two PNG at 16 px: the truth names what it was made of, its hash follows the files' content, and
+    rows that are told the shape read it again."""
+    models, lights = tmp_path / "models", tmp_path / "lights"
+    models.mkdir()
+    lights.mkdir()
+    trimesh.creation.icosphere(1).export(models / "ball.glb")
+    trimesh.creation.box((1, 1, 0.5)).export(models / "box.glb")
+    rng = np.random.default_rng(0)
+    for name in ("dawn", "dusk"):
+        Image.fromarray(rng.integers(0, 256, (16, 24, 3), np.uint8)).save(lights / f"{name}.png")
+    text = suite_path("paper").read_text()
+    changes = {
+        "resolution": "16",
+        "light_rows": "8",
+        "per_scene": "1",
+        "spp": "32",
+        "light_spp": "32",
+        "target_db": "28.0",
+        "light_target_db": "28.0",
+    }
+    for name, value in changes.items():
+        text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    (tmp_path / "small.toml").write_text(text)
+
+    def make(out: str) -> Suite:
+        folders = {"objects": models, "lights": lights, "out": tmp_path / out}
+        assert len(list(make_truth(tmp_path / "small.toml", tmp_path / "work", 2, **folders))) == 2
+        return load_suite(tmp_path / out / "paper.toml")
+
+    suite = make("first")
+    assert (tmp_path / "small.toml").read_text() == text, "the suite that is copied stays as it is"
+    assert suite.spec.folder("objects") == models
+    made = suite.provenance["objects"]
+    assert [row["file"] for row in made.values()] == ["ball.glb", "box.glb"]
+    assert [row["file_sha256"] for row in made.values()] == [file_sha256(models / n) for n in ("ball.glb", "box.glb")]
+    assert sorted(row["file"] for row in suite.provenance["lights"].values()) == ["dawn.png", "dusk.png"]
+    assert str(tmp_path) not in suite._member("suite.json").decode()
+    assert [scene.family for scene in suite.scenes] == ["mesh"] * 4
+    assert all(len({s.light for s in pair}) == 2 for pair in (suite.scenes[:2], suite.scenes[2:]))
+    for scene in suite.scenes:
+        maps = suite.intrinsics(scene, suite.spec.base).require("albedo", "specular", "diffuse")
+        assert 0.1 < suite.mask(scene).mean() < 0.9
+        assert all(maps[name].max() > 0.01 for name in maps)
+        assert object_hash(scene_object(suite, scene)) == made[scene.object]["sha256"]
+    assert quality_summary(suite)["image"]["min_db"] >= 28
+
+    assert make("again").sha256 == suite.sha256, "equal files give equal bytes"
+    (part,) = (tmp_path / "work").glob("*/ball-*.tar")
+    before = part.stat().st_mtime_ns
+    trimesh.creation.box((1, 1, 0.6)).export(models / "box.glb")
+    assert make("other").sha256 != suite.sha256
+    assert part.stat().st_mtime_ns == before, "what did not change is not rendered again"
+    with pytest.raises(UnirenderError, match=r"box\.glb is another file than the truth was rendered from"):
+        scene_object(suite, suite.scenes[2])

@@ -1,0 +1,127 @@
+"""Where the truth of a suite lies, and its TOML file with the folders and the hash that belong to it.
+
+A suite that ships without its truth (`standard`, `paper`) is a definition: `bench truth` writes a copy of its TOML file
+that names the folders it was made from and the truth's hash, and the truth beside it. By name, that copy is looked for
+in `${UNIRENDER_CACHE}/suites/NAME`; elsewhere (`--out`) it is any suite of its own, by the path of its file.
+"""
+
+import json
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from unirender.errors import UnirenderError
+from unirender.paths import cache_dir
+from unirender_evaluation.suite_spec import SuiteSpec, is_bundled, parse_spec, read_spec, read_text, suite_path
+
+TABLE = re.compile(r"^[ \t]*\[", re.MULTILINE)
+
+
+def home(name: str) -> Path:
+    """The copy of a bundled suite's TOML file that `bench truth NAME` writes."""
+    return cache_dir() / "suites" / name / f"{name}.toml"
+
+
+def ships_truth(spec: SuiteSpec) -> bool:
+    """Whether a bundled suite comes with its truth: its file then has the hash."""
+    return bool(spec.truth_sha256)
+
+
+def found_spec(name_or_path: str | Path) -> SuiteSpec:
+    """A suite's file with a truth: of a bundled suite without one the copy that was made here.
+
+    Raises:
+        UnirenderError: as `read_spec`; or that copy is not there, or of another version of the suite.
+    """
+    spec = read_spec(name_or_path)
+    if not is_bundled(spec.path) or ships_truth(spec):
+        return spec
+    path = home(spec.name)
+    if not path.is_file():
+        raise UnirenderError(f"suite {spec.name!r} has no truth here: make it once with {truth_command(spec)}")
+    made = read_spec(path)
+    if definition(made) != definition(spec):
+        raise UnirenderError(
+            f"the truth in {path.parent} is of another version of suite {spec.name!r}: make it anew with "
+            f"{truth_command(spec)}, or use it by its path"
+        )
+    return made
+
+
+def definition(spec: SuiteSpec) -> SuiteSpec:
+    """What a suite's file says but for the place of its folders and the hash of its truth."""
+    return replace(spec, objects_folder="", lights_folder="", objects_from="", lights_from="", truth_sha256="")
+
+
+def truth_command(spec: SuiteSpec) -> str:
+    """The command that makes a suite's truth, how long that takes, and where to get what it needs."""
+    asked = ""
+    if spec.meshes and not spec.objects_folder:
+        asked += " --objects FOLDER"
+    if spec.light_files is not None and not spec.lights_folder:
+        asked += " --lights FOLDER"
+    name = spec.name if is_bundled(spec.path) else spec.path
+    sources = [
+        f"{what}: {where}"
+        for what, where, needed in (
+            ("objects", spec.objects_from, bool(spec.meshes) and not spec.objects_folder),
+            ("lights", spec.lights_from, spec.light_files is not None and not spec.lights_folder),
+        )
+        if where and needed
+    ]
+    cost = f", which takes {spec.truth_cost}" if spec.truth_cost else ""
+    return f"`unirender bench truth {name}{asked}`{cost}" + (f" ({'; '.join(sources)})" if sources else "")
+
+
+def target(
+    name_or_path: str | Path, out: Path | None = None, objects: Path | None = None, lights: Path | None = None
+) -> tuple[SuiteSpec, str]:
+    """The suite that a truth is made of, and the text of its TOML file, whose place is the spec's `path`.
+
+    Args:
+        name_or_path: of the suite.
+        out: folder for the TOML file and the truth. None: `home` of a bundled suite that ships without its truth; the
+            folder of any other.
+        objects, lights: folders in place of those that the file names.
+
+    Raises:
+        UnirenderError: as `read_spec`; a folder that is not there or that the suite has no use for.
+    """
+    source = suite_path(name_or_path)
+    text = read_text(source)
+    spec = parse_spec(text, source)
+    path = source
+    if out is not None:
+        path = out / f"{spec.name}.toml"
+    elif is_bundled(source) and not ships_truth(spec):
+        path = home(spec.name)
+    uses = {"objects": bool(spec.meshes), "lights": spec.light_files is not None}
+    asked: tuple[tuple[Literal["objects", "lights"], Path | None], ...] = (("objects", objects), ("lights", lights))
+    for kind, given in asked:
+        if given is not None and not uses[kind]:
+            raise UnirenderError(f"--{kind} {given}: suite {spec.name!r} takes no files from a folder of {kind}")
+        if given is not None and not given.expanduser().is_dir():
+            raise UnirenderError(f"--{kind} {given}: no such folder")
+        folder = spec.folder(kind) if given is None else given.expanduser()
+        if folder is not None and (given is not None or path != source):
+            text = with_folder(text, kind, os.path.abspath(folder))
+    return parse_spec(text, path), text
+
+
+def with_folder(text: str, key: str, value: str) -> str:
+    """The text of a TOML file with another value of a key of its table [folders]; comments and layout stay."""
+    text = f"{text.rstrip()}\n"
+    line = f"{key} = {json.dumps(value, ensure_ascii=False)}"  # a JSON string is a TOML string
+    header = re.search(r"^[ \t]*\[folders\][^\n]*\n?", text, re.MULTILINE)
+    if header is None:
+        return f"{text}\n[folders]\n{line}\n"
+    following = TABLE.search(text, header.end())
+    end = following.start() if following else len(text)
+    inner, count = re.subn(
+        rf"^[ \t]*{key}[ \t]*=[^\n]*$", lambda _: line, text[header.end() : end], count=1, flags=re.MULTILINE
+    )
+    if not count:
+        inner = f"{line}\n{text[header.end() : end]}"
+    return text[: header.end()] + inner + text[end:]

@@ -1,0 +1,320 @@
+"""Suites of files: which meshes and lights a TOML file takes, what is refused, and where made suites are found."""
+
+import hashlib
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from tiny_suites import write_suite
+
+from unirender.cli import main
+from unirender.errors import UnirenderError
+from unirender_evaluation import results_check
+from unirender_evaluation.results_listing import suites as listed_suites
+from unirender_evaluation.stratification import constant_mse
+from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
+from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
+from unirender_evaluation.suite_objects import broken_meshes, file_sha256, scene_object, suite_sources
+from unirender_evaluation.suite_spec import SuiteSpec, parse_spec, read_spec, suite_path
+from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.truth import make_truth
+from unirender_evaluation.truth_file import list_tar, write_tar
+
+MESHES = '\n[folders]\nobjects = "models"\n\n[[meshes]]\nfiles = "*"\n'
+
+
+def write_meshes(folder: Path, names: list[str]) -> None:
+    """Boxes of different sides."""
+    for number, name in enumerate(names):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trimesh.creation.box((1, 1, 0.5 + 0.2 * number)).export(path)
+
+
+def write_pictures(folder: Path, count: int) -> None:
+    """Grey noise as PNG: light pictures."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        Image.fromarray(rng.integers(0, 256, (16, 24, 3), np.uint8)).save(folder / f"{number}.png")
+
+
+def spec_with(folder: Path, more: str, **changes: str) -> SuiteSpec:
+    """The tiny suite's file with other values and further tables, in a folder."""
+    text = suite_path("tiny").read_text()
+    for name, value in changes.items():
+        text, count = re.subn(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+        assert count == 1, name
+    return parse_spec(text + more, folder / "my.toml")
+
+
+def test_standard_is_a_third_real_and_its_constant_scores_a_tenth() -> None:
+    """What the suite promises: 100 objects, unseen by tiny, stratified materials, every light about equally often."""
+    spec = read_spec("standard")
+    meshes = sum(group.count or 0 for group in spec.meshes)
+    assert len(spec.objects) + meshes == 100
+    assert meshes >= 34
+    assert spec.split == "test"
+    assert spec.resolution == 128
+    assert not set(spec.objects) & set(read_spec("tiny").objects)
+    for mse in constant_mse(spec.materials(meshes)):
+        assert mse == pytest.approx(0.1, abs=0.002)
+    names = list(light_sources(spec))
+    assert len(names) == spec.bundled_lights + len(spec.procedural_lights)
+    assigned = assign_lights(spec, names, 100)
+    counts = [sum(light == name for light, _ in assigned) for name in names]
+    assert max(counts) - min(counts) <= 1
+    assert all(first[0] != second[0] for first, second in zip(assigned[::2], assigned[1::2], strict=True))
+
+
+def test_paper_takes_every_file_of_two_folders(tmp_path: Path) -> None:
+    spec = read_spec("paper")
+    assert (spec.resolution, spec.objects, spec.bundled_lights, spec.procedural_lights) == (1024, (), 0, ())
+    write_meshes(tmp_path / "models", ["b.glb", "a/c.glb"])
+    write_pictures(tmp_path / "lights", 3)
+    spec, text = target("paper", tmp_path / "out", tmp_path / "models", tmp_path / "lights")
+    assert spec.path == tmp_path / "out" / "paper.toml"
+    assert parse_spec(text, spec.path) == spec
+    assert [source.name for source in suite_sources(spec)] == ["b.glb", "a/c.glb"]
+    assert len(light_sources(spec)) == 3
+    assert definition(spec) == definition(read_spec("paper"))
+
+
+@pytest.mark.parametrize("lights", [2, 3, 5])
+def test_lights_of_an_object_differ_whatever_their_number(lights: int) -> None:
+    """Three lights for two of each object: a draw of all scenes at once would hardly ever succeed."""
+    names = [f"light-{i}" for i in range(lights)]
+    assigned = assign_lights(read_spec("tiny"), names, 100)
+    assert all(a[0] != b[0] for a, b in zip(assigned[::2], assigned[1::2], strict=True))
+    counts = [sum(light == name for light, _ in assigned) for name in names]
+    assert max(counts) - min(counts) <= 1
+
+
+def test_meshes_are_drawn_by_pattern_split_and_seed(tmp_path: Path) -> None:
+    """Every 3rd of a pattern for the test split, the others for the training split; a draw is a pure function of its
+    seed, and other seeds give other files."""
+    names = [f"a/{i:02d}.obj" for i in range(12)] + [f"b/{i:02d}.obj" for i in range(4)]
+    write_meshes(tmp_path / "models", names)
+
+    def chosen(group: str, **changes: str) -> list[str]:
+        more = f'\n[folders]\nobjects = "models"\n[[meshes]]\n{group}\n'
+        spec = spec_with(tmp_path, more, objects="[]", ceiling_scenes="[]", **changes)
+        return [str(source.name) for source in suite_sources(spec)]
+
+    assert chosen('files = "a/*"\nholdout = 3') == [f"a/{i:02d}.obj" for i in (2, 5, 8, 11)]
+    assert set(chosen('files = "a/*"\nholdout = 3', split='"train"')) == set(names[:12]) - set(
+        chosen('files = "a/*"\nholdout = 3')
+    )
+    assert chosen('files = "b/*"\nwithout = ["b/01.obj"]') == ["b/00.obj", "b/02.obj", "b/03.obj"]
+    draws = {tuple(chosen(f'files = "a/*"\ncount = 4\nseed = {seed}')) for seed in (0, 0, 1, 2)}
+    assert len(draws) == 3
+    assert all(len(set(draw)) == 4 and list(draw) == sorted(draw) for draw in draws)
+
+
+def test_objects_are_counted_together_and_twins_are_named_by_path(tmp_path: Path) -> None:
+    write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
+    spec = spec_with(tmp_path, MESHES, objects="[7]", ceiling_scenes='[[7, 0], ["b.obj", 1]]')
+    sources = suite_sources(spec)
+    assert [source.name for source in sources] == [7, "a.obj", "b.obj"]
+    assert len(spec.materials(2)) == 6
+    obj = sources[1].load()
+    assert obj.name.startswith("a-")
+    assert obj.roughness is None
+    assert sources[0].provenance() == {"seed": 7}
+    assert sources[1].provenance() == {"file": "a.obj", "file_sha256": file_sha256(tmp_path / "models" / "a.obj")}
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ('[[meshes]]\nfiles = "*"\n', r"needs a folder of meshes: name it with --objects FOLDER"),
+        (MESHES + "count = 5\n", r"got 2 files, expected 5"),
+        (MESHES + 'without = ["c.obj"]\n', r"`without` has c.obj, expected some of the 2 files"),
+        (MESHES + '[[meshes]]\nfiles = "a*"\n', r"the same mesh in two groups: a.obj"),
+        (
+            MESHES.replace('"*"', '"x*"') + '[[meshes]]\nfiles = "y*"\n',
+            r"'x\*' in .*got 0 files.*; meshes 'y\*' in .*got 0 files",
+        ),
+    ],
+)
+def test_what_a_folder_lacks_is_said_all_at_once(more: str, message: str, tmp_path: Path) -> None:
+    write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
+    with pytest.raises(UnirenderError, match=message):
+        suite_sources(spec_with(tmp_path, more))
+
+
+@pytest.mark.parametrize(
+    ("more", "changes", "messages"),
+    [
+        ("", {"resolution": '"64"', "batches": "2"}, ["resolution is '64', expected", "batches is 2, expected"]),
+        ("", {"lights_per_object": "1"}, ["lights_per_object is 1, expected at least 2"]),
+        ("", {"edits": "[[1.0, 0.1]]"}, ["differ from the base in one of"]),
+        ("", {"name": '"../x"'}, ["name is '../x'"]),
+        ("", {"objects": "[]"}, ["it has no objects"]),
+        ("[[meshes]]\ncount = 0\nfile = 1\n", {}, ["meshes[0] has unknown keys ['file']", "meshes[0].count is 0"]),
+        ("[light_files]\nholdout = 1\n", {}, ["light_files.holdout is 1, expected 0 (all files) or at least 2"]),
+        ("[folders]\nobject = 1\n", {}, ["unknown keys ['object']"]),
+    ],
+)
+def test_every_wrong_value_is_named(more: str, changes: dict[str, str], messages: list[str], tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError) as error:
+        spec_with(tmp_path, more, **changes)
+    assert all(message in str(error.value) for message in messages), str(error.value)
+
+
+def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) -> None:
+    """All of them at once, before anything is rendered; the good one is not among them."""
+    write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
+    (tmp_path / "models" / "a.obj").write_text("v 0 0 0\n")
+    (tmp_path / "models" / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nf 1 2 3\n")
+    spec = spec_with(tmp_path, MESHES, objects="[]", ceiling_scenes="[]", resolution="16")
+    reasons = list(broken_meshes(suite_sources(spec), spec))
+    assert [reason.partition(":")[0] for reason in reasons] == ["a.obj", "flat.obj"]
+    assert "has no faces" in reasons[0]
+    assert "covers no pixel" in reasons[1]
+    assert str(tmp_path) not in "".join(reasons)
+    spec.path.write_text(suite_path("tiny").read_text() + MESHES)
+    with pytest.raises(UnirenderError, match=r"(?s)2 of its meshes cannot be used.*a\.obj.*flat\.obj"):
+        next(make_truth(spec.path, tmp_path / "work"))
+    assert not (tmp_path / "work").exists()
+    assert not list(tmp_path.glob("*.tar"))
+
+    write_pictures(tmp_path / "lights", 3)
+    (tmp_path / "lights" / "1.png").write_bytes(b"no picture")
+    (tmp_path / "lights" / "2.png").write_bytes(b"")
+    spec = spec_with(tmp_path, '[folders]\nlights = "lights"\n[light_files]\n', bundled_lights="0")
+    pool = light_sources(spec)
+    with pytest.raises(UnirenderError, match=r"(?s)2 of its lights cannot be read.*1\.png.*2\.png"):
+        load_lights(spec, list(pool), pool)
+    (good,) = (name for name in pool if name.startswith("0-"))
+    light = load_lights(spec, [good], pool)[good]
+    assert light.environment.shape == (64, 128, 3)
+    assert light.provenance["file"] == "0.png"
+    assert light.provenance["file_sha256"] == file_sha256(tmp_path / "lights" / "0.png")
+    assert light.provenance["rule"].startswith("photograph")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'name = "x"',
+        'name = "x"\n[folders]',
+        'name = "x"\n[folders]   # of files\nlights = "l"\n\n[[meshes]]\nobjects = "no"\n',
+        'name = "x"\n[folders]\n  objects = "old"  # mine\nobjects_from = "there"\n[truth]\nobjects = "no"\n',
+    ],
+)
+def test_a_folder_is_written_into_the_table_of_folders(text: str) -> None:
+    import tomllib
+
+    changed = with_folder(text, "objects", 'C:\\a "b"')
+    before, after = tomllib.loads(text), tomllib.loads(changed)
+    assert after == before | {"folders": before.get("folders", {}) | {"objects": 'C:\\a "b"'}}
+    assert all(line in changed for line in text.splitlines() if "objects =" not in line)
+
+
+def mesh_suite(folder: Path) -> Suite:
+    """The closed-form suite of two scenes, whose first object says that it is a file."""
+    write_meshes(folder / "models", ["a.obj"])
+    path = write_suite(folder)
+    suite = load_suite(path)
+    provenance = suite.provenance
+    made = {"file": "a.obj", "file_sha256": file_sha256(folder / "models" / "a.obj"), "sha256": "none"}
+    provenance["objects"]["ball-0"] = made
+    members = {**list_tar(folder / "ball.tar"), "suite.json": json.dumps(provenance).encode()}
+    write_tar(folder / "ball.tar", members)
+    digest = hashlib.sha256((folder / "ball.tar").read_bytes()).hexdigest()
+    path.write_text(path.read_text().replace(suite.sha256, digest) + MESHES)
+    return load_suite(path)
+
+
+def test_the_true_shape_of_a_mesh_is_read_again_or_refused(tmp_path: Path) -> None:
+    suite = mesh_suite(tmp_path)
+    scene, mesh = suite.scenes[0], tmp_path / "models" / "a.obj"
+    obj = scene_object(suite, scene)
+    assert len(obj.faces) == 12
+    assert obj.name.startswith("a-")
+    assert scene_object(suite, suite.scenes[-1]).family != "mesh"
+    original = mesh.read_bytes()
+    mesh.write_bytes(original + b"# changed\n")
+    with pytest.raises(UnirenderError, match=r"a\.obj is another file than the truth was rendered from"):
+        scene_object(suite, scene)
+    mesh.unlink()
+    with pytest.raises(UnirenderError, match=r"its mesh a\.obj is not in .*models; name the folder"):
+        scene_object(suite, scene)
+    unnamed = replace(suite.spec, objects_folder="")
+    suite.spec = unnamed
+    with pytest.raises(UnirenderError, match=r"its mesh a\.obj is not in any folder"):
+        scene_object(suite, scene)
+
+
+def test_a_suite_without_its_truth_says_how_to_make_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One sentence with command, time and source of the files; no smaller suite in its place; once made, the name
+    finds it; another version of the suite is not taken for it."""
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    spec = read_spec("standard")
+    with pytest.raises(UnirenderError) as error:
+        load_suite("standard")
+    said = str(error.value)
+    assert "`unirender bench truth standard --objects FOLDER`" in said
+    assert spec.truth_cost in said
+    assert "apt-get download" in said
+    assert any(said in line for line in listed_suites())
+    assert results_check.installed_suite_hash("standard") is None
+
+    (tmp_path / "models").mkdir()
+    made, text = target("standard", objects=tmp_path / "models")
+    assert made.path == home("standard")
+    assert made.folder("objects") == tmp_path / "models"
+    made.path.parent.mkdir(parents=True)
+    made.path.write_text(text.replace('sha256 = ""', f'sha256 = "{"0" * 64}"'))
+    assert found_spec("standard").path == made.path
+    assert results_check.installed_suite_hash("standard") == "0" * 64
+    with pytest.raises(UnirenderError, match=re.escape(f"has no truth file {made.truth_path}")):
+        load_suite("standard")
+
+    made.path.write_text(text.replace("target_db = 45.0", "target_db = 30.0"))
+    with pytest.raises(UnirenderError, match=r"of another version of suite 'standard'.*bench truth standard"):
+        load_suite("standard")
+    assert results_check.installed_suite_hash("standard") is None
+
+
+def test_folders_are_refused_where_they_are_not_used_or_not_there(tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match="suite 'tiny' takes no files from a folder of objects"):
+        target("tiny", objects=tmp_path)
+    with pytest.raises(UnirenderError, match=r"--lights .*: no such folder"):
+        target("paper", lights=tmp_path / "none")
+    assert "--objects" not in truth_command(read_spec("tiny"))
+
+
+def test_a_truth_that_changes_while_it_is_read_is_noticed(tmp_path: Path) -> None:
+    suite = load_suite(write_suite(tmp_path))
+    first = suite.members[0]
+    suite.read(first)
+    (tmp_path / "ball.tar").write_bytes((tmp_path / "ball.tar").read_bytes() + bytes(512))
+    with pytest.raises(UnirenderError, match="was replaced while it was in use"):
+        suite.read(first)
+
+
+def test_the_command_refuses_in_a_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No folder, no such suite: 1; an option that no file makes right: 2. No traceback, nothing written."""
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    for words, status, said in (
+        (["standard"], 1, "needs a folder of meshes: name it with --objects FOLDER"),
+        (["paper", "--objects", str(tmp_path)], 1, "no mesh found"),
+        (["none"], 1, "no suite 'none'"),
+        (["standard", "--workers", "0"], 2, "expected at least 1"),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(["bench", "truth", *words])
+        error = capsys.readouterr().err
+        assert stopped.value.code == status
+        assert said in error
+        assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
