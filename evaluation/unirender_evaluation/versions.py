@@ -128,6 +128,7 @@ NOT_IN_RECORDS = (
     "plan",
     "principled",
     "processes",
+    "recipe",
     "resume",
     "shards",
     "sheets",
@@ -165,7 +166,11 @@ PARTS: Mapping[str, Part] = {
             "unirender_evaluation": tuple(f"{name}.py" for name in MITSUBA_ROW),
         },
         ("mitsuba", "drjit", "karellen-llvm-core"),
-        ("*/LICENSES.txt", *(f"unirender_reference/{name}.py" for name in NOT_IN_RECORDS)),
+        (
+            "*/LICENSES.txt",
+            "unirender_reference/data/recipes/*",
+            *(f"unirender_reference/{name}.py" for name in NOT_IN_RECORDS),
+        ),
         ("UNIRENDER_MITSUBA_VARIANT",),
     ),
     OPTIMIZER: Part(

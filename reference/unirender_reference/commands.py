@@ -1,7 +1,7 @@
 """`unirender dataset`. Light to import: what renders is loaded when the command runs."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -27,7 +27,12 @@ class Dataset:
     """
 
     out: Path
-    """Folder for the shards and `manifest.json`."""
+    """Folder for the shards and `manifest.json`; of a recipe, for a folder of each part."""
+    recipe: str | None = None
+    """A training set in parts: train-64, train-128, or a TOML file. It takes the place of all options but
+    --assets, --workers, --cluster and --verify."""
+    assets: Path | None = None
+    """Folder of the mesh and light folders that a recipe names."""
     objects: int | None = None
     """How many objects. None: 20 procedural ones, or all meshes."""
     meshes: str | None = None
@@ -118,8 +123,42 @@ class Dataset:
         except UnirenderError as error:
             raise UsageError(str(error)) from error
 
+    def parts(self) -> dict[str, "Dataset"]:
+        """The data sets of a recipe, by name.
+
+        Raises:
+            UsageError: an option beside the recipe that it decides, or one of its own that is refused.
+            UnirenderError: no such recipe, a broken one, or folders that it names are not there.
+        """
+        from unirender_reference.recipe import read_recipe
+
+        assert self.recipe is not None
+        kept = {"out", "recipe", "assets", "workers", "cluster", "verify"}
+        given = [f.name for f in fields(self) if f.name not in kept and getattr(self, f.name) != f.default]
+        if given:
+            raise UsageError(
+                f"--{given[0].replace('_', '-')}: got it beside --recipe, which decides it; expected none; copy the "
+                "recipe, change it, and pass its path"
+            )
+        recipe = read_recipe(self.recipe)
+        machine = {"workers": self.workers, "cluster": self.cluster, "verify": self.verify}
+        made = {}
+        for name, options in recipe.options(self.assets).items():
+            if "lights" in options:
+                options["lights"] = Path(options["lights"])
+            made[name] = Dataset(out=self.out / name, **machine, **options)
+            try:
+                made[name].check()
+            except UsageError as error:
+                raise UsageError(f"{recipe.path}, part {name}: {error}") from error
+        return made
+
     def run(self) -> int:
         """Renders what is missing; returns the exit status: 1 if mesh files failed, now or earlier."""
+        if self.recipe is not None:
+            return max([part.run() for part in self.parts().values()])
+        if self.assets is not None:
+            raise UsageError("--assets: got it without --recipe, expected a recipe that names folders in it")
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -135,7 +135,7 @@ def test_the_command_trains_on_runs_where_the_preset_says_so(tmp_path: Path) -> 
     data = write_dataset(tmp_path / "data")
     options = Train(data, preset="tiny_one_at_a_time", out=tmp_path / "run", steps=1, device="cpu", parallel=1)
     with pytest.raises(UnirenderError, match="expected one-at-a-time"):
-        options.run(lambda suite, count: pytest.fail(f"nothing is scored: {suite}, {count}"))
+        options.run(lambda suite, count: pytest.fail(f"nothing is scored: {suite}, {count}"), tuple)
 
 
 @pytest.mark.parametrize("pairs", [24, 121])

@@ -273,6 +273,26 @@ def test_a_growing_folder(folder: Path, dataset: GroupDataset, tmp_path: Path) -
     assert torch.equal(samples(same, 1, start=3)[0], samples(dataset, 1, start=3)[0])
 
 
+def test_a_training_set_in_parts(folder: Path, dataset: GroupDataset, tmp_path: Path) -> None:
+    """Its shards are named by part and file; a part that was just begun does not count yet."""
+    whole = tmp_path / "whole"
+    shutil.copytree(folder, whole / "chairs")
+    extra = {"train-000099_g0": group_members("basis", 16, 2, (40, 70), (0, 50, 100), 99)}
+    (whole / "balls").mkdir()
+    write_shard(whole / "balls" / "shard-000000.tar", extra)
+    (whole / "begun").mkdir()
+    (whole / "begun" / "manifest.json").write_text(json.dumps({"shards": []}))
+    parts = GroupDataset(whole)
+    assert parts.shard_names == ("balls/shard-000000.tar", *(f"chairs/{name}" for name in dataset.shard_names))
+    assert len(parts) == len(dataset) + 1
+    chairs = GroupDataset(whole, shards=parts.shard_names[1:])
+    assert chairs.fingerprint == dataset.fingerprint
+    assert torch.equal(samples(chairs, 1, start=3)[0], samples(dataset, 1, start=3)[0])
+    (whole / "chairs" / dataset.shard_names[0]).unlink()
+    with pytest.raises(UnirenderError, match=r"chairs: shards .* of the manifest are missing"):
+        GroupDataset(whole)
+
+
 def test_packing_happens_once(folder: Path, dataset: GroupDataset) -> None:
     packed = sorted((cache_dir() / "packed").iterdir())
     stamps = [path.stat().st_mtime_ns for path in packed]

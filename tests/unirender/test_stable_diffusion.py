@@ -443,7 +443,7 @@ def test_training_from_the_folder_to_a_pipeline_that_decomposes(
     assert [entry.get("steps") for entry in facts["continues"]] == [None, 3]
     assert (second / "pipeline" / "vae" / WEIGHTS[VAE]).is_file()
     with pytest.raises(UnirenderError, match="its network has the codec kl, expected pixel; choose the preset"):
-        Train(data=data, preset="tiny", init=run / "pipeline", out=tmp_path / "third").run(no_validation)
+        Train(data=data, preset="tiny", init=run / "pipeline", out=tmp_path / "third").run(no_validation, tuple)
 
 
 def no_validation(suite: str, scenes: int) -> Any:

@@ -71,23 +71,24 @@ class GroupDataset:
         """Opens a folder; shards not used before are decoded once.
 
         Args:
-            folder: as written by `unirender dataset`; it may still be growing.
+            folder: as written by `unirender dataset`, with or without a recipe; it may still be growing.
             shards: names of the shards to use; None: all that are complete. A resumed training passes `shard_names` of
                 the interrupted one, so that a folder that grew in between gives the same stream.
             progress: called with (shards opened, shards in all).
         """
         self.folder = Path(folder)
         available = list_shards(self.folder)
+        names = {path: path.relative_to(self.folder).as_posix() for path in available}
         if shards is not None:
-            missing = sorted(set(shards) - {path.name for path in available})
+            missing = sorted(set(shards) - set(names.values()))
             if missing:
                 raise UnirenderError(
                     f"{folder}: shards {', '.join(missing)} are missing, expected all of {', '.join(shards)}"
                 )
-            available = {path: sha256 for path, sha256 in available.items() if path.name in shards}
+            available = {path: sha256 for path, sha256 in available.items() if names[path] in shards}
         self.shards: list[Shard] = []
         for path, sha256 in available.items():
-            self.shards.append(open_packed(path, sha256))
+            self.shards.append(open_packed(path, sha256, names[path]))
             if progress is not None:
                 progress(len(self.shards), len(available))
         sizes = {shard.shared.shape[-2:] for shard in self.shards}

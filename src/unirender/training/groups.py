@@ -87,13 +87,32 @@ class Shard:
 def list_shards(folder: str | Path) -> dict[Path, str | None]:
     """The complete shards of a data folder in order of name, each with the sha256 the manifest gives, if it lists it.
 
-    Works while shards are still being written: a shard gets its `.tar` name when it is complete. A shard in which every
-    mesh file failed, so that the manifest gives it no groups, is left out.
+    The folder has shards itself, or is a training set in parts: its folders have them. Works while shards are still
+    being written: a shard gets its `.tar` name when it is complete. A shard in which every mesh file failed, so that
+    the manifest gives it no groups, is left out.
 
     Raises:
         UnirenderError: there is none, or one that the manifest lists is missing.
     """
     folder = Path(folder)
+    parts = [folder] if _is_data(folder) else sorted(part for part in folder.glob("*/") if _is_data(part))
+    found = {path: sha256 for part in parts for path, sha256 in _own_shards(part).items()}
+    if not found:
+        kind = "only shards without groups" if any(any(part.glob("*.tar")) for part in parts) else "no .tar shard found"
+        raise UnirenderError(f"{folder}: {kind}, expected a folder written by `unirender dataset`")
+    return found
+
+
+def _is_data(folder: Path) -> bool:
+    return (folder / "manifest.json").exists() or any(folder.glob("*.tar"))
+
+
+def _own_shards(folder: Path) -> dict[Path, str | None]:
+    """Those that lie in the folder itself.
+
+    Raises:
+        UnirenderError: a broken manifest, or one that lists a shard that is missing.
+    """
     listed: dict[str, str] = {}
     empty: set[str] = set()
     manifest = folder / "manifest.json"
@@ -109,9 +128,6 @@ def list_shards(folder: str | Path) -> dict[Path, str | None]:
     missing = sorted(set(listed) - set(present))
     if missing:
         raise UnirenderError(f"{folder}: shards {', '.join(missing)} of the manifest are missing; remake the dataset")
-    if not present or empty.issuperset(present):
-        found = "only shards without groups" if present else "no .tar shard found"
-        raise UnirenderError(f"{folder}: {found}, expected a folder written by `unirender dataset`")
     return {path: listed.get(name) for name, path in present.items() if name not in empty}
 
 
@@ -160,12 +176,13 @@ def file_sha256(path: str | Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def open_packed(path: str | Path, sha256: str | None = None) -> Shard:
+def open_packed(path: str | Path, sha256: str | None = None, name: str | None = None) -> Shard:
     """Opens a shard for training, packing it first if that has not been done.
 
     Args:
         path: the tar.
         sha256: its hash as the manifest gives it: verified when the shard is packed, trusted afterwards.
+        name: of the shard in its data folder; the file's if None.
     """
     path = Path(path)
     known = sha256 or file_sha256(path)
@@ -177,13 +194,13 @@ def open_packed(path: str | Path, sha256: str | None = None) -> Shard:
             )
         _pack(path, folder)
     arrays = {}
-    for name in ("pixels", "shared", "environment"):
-        arrays[name] = np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r"))  # a plain view of the memory map
+    for array in ("pixels", "shared", "environment"):
+        arrays[array] = np.asarray(np.load(folder / f"{array}.npy", mmap_mode="r"))  # a plain view of the memory map
     groups = tuple(
         Group(**{**group, "pairs": tuple(Pair(**pair) for pair in group["pairs"])})
         for group in json.loads((folder / "index.json").read_text())
     )
-    return Shard(name=path.name, sha256=known, groups=groups, **arrays)
+    return Shard(name=name or path.name, sha256=known, groups=groups, **arrays)
 
 
 def _pack(path: Path, folder: Path) -> None:
