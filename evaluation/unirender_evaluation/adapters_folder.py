@@ -185,13 +185,13 @@ def folder_sha256(folder: Path) -> str:
 
 
 def load_parts(
-    folder: Path, schedulers: Mapping[str, Any], device: str, dtype: str, **scheduler_changes: Any
+    folder: Path, schedulers: Mapping[str, Any] | type, device: str, dtype: str, **scheduler_changes: Any
 ) -> dict[str, Any]:
     """The parts of a folder by the names that diffusers' pipelines take.
 
     Args:
         folder: of the model.
-        schedulers: classes that it may name, by name.
+        schedulers: classes that it may name, by name; or one that works with its noise schedule whatever it names.
         device: where U-Net, autoencoder and text encoder go.
         dtype: their precision.
         **scheduler_changes: entries of the scheduler's configuration that are others than in the folder.
@@ -207,8 +207,9 @@ def load_parts(
         ) from error
     config = read_json(folder / SCHEDULER, "the scheduler's configuration")
     kind = config.get("_class_name")
-    if kind not in schedulers:
+    if isinstance(schedulers, Mapping) and kind not in schedulers:
         raise UnirenderError(f"{folder / SCHEDULER}: got the scheduler {kind!r}, expected {' or '.join(schedulers)}")
+    scheduler_class: Any = schedulers[str(kind)] if isinstance(schedulers, Mapping) else schedulers
     tokenizer = load_tokenizer(CLIPTokenizer, folder / "tokenizer")
     with silent():
         text_encoder = load_weights(CLIPTextModel, folder / "text_encoder")
@@ -220,5 +221,5 @@ def load_parts(
     if dtype != "float32":  # as they were read
         modules = {name: module.to(getattr(torch, dtype)) for name, module in modules.items()}
     moved = {name: module.to(device) for name, module in modules.items()}
-    scheduler = schedulers[str(kind)].from_config(config, **scheduler_changes)
+    scheduler = scheduler_class.from_config(config, **scheduler_changes)
     return moved | {"tokenizer": tokenizer, "scheduler": scheduler}

@@ -43,6 +43,7 @@ def check_properties(properties: Any, folder: Path) -> None:
     where = f"{folder / 'model_index.json'}: target_properties"
     if not isinstance(properties, dict) or not isinstance(properties.get("target_names"), list):
         raise UnirenderError(f"{where}: got {properties!r}, expected the names and properties of the targets")
+    _check_names(properties, properties["target_names"], where)
     scalars: list[str] = []
     for name in properties["target_names"]:
         space = _space(properties, name)
@@ -52,7 +53,9 @@ def check_properties(properties: Any, folder: Path) -> None:
             names = properties[name].get("sub_target_names")
             if not isinstance(names, list) or len(names) != 3:
                 raise UnirenderError(f"{where}: {name} stacks {names!r}, expected three names, null for none")
-            scalars += [sub for sub in names if sub is not None]
+            stacked = [sub for sub in names if sub is not None]
+            _check_names(properties, stacked, where)
+            scalars += stacked
     for name in scalars:
         if _space(properties, name) not in SPACES[:2]:
             raise UnirenderError(f"{where}: {name} is {_space(properties, name)!r}, expected srgb or linear")
@@ -60,6 +63,18 @@ def check_properties(properties: Any, folder: Path) -> None:
     if not colours and not set(scalars) & set(MAP_NAMES):
         names = ", ".join([*properties["target_names"], *scalars])
         raise UnirenderError(f"{where}: names {names}, expected some of {', '.join(MAP_NAMES)}, shading")
+
+
+def _check_names(properties: Properties, names: list[Any], where: str) -> None:
+    """Looks whether they are names, and what they name are tables.
+
+    Raises:
+        UnirenderError: they are not.
+    """
+    for name in names:
+        if not isinstance(name, str) or not isinstance(properties.get(name, {}), dict):
+            got = properties.get(name) if isinstance(name, str) else name
+            raise UnirenderError(f"{where}: got {got!r} as a target, expected names, each with a table of properties")
 
 
 def decoded_targets(
@@ -99,7 +114,7 @@ def shading_scale(
     targets: Mapping[str, Float[np.ndarray, "h w c"]], properties: Properties, image_linear: Image, mask: Mask
 ) -> float | None:
     """The factor that makes the shading d; None where there is no shading, or nothing to fix its scale by."""
-    if "shading" not in targets:
+    if "shading" not in targets or targets["shading"].shape[-1] != 3:  # a scalar is no light
         return None
     if not _up_to_scale(properties, "shading"):
         return 1.0

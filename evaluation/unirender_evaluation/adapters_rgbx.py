@@ -81,8 +81,7 @@ class RgbToX(FolderMethod):
     @cached_property
     def network(self) -> ConditionedDiffusion:
         """Loaded at the first question."""
-        schedulers = {"DDIMScheduler": DDIMScheduler}
-        return ConditionedDiffusion(**load_parts(self.folder, schedulers, self.device, self.dtype, **SCHEDULE))
+        return ConditionedDiffusion(**load_parts(self.folder, DDIMScheduler, self.device, self.dtype, **SCHEDULE))
 
     def condition(self, image_srgb: Image, mask: Mask) -> tuple[Float[Tensor, "1 c lh lw"], Fit]:
         """The latent of the picture's linear values, and the way back to its size."""

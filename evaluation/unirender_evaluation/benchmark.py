@@ -221,8 +221,10 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
     processes."""
     missing = {scene.key: [job for job in here.jobs(scene) if not job.is_done(store.has)] for scene in here.scenes}
     scenes = [scene for scene in here.scenes if missing[scene.key]]
+    if not scenes:
+        return  # a finished run needs no cluster to write its tables again
     total = sum(map(len, missing.values()))
-    bar = progress.add_task("methods", total=total, visible=total > 0)
+    bar = progress.add_task("methods", total=total)
     if config.cluster is None and (config.jobs == 0 or total <= FEW):
         for job in (job for scene in scenes for job in missing[scene.key]):
             store.add(job.make())

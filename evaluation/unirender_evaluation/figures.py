@@ -5,6 +5,7 @@ enlarged by a whole factor without interpolation, so that every pixel of the sui
 """
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 
 SIDE = 128  # of a cell, pixels, about: the nearest whole multiple of the pictures' own size, and never less than it
 GAP, GROUP_GAP, HEADER, MARGIN = 6, 16, 24, 12
@@ -103,12 +105,10 @@ def draw(grid: Grid) -> Image.Image:
 
 
 def save(grid: Grid, path: Path) -> Path:
-    """Writes the figure as a PNG, by way of a temporary file; returns the path."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
-    draw(grid).save(temporary, format="PNG", optimize=True)
-    temporary.replace(path)
-    return path
+    """Writes the figure as a PNG, complete or not at all; returns the path."""
+    content = BytesIO()
+    draw(grid).save(content, format="PNG", optimize=True)
+    return replace_file(path, content.getvalue())
 
 
 def _paste(

@@ -1,6 +1,7 @@
 """Two traces of one object's mask, albedo and normal, compared within stated tolerances; and wrong maps that the
 comparison has to refuse."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from unirender.intrinsics import Intrinsics
 ALBEDO_TWIN = 1.02
 INSIDE = 0.99  # coverage above which a pixel is not an edge
 FAINT = 0.1  # edges with less coverage hold too few of the samples to compare
+TOLERANCE_SPP = 256  # with fewer samples of a trace tolerances grow as its noise does
 # Largest differences between two traces of the same geometry; three times or more what 24 objects show at 256 samples.
 TOLERANCES: Mapping[str, float] = {
     "mask, mean": 0.004,  # over covered pixels
@@ -28,13 +30,23 @@ TOLERANCES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class GeometryTest:
-    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`."""
+    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`.
+
+    Attributes:
+        differences: their values.
+        factor: of all tolerances.
+    """
 
     differences: Mapping[str, float]
+    factor: float = 1.0
+
+    def tolerance(self, name: str) -> float:
+        """The largest difference of a name that is allowed."""
+        return TOLERANCES[name] * self.factor
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        return tuple(name for name, value in self.differences.items() if not value <= TOLERANCES[name])
+        return tuple(name for name, value in self.differences.items() if not value <= self.tolerance(name))
 
     @property
     def passed(self) -> bool:
@@ -43,11 +55,17 @@ class GeometryTest:
     def __str__(self) -> str:
         worst = max(self.differences, key=lambda name: self.differences[name] / TOLERANCES[name])
         state = "passed" if self.passed else f"FAILED on {', '.join(self.exceeded)}"
-        return f"geometry {state}: {worst} {self.differences[worst]:.4g} (tolerance {TOLERANCES[worst]:g})"
+        return f"geometry {state}: {worst} {self.differences[worst]:.4g} (tolerance {self.tolerance(worst):.2g})"
 
 
-def compare_geometry(stored: Intrinsics, again: Intrinsics) -> GeometryTest:
-    """Compares two traces of mask, albedo and normal: strictly inside, where both cover the pixel, loosely at edges."""
+def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE_SPP) -> GeometryTest:
+    """Compares two traces of mask, albedo and normal: strictly inside, where both cover the pixel, loosely at edges.
+
+    Args:
+        stored: a trace.
+        again: another one.
+        spp: samples per pixel of each.
+    """
     a, b = (maps.require("mask", "albedo", "normal") for maps in (stored, again))
     low, high = (f(a["mask"], b["mask"])[..., 0] for f in (np.minimum, np.maximum))
     inside, edge = low > INSIDE, (low > FAINT) & (low <= INSIDE)
@@ -65,7 +83,8 @@ def compare_geometry(stored: Intrinsics, again: Intrinsics) -> GeometryTest:
         found |= {"albedo edge, mean": albedo[edge].mean(), "normal edge, mean deg": angle[edge].mean()}
     if not found:
         raise UnirenderError("truth check: the object covers no pixel in either trace, expected at least one")
-    return GeometryTest({name: float(value) for name, value in found.items()})
+    factor = math.sqrt(max(1.0, TOLERANCE_SPP / spp))
+    return GeometryTest({name: float(value) for name, value in found.items()}, factor)
 
 
 def twin_geometry(maps: Intrinsics) -> dict[str, Intrinsics]:

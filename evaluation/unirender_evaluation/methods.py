@@ -53,10 +53,12 @@ def capabilities(method: Method) -> tuple[str, ...]:
         UnirenderError: it has none, or no name or config.
     """
     found = tuple(name for name in CAPABILITIES if callable(getattr(method, name, None)))
-    if not found or not isinstance(method, Method):
+    absent = [f"no `{name}`" for name in ("name", "config") if not hasattr(method, name)]
+    absent += [] if found else ["none of the functions"]
+    if absent or not isinstance(method, Method):
         raise UnirenderError(
-            f"{method!r} is not a method: expected a `name`, a `config` and at least one of the functions "
-            f"{', '.join(CAPABILITIES)}"
+            f"{type(method).__name__} is not a method: it has {' and '.join(absent)}; expected a `name`, a `config` "
+            f"and at least one of the functions {', '.join(CAPABILITIES)}"
         )
     return found
 

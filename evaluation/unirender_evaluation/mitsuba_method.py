@@ -70,7 +70,8 @@ class MitsubaScene:
     @cached_property
     def shows_the_truth(self) -> bool:
         """Whether this is the object of the stored truth."""
-        return compare_geometry(self.suite.intrinsics(self.scene, self.suite.spec.base), self.geometry).passed
+        spec = self.suite.spec
+        return compare_geometry(self.suite.intrinsics(self.scene, spec.base), self.geometry, spec.geometry_spp).passed
 
     def maps(self, material: Material) -> Intrinsics:
         """What a perfect decomposition says: traced buffers, the scene's material; no light."""

@@ -29,7 +29,7 @@ from unirender_evaluation.physics_tests import TESTS, PhysicsTest
 from unirender_evaluation.physics_tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
-from unirender_evaluation.suites import Material, Scene, Suite
+from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_render import item_seed
 
 MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
@@ -108,7 +108,7 @@ def _perfect(stage: Stage, *_: object) -> Points:
 
 
 class Sampler:
-    """The materials of a pipeline's samples; a scene's are drawn once, since several tests ask.
+    """The materials of a pipeline's samples; those for one picture are drawn once, since several tests ask.
 
     Args:
         pipeline: a `UniRenderPipeline`.
@@ -116,17 +116,19 @@ class Sampler:
 
     def __init__(self, pipeline: Any) -> None:
         self._pipeline = pipeline
-        self._drawn: dict[str, Points] = {}
+        self._drawn: dict[tuple[str, Material], Points] = {}  # by scene and material: they make the picture
 
-    def __call__(self, stage: Stage, _: Material, image: Image) -> Points:
-        if stage.scene.key not in self._drawn:
+    def __call__(self, stage: Stage, material: Material, image: Image) -> Points:
+        asked = (stage.scene.key, material)
+        if asked not in self._drawn:
             import torch
 
-            generator = torch.Generator().manual_seed(item_seed("posterior", stage.scene.key))
+            seed = item_seed("posterior", stage.scene.key, material_key(material))
+            generator = torch.Generator().manual_seed(seed)
             steps = {"mode": "sample", "num_inference_steps": SAMPLE_STEPS, "num_samples": POSTERIOR}
             found = self._pipeline.decompose(**_shown(stage, image), **steps, generator=generator)
-            self._drawn[stage.scene.key] = np.stack([material_point(maps, stage.mask) for maps in found.samples])
-        return self._drawn[stage.scene.key]
+            self._drawn[asked] = np.stack([material_point(maps, stage.mask) for maps in found.samples])
+        return self._drawn[asked]
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ at 64 pixels.
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Iterator, Sequence
+from io import BytesIO
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from PIL import Image as PngImage
 from PIL.PngImagePlugin import PngInfo
 
 from unirender.color import image_srgb
+from unirender.files import replace_file
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import GalleryItem, Picture, image_picture, map_pictures
@@ -216,10 +217,9 @@ def write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
     text = PngInfo()
     text.add_text("key", key)
     text.add_text("names", json.dumps(list(pictures)))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    PngImage.fromarray(sheet).save(temporary, format="PNG", pnginfo=text)
-    os.replace(temporary, path)
+    content = BytesIO()
+    PngImage.fromarray(sheet).save(content, format="PNG", pnginfo=text)
+    replace_file(path, content.getvalue())
 
 
 def read_sheet(path: Path, width: int) -> dict[str, Picture]:

@@ -8,6 +8,8 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Image, Mask
 
+KEPT = 16  # decompositions: more than are asked for of one scene
+
 
 class PipelineMethod:
     """Our model as a benchmark method.
@@ -73,11 +75,16 @@ class PipelineMethod:
         }
 
     def _decomposition(self, image_srgb: Image, mask: Mask, camera: Camera) -> Any:
-        """Of a picture, computed once: the rows that share it differ in what they do with it."""
+        """Of a picture, computed once: the rows that share it differ in what they do with it.
+
+        Only the last few are kept; those of thousands of photographs would not fit into memory.
+        """
         key = hashlib.sha256(image_srgb.tobytes() + mask.tobytes() + repr(camera).encode()).hexdigest()
         if key not in self._decompositions:
             options = {**self._options(), "closed": self.closed}
             made = self.pipeline.decompose(image_srgb, mask=mask, camera=camera, **options)
+            while len(self._decompositions) >= KEPT:
+                del self._decompositions[next(iter(self._decompositions))]
             self._decompositions[key] = made
         return self._decompositions[key]
 

@@ -12,6 +12,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -74,8 +75,8 @@ def named_plugin(spec: str) -> Plugin:
     if not hasattr(module, name):
         defined = [n for n, value in vars(module).items() if any(hasattr(value, c) for c in CAPABILITIES)]
         raise UnirenderError(
-            f"{what}: {module.__file__ or place} has no {name!r}; with one of {', '.join(CAPABILITIES)} it has "
-            f"{', '.join(defined) or 'nothing'}"
+            f"{what}: {module.__file__ or place} has no {name!r}; of what it has, {', '.join(defined) or 'nothing'} "
+            f"has one of {', '.join(CAPABILITIES)}; a function that returns a method may be named, too"
         )
     found = getattr(module, name)
     arguments = _arguments(found, query, what) if has_arguments else {}
@@ -95,8 +96,10 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
     arguments: dict[str, Any] = {}
     for entry in query.split("&"):
         name, separator, text = entry.partition("=")
-        if not separator or name in arguments:
-            raise UsageError(f"{what}: got {entry!r}, expected {ARGUMENTS}, each name once")
+        if not separator:
+            raise UsageError(f"{what}: got {entry!r}, expected {ARGUMENTS}")
+        if name in arguments:
+            raise UsageError(f"{what}: {name} is given twice, expected once")
         if name not in taken:
             raise UsageError(f"{what}: no argument {name!r}, expected some of {', '.join(taken) or 'none'}")
         arguments[name] = _value(text, taken[name].annotation, f"{what}: {name}")
@@ -112,9 +115,11 @@ def _value(text: str, annotation: Any, what: str) -> Any:
         return BOOLEANS[text]
     if kind in (int, float, str, Path):
         try:
-            return kind(text)
+            value = kind(text)
         except ValueError:
-            pass
+            value = None
+        if value is not None and (kind is not float or math.isfinite(value)):
+            return value
     elif kind is not bool:
         raise UsageError(f"{what} is {annotation}: expected a number, text, path or true/false in a SPEC")
     raise UsageError(f"{what} is {text!r}, expected {'true or false' if kind is bool else f'one {kind.__name__}'}")

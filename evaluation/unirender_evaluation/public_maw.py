@@ -113,7 +113,7 @@ class Maw(Scenes):
             ("compared", f"8-bit sRGB albedo brought to {SIZE[0]} x {SIZE[1]} px (bilinear), linear mean over each "
              "measured surface, weighted by its pixels; mean over photographs"),
             ("intensity", "100 x squared error of grey values (channel means), a least-squares factor per photograph"),
-            ("chromaticity", "CIEDE2000, D65, after a factor per surface that equals its grey value"),
+            ("chromaticity", "CIEDE2000, D65, after a factor per surface that equals its grey value, clipped at 1"),
         )  # fmt: skip
 
 

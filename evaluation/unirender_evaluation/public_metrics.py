@@ -227,7 +227,10 @@ def intensity(p: Float[np.ndarray, "k 3"], t: Float[np.ndarray, "k 3"], weights:
 
 
 def chromaticity(p: Float[np.ndarray, "k 3"], t: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"]) -> float:
-    """MAW's chromaticity error: weighted mean CIEDE2000 over segments, each brought to the truth's grey value first."""
+    """MAW's chromaticity error: weighted mean CIEDE2000 over segments, each brought to the truth's grey value first.
+
+    Both are clipped at 1 on the way to display values, as the benchmark's code does.
+    """
     grey_p, grey_t = p.mean(axis=-1, keepdims=True), t.mean(axis=-1, keepdims=True)
     scaled = p * (grey_p * grey_t / np.maximum(grey_p**2, NO_POWER))
     images = [x[None].astype(np.float32) for x in (scaled, t, weights[:, None])]

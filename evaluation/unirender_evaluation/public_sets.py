@@ -17,6 +17,7 @@ from PIL import Image
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import display_values, open_picture
 from unirender_evaluation.lpips import Lpips
@@ -122,19 +123,6 @@ class PublicSet(Protocol):
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs: what exactly the table of that name measures."""
         ...
-
-
-def file_sha256(path: Path) -> str:
-    """Of a file's content.
-
-    Raises:
-        UnirenderError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def need_folder(path: Path, name: str, layout: str) -> None:

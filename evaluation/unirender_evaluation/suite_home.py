@@ -8,6 +8,7 @@ in `${UNIRENDER_CACHE}/suites/NAME`; elsewhere (`--out`) it is any suite of its 
 import json
 import os
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,7 @@ from unirender.paths import cache_dir
 from unirender_evaluation.suite_spec import SuiteSpec, is_bundled, parse_spec, read_spec, read_text, suite_path
 
 TABLE = re.compile(r"^[ \t]*\[", re.MULTILINE)
+FOLDERS = re.compile(r"^[ \t]*\[[ \t]*folders[ \t]*\][^\n]*\n?", re.MULTILINE)
 
 
 def home(name: str) -> Path:
@@ -106,22 +108,46 @@ def target(
             raise UnirenderError(f"--{kind} {given}: no such folder")
         folder = spec.folder(kind) if given is None else given.expanduser()
         if folder is not None and (given is not None or path != source):
-            text = with_folder(text, kind, os.path.abspath(folder))
+            text = with_folder(text, source, kind, os.path.abspath(folder))
     return parse_spec(text, path), text
 
 
-def with_folder(text: str, key: str, value: str) -> str:
-    """The text of a TOML file with another value of a key of its table [folders]; comments and layout stay."""
+def with_folder(text: str, path: Path, key: str, value: str) -> str:
+    """The text of a TOML file with another value of a key of its table [folders]; comments and layout stay.
+
+    Args:
+        text: of the file.
+        path: of the file, for the message.
+        key: of the table; it need not be there yet, nor the table.
+        value: the new one.
+
+    Raises:
+        UnirenderError: the file writes the table or the key in a way that is not recognised here.
+    """
+    changed = _with_value(text, key, json.dumps(value, ensure_ascii=False))  # a JSON string is a TOML string
+    before = tomllib.loads(text)
+    folders = before.get("folders", {})
+    try:
+        written = tomllib.loads(changed) == before | {"folders": folders | {key: value}}
+    except tomllib.TOMLDecodeError:
+        written = False
+    if not written:
+        raise UnirenderError(
+            f'{path}: the folder of {key} cannot be written into it; write [folders] with `{key} = "..."` on a line '
+            "of its own"
+        )
+    return changed
+
+
+def _with_value(text: str, key: str, quoted: str) -> str:
+    """`with_folder` where table and key are plainly written; anything else may come out wrong."""
     text = f"{text.rstrip()}\n"
-    line = f"{key} = {json.dumps(value, ensure_ascii=False)}"  # a JSON string is a TOML string
-    header = re.search(r"^[ \t]*\[folders\][^\n]*\n?", text, re.MULTILINE)
+    header = FOLDERS.search(text)
     if header is None:
-        return f"{text}\n[folders]\n{line}\n"
+        return f"{text}\n[folders]\n{key} = {quoted}\n"
     following = TABLE.search(text, header.end())
     end = following.start() if following else len(text)
-    inner, count = re.subn(
-        rf"^[ \t]*{key}[ \t]*=[^\n]*$", lambda _: line, text[header.end() : end], count=1, flags=re.MULTILINE
-    )
-    if not count:
-        inner = f"{line}\n{text[header.end() : end]}"
-    return text[: header.end()] + inner + text[end:]
+    before, inner, after = text[: header.end()], text[header.end() : end], text[end:]
+    old = re.compile(rf"""^([ \t]*{key}[ \t]*=[ \t]*)(?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*')""", re.MULTILINE)
+    inner, count = old.subn(lambda found: found[1] + quoted, inner, count=1)
+    return before + (inner if count else f"{key} = {quoted}\n{inner}") + after

@@ -2,7 +2,6 @@
 again for rows that are told the true shape.
 """
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -12,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 from unirender_evaluation.suite_spec import Files, SuiteSpec
 from unirender_evaluation.suites import Scene, Suite
 from unirender_reference.mesh_folder import MeshFile, mesh_folder
@@ -79,9 +79,9 @@ def suite_sources(spec: SuiteSpec) -> list[ObjectSource]:
     twice = sorted({str(name) for name in names if names.count(name) > 1})
     if twice:
         problems.append(f"the same mesh in two groups: {', '.join(twice)}")
-    strangers = sorted({str(name) for name, _ in spec.ceiling_scenes} - {str(name) for name in names})
+    strangers = sorted(map(repr, {name for name, _ in spec.ceiling_scenes} - set(names)))
     if strangers and not problems:
-        problems.append(f"ceiling_scenes has {', '.join(strangers)}, expected objects of the suite")
+        problems.append(f"ceiling_scenes has {', '.join(strangers)}, expected seeds or mesh paths of the suite")
     if problems:
         raise UnirenderError(f"suite {spec.name!r}: {'; '.join(problems)}")
     return sources
@@ -155,19 +155,6 @@ def _chosen(listed: Sequence[MeshFile], group: Files, spec: SuiteSpec) -> list[M
     held = f", split {spec.split!r} with holdout {group.holdout}" if group.holdout else ""
     what = f"meshes {group.files!r} in {spec.folder('objects')}{held}"
     return [files[name] for name in drawn(names, group, what)]
-
-
-def file_sha256(path: Path) -> str:
-    """sha256 of a file's bytes.
-
-    Raises:
-        UnirenderError: it cannot be read.
-    """
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
 
 
 def scene_object(suite: Suite, scene: Scene) -> MeshObject:

@@ -1,5 +1,6 @@
 """What a suite's TOML file says: objects, lights, materials, and how good its truth has to be."""
 
+import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -174,8 +175,11 @@ def parse_spec(text: str, path: Path) -> SuiteSpec:
     required = {name for name in fields if name not in _OPTIONAL}
     missing, unknown = sorted(required - flat.keys()), sorted(flat.keys() - fields.keys())
     if missing or unknown:
+        meant = {key: difflib.get_close_matches(key, missing, 1) for key in unknown}
+        named = [f"{key} (did you mean {close[0]}?)" if close else key for key, close in meant.items()]
         raise UnirenderError(
-            f"{path}: missing keys {missing}, unknown keys {unknown}; compare with the package's data/suites/tiny.toml"
+            f"{path}: missing keys: {', '.join(missing) or 'none'}; unknown keys: {', '.join(named) or 'none'}; "
+            "docs/suites.md lists every key and the table that it stands in"
         )
     found = value_problems(flat)
     if found:

@@ -133,8 +133,8 @@ def print_table(console: Console, table: Table) -> None:
         console.print(f"[bold red]{escape(table.watermark)}[/]")
     groups = [[i for i, _ in items] for _, items in groupby(enumerate(table.columns), key=lambda item: item[1].group)]
     blocks = [[i for group in groups for i in group]]
-    if _rich_width(console, _rich_table(table, blocks[0], console.width)) > console.width:
-        blocks = groups
+    if not _fits(console, table, blocks[0]):
+        blocks = [block for group in groups for block in _fitting(console, table, group)]
     for number, indices in enumerate(blocks):
         rich_table = _rich_table(table, indices, console.width)
         rich_table.title = escape(table.heading) if number == 0 else None
@@ -172,6 +172,21 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
                 )
         rich_table.add_row(*texts)
     return rich_table
+
+
+def _fits(console: Console, table: Table, indices: Sequence[int]) -> bool:
+    return _rich_width(console, _rich_table(table, indices, console.width)) <= console.width
+
+
+def _fitting(console: Console, table: Table, indices: Sequence[int]) -> list[list[int]]:
+    """Columns in as few blocks as the terminal is wide enough for, at least one column in each."""
+    blocks: list[list[int]] = []
+    for i in indices:
+        if blocks and _fits(console, table, [*blocks[-1], i]):
+            blocks[-1].append(i)
+        else:
+            blocks.append([i])
+    return blocks
 
 
 def _rich_width(console: Console, rich_table: RichTable) -> int:

@@ -258,13 +258,16 @@ def _notes(spec: TableSpec, rows: Iterable[Row], total: int) -> tuple[str, ...]:
     notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
     fewer = [f"{row.label} (n = {row.n})" for row in rows if row.info is not None and 0 < row.n < total]
     if fewer:
-        notes.append(f"Measured on a fixed subset and not ranked: {'; '.join(fewer)}.")
+        notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
     if any(cell.dagger for row in rows for cell in row.cells):
         notes.append(
             "† The published value is worse than the constant 0.5, measured on materials distributed as in the paper."
         )
     if any(cell.unavailable for row in rows for cell in row.cells):
-        notes.append("n/a: the LPIPS backbone's weights are not on this machine (unirender_evaluation.lpips_convert).")
+        notes.append(
+            "n/a: the weights of this LPIPS backbone are not on this machine; "
+            "`python -m unirender_evaluation.lpips_convert vgg` fetches and converts them."
+        )
     origins = dict.fromkeys(row.stored for row in rows if row.stored)
     stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
     return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))

@@ -21,10 +21,10 @@ from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
 from unirender.files import replace_file
 from unirender_evaluation.suite_home import target
-from unirender_evaluation.suite_lights import SuiteLight, assign_lights, light_sources, load_lights
+from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import ObjectSource, broken_meshes, suite_sources
 from unirender_evaluation.suite_spec import SuiteSpec
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
 
@@ -69,20 +69,16 @@ def make_truth(
     spec, text = target(suite, out, objects, lights)
     with_sha256(text, spec.path, "")  # before hours of rendering: can the hash be written?
     sources, pool = suite_sources(spec), light_sources(spec)
-    broken = list(broken_meshes(sources, spec))
-    if broken:
-        raise UnirenderError(
-            f"suite {spec.name!r}: {len(broken)} of its meshes cannot be used; repair them, or name them under "
-            "`without` of their group:\n" + "\n".join(f"  {line}" for line in broken)
-        )
+    _keep_truth(spec, sources)
     assigned = assign_lights(spec, list(pool), len(sources))
-    used = load_lights(spec, [name for name, _ in assigned], pool)
+    used = _checked(spec, sources, [name for name, _ in assigned], pool)
     folder = work / _fingerprint(spec, text, used)
     for needed in (folder, spec.path.parent):
         try:
             needed.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UnirenderError(f"{needed}: cannot be made ({error.strerror}); choose another folder") from error
+            option = "--work" if needed == folder else "--out"
+            raise UnirenderError(f"{needed}: cannot be made ({error.strerror}); choose another {option}") from error
     jobs = _jobs(spec, sources, assigned, used, folder)
     parts: dict[int, Path] = {}
     failures: list[str] = []
@@ -95,10 +91,59 @@ def make_truth(
     if failures:
         raise UnirenderError(
             f"suite {spec.name!r}: {len(failures)} of its objects could not be rendered; repair them and run the "
-            "command again (the others are kept), or leave them out (all then get other lights and materials):\n"
-            + "\n".join(f"  {line}" for line in sorted(failures))
+            "command again (the others are kept), or leave them out (all objects then get other lights and materials, "
+            "and are rendered anew):\n" + "\n".join(f"  {line}" for line in sorted(failures))
         )
     pack_truth(spec, text, [parts[number] for number in range(len(jobs))], used)
+
+
+def _keep_truth(spec: SuiteSpec, sources: Sequence[ObjectSource]) -> None:
+    """Looks whether the truth that is there was made from the same mesh files.
+
+    Raises:
+        UnirenderError: it was not: results on it would be results on nothing that is left.
+    """
+    if not (spec.truth_sha256 and spec.truth_path.is_file() and spec.path.is_file()):
+        return
+    try:
+        made = load_suite(spec.path).provenance["objects"].values()
+    except UnirenderError:
+        return  # no results can be had on it
+    before = {entry["file"]: entry["file_sha256"] for entry in made if "file" in entry}
+    now = [source.provenance() for source in sources]
+    changed = [
+        str(e["file"]) for e in now if "file" in e and before.get(e["file"], e["file_sha256"]) != e["file_sha256"]
+    ]
+    if changed:
+        raise UnirenderError(
+            f"{spec.truth_path}: was made from other contents of {', '.join(changed)}; results on it and on a new "
+            "truth do not belong together. Pass another --out, or remove it to make the truth anew"
+        )
+
+
+def _checked(
+    spec: SuiteSpec, sources: Sequence[ObjectSource], lights: Sequence[str], pool: Pool
+) -> dict[str, SuiteLight]:
+    """The lights of these names, once every mesh and every one of them has been read.
+
+    Raises:
+        UnirenderError: all meshes and all lights that cannot be used.
+    """
+    problems: list[str] = []
+    broken = list(broken_meshes(sources, spec))
+    if broken:
+        problems.append(
+            f"suite {spec.name!r}: {len(broken)} of its meshes cannot be used; repair them, or name them under "
+            "`without` of their group:\n" + "\n".join(f"  {line}" for line in broken)
+        )
+    used: dict[str, SuiteLight] = {}
+    try:
+        used = load_lights(spec, lights, pool)
+    except UnirenderError as error:
+        problems.append(str(error))
+    if problems:
+        raise UnirenderError("\n".join(problems))
+    return used
 
 
 def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Iterator[tuple[int, Path | UnirenderError]]:
@@ -152,7 +197,7 @@ def _start_worker() -> None:
 
 def _fingerprint(spec: SuiteSpec, text: str, lights: Mapping[str, SuiteLight]) -> str:
     """Names the work folder: the suite's file but for the truth's hash, the lights, the code, Mitsuba. (Parts are named
-    after what their object holds.)"""
+    after what `render_object` is given.)"""
     digest = hashlib.sha256(with_sha256(text, spec.path, "").encode())
     for name, light in lights.items():
         digest.update(name.encode() + light.environment.tobytes())

@@ -147,10 +147,11 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
         if scene.object not in {c.name for c in geometry}:
             stored = suite.intrinsics(scene, spec.base)
             again = renderer.geometry(spec.geometry_spp, item_seed("check", seed, scene.object, "geometry"))
-            geometry.append(GeometryCheck(scene.object, compare_geometry(stored, again)))
+            geometry.append(GeometryCheck(scene.object, compare_geometry(stored, again, spec.geometry_spp)))
             yield geometry[-1]
             if not geometry_twins:
-                geometry_twins = {n: compare_geometry(stored, maps) for n, maps in twin_geometry(again).items()}
+                twins = twin_geometry(again).items()
+                geometry_twins = {n: compare_geometry(stored, maps, spec.geometry_spp) for n, maps in twins}
         for lit, material in checked_images(suite, scene, seed):
             checks.append(_check_image(suite, renderer, lit, material, material, seed, alpha))
             yield checks[-1]

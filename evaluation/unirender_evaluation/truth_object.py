@@ -1,5 +1,6 @@
 """Renders everything that a suite's truth holds of one object; what one worker process does."""
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -60,7 +61,10 @@ class _Buffer:
 
 
 def render_object(job: ObjectJob) -> Path:
-    """Renders all members of one object into `<out>/<object>-<object hash>.tar`; returns at once if that file exists.
+    """Renders all members of one object into `<out>/<object>-<hash>.tar`; returns at once if that file exists.
+
+    The hash is over the object's arrays and file and over its lights, turns and materials: which ones an object gets
+    follows from how many objects the suite has, which a folder of meshes changes and the suite's file does not say.
 
     Raises:
         UnirenderError: the object cannot be loaded, or not be seen.
@@ -69,7 +73,9 @@ def render_object(job: ObjectJob) -> Path:
 
     spec = job.spec
     obj = job.source.load()
-    path = job.out / f"{obj.name}-{object_hash(obj)[:12]}.tar"
+    made_of = {**job.source.provenance(), "sha256": object_hash(obj)}
+    given = json.dumps([made_of, job.lights, job.materials], sort_keys=True)
+    path = job.out / f"{obj.name}-{hashlib.sha256(given.encode()).hexdigest()[:12]}.tar"
     if path.exists():
         return path
     renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
@@ -109,7 +115,7 @@ def render_object(job: ObjectJob) -> Path:
         "scenes": scenes,
         "hashes": hashes,
         "quality": quality,
-        "object": {name: {**job.source.provenance(), "sha256": object_hash(obj)}},
+        "object": {name: made_of},
     }
     members[PART] = json.dumps(part).encode()
     write_tar(path, members)

@@ -109,11 +109,13 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
         "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
     ]
     state = "HOLDS" if check["passed"] else "FAILS"
+    agree = "differ from" if check["failed"] else "agree with"
+    twins = "were found" if check["twin_detected"] else "were NOT found: too blind on this suite, raise its samples"
     lines.append(
-        f"  {state}  truth: {check['members']} members rendered again with other seeds agree with the shipped file "
-        f"(check seed {check['seed']}, {check['date']}, smallest pass share {check['smallest_pass_share']:.3f}), "
-        f"{check['geometries']} objects' mask, albedo and normal too; "
-        f"twins (roughness, albedo, normal off) detected: {check['twin_detected']}"
+        f"  {state}  truth: {check['members']} members, and mask, albedo and normal of {check['geometries']} objects, "
+        f"rendered again with other seeds {agree} the truth file (check seed {check['seed']}, {check['date']}, "
+        f"smallest pass share {check['smallest_pass_share']:.3f}); deliberate errors of roughness, albedo and normal "
+        f"{twins}"
     )
     lines += [f"         {line}" for line in check["failed"]]
     if check["failed"] and check["other_objects"]:

@@ -141,7 +141,7 @@ NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placeme
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
-        ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR"),
+        ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
             *(f"unirender/{name}.py" for name in ("cli", "command_line", "commands", "options")),
             *(
@@ -158,7 +158,7 @@ PARTS: Mapping[str, Part] = {
             "unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py"),
             "unirender_evaluation": tuple(f"{name}.py" for name in ADAPTERS),
         },
-        ("torch", "diffusers"),
+        ("torch", "diffusers", "transformers"),
     ),
     REFERENCE: Part(
         {

@@ -5,6 +5,7 @@ records and pictures travel back, and the process that was started is the only w
 """
 
 import tempfile
+import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -15,6 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import Job, content_key, method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
@@ -27,6 +29,7 @@ from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions, versions
 
 AHEAD = 2  # scenes under way on a cluster for each of its workers
+PAUSE = 0.1  # seconds between two looks at what is under way there; a scene takes many
 
 
 @dataclass
@@ -196,7 +199,7 @@ def cluster_scene(order: Order, scene: str, wanted: frozenset[str]) -> tuple[lis
 def run_on_cluster(
     run: Run, build: Callable[[], Sequence[Row]], suite: str, wanted: Mapping[str, frozenset[str]], address: str
 ) -> Iterator[list[Record]]:
-    """Records of scenes from a cluster's workers, a scene at a time in the given order; pictures are written here.
+    """Records of scenes from a cluster's workers, a scene at a time as they come; pictures are written here.
 
     Args:
         run: what the run is.
@@ -212,15 +215,21 @@ def run_on_cluster(
 
     order = Order.of(run, build, suite)
     with connect(address) as executor:
-        under_way: deque[Any] = deque()
+        under_way: list[Any] = []
         waiting = deque(wanted.items())
         while waiting or under_way:
             while waiting and len(under_way) < AHEAD * max(executor.workers, 1):
                 under_way.append(executor.submit(cluster_scene, order, *waiting.popleft()))
-            records, pictures = under_way.popleft().result()
-            run.pictures.mkdir(parents=True, exist_ok=True)
+            records, pictures = _take_done(under_way).result()
             for name, data in pictures.items():
-                temporary = run.pictures / f"{name}.tmp"
-                temporary.write_bytes(data)
-                temporary.replace(run.pictures / name)
+                replace_file(run.pictures / name, data)
             yield records
+
+
+def _take_done(under_way: list[Any]) -> Any:
+    """Removes the first future that is done, after waiting for one: a slow scene holds up no other."""
+    while True:
+        for place, future in enumerate(under_way):
+            if future.done():
+                return under_way.pop(place)
+        time.sleep(PAUSE)

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.mesh_folder import files_hash
 from unirender_reference.plan import GroupPlan
-from unirender_reference.shards import JOURNAL, MANIFEST, ShardRecord, file_sha256, parse_record, shard_name
+from unirender_reference.shards import JOURNAL, MANIFEST, ShardRecord, parse_record, shard_name
 from unirender_reference.versions import check_versions
 
 HASHED = 4  # shards whose bytes are read again when a run goes on; of the others the size has to do

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 
 MANIFEST = "manifest.json"
 FAILURES = "failures.jsonl"
@@ -169,11 +170,6 @@ def write_shard(path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -
             f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
         ) from error
     return sha256
-
-
-def file_sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def write_manifest(folder: Path, header: Mapping[str, Any], shards: Iterable[ShardRecord], *, complete: bool) -> str:

@@ -136,23 +136,39 @@ def _move_into_place(temporary: Path, path: Path) -> None:
 def replace_file(path: Path, content: str | bytes) -> Path:
     """Writes a file, text as UTF-8, and its folder where there is none; returns the path.
 
-    It is written aside, synced and renamed: whoever reads `path`, after a crash too, finds the old content or the new.
+    It is written aside, synced and renamed: whoever reads `path`, after a crash or while others write it too, finds the
+    old content or the new.
 
     Raises:
         OSError: it cannot be written; what was there stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.partial")
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
+    temporary = Path(name)
     try:
-        with temporary.open("wb") as file:
+        with os.fdopen(handle, "wb") as file:
             file.write(content if isinstance(content, bytes) else content.encode())
             file.flush()
             os.fsync(file.fileno())
+        temporary.chmod(0o644)  # mkstemp gives it to its owner alone
         temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
     return path
+
+
+def file_sha256(path: str | Path) -> str:
+    """sha256 of a file's bytes, hexadecimal.
+
+    Raises:
+        UnirenderError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
 
 
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:

@@ -149,6 +149,9 @@ def test_several_predictions_are_one(appearance: Path, seen: dict[str, Any]) -> 
         ({"albedo": {"prediction_space": "log"}}, "albedo is 'log', expected one of srgb, linear, stack"),
         ({"material": {"prediction_space": "stack"}}, "material stacks None, expected three names"),
         ({"roughness": {"prediction_space": "stack"}}, "roughness is 'stack', expected srgb or linear"),
+        ({"albedo": "srgb"}, "got 'srgb' as a target, expected names, each with a table"),
+        ({"target_names": [["albedo"]]}, r"got \['albedo'\] as a target, expected names"),
+        ({"roughness": 1}, "got 1 as a target, expected names, each with a table"),
         ({"target_names": ["depth"]}, "names depth, expected some of albedo, roughness, metallicity, shading"),
     ],
 )

@@ -66,9 +66,9 @@ def test_arguments_have_the_types_of_the_signature(file: Path) -> None:
 @pytest.mark.parametrize(
     ("query", "message"),
     [
-        ("Given?", "got '', expected ?name=value&name=value, each name once"),
+        ("Given?", "got '', expected ?name=value&name=value"),
         ("Given?sigma", "got 'sigma', expected ?name=value&name=value"),
-        ("Given?sigma=1&sigma=2", "got 'sigma=2', expected ?name=value&name=value, each name once"),
+        ("Given?sigma=1&sigma=2", "sigma is given twice, expected once"),
         ("Given?sigmas=1", "no argument 'sigmas', expected some of sigma, folder, count, fast, plain, several, depth"),
         ("Given?sigma=much", "sigma is 'much', expected one float"),
         ("Given?count=1.5", "count is '1.5', expected one int"),

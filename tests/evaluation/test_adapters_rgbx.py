@@ -1,5 +1,7 @@
 """RGB-to-X as a method: its conversions against a stated answer, its sampling against diffusers' nearest pipeline."""
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +90,19 @@ def test_sampling_is_that_of_diffusers_nearest_pipeline(folder: Path) -> None:
     pipeline.scheduler = DDIMScheduler(**SCHEDULE)  # as the file has it
     as_filed = edited()
     assert (found - as_filed).abs().max() > 1e-3
+
+
+def test_the_scheduler_that_the_folder_names_does_not_matter(folder: Path, tmp_path: Path) -> None:
+    """Only its noise schedule does."""
+    other = Path(shutil.copytree(folder, tmp_path / "other"))
+    path = other / "scheduler" / "scheduler_config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps(config | {"_class_name": "PNDMScheduler"}))
+    one, two = (RgbToX(place).network.scheduler for place in (folder, other))
+    assert type(one) is type(two) is DDIMScheduler
+    torch.testing.assert_close(one.alphas_cumprod, two.alphas_cumprod)
+    path.write_text(json.dumps(config | {"beta_end": 0.02}))
+    assert not torch.equal(RgbToX(other).network.scheduler.alphas_cumprod, one.alphas_cumprod)
 
 
 def test_a_picture_of_any_size_goes_there_and_back() -> None:

@@ -1,7 +1,8 @@
 """`bench run --cluster` on `dask.distributed` workers, separate processes over TCP: the run of this machine alone."""
 
+import contextlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,17 +10,19 @@ from typing import Any
 
 import pytest
 from rich.progress import Progress
-from tiny_suites import write_suite
+from tiny_suites import make_suite, write_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.benchmark import BenchConfig, _work, build_rows, prepare
 from unirender_evaluation.bounds import CEILING_KEY
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.engine import Job, Store
+from unirender_evaluation.records import Record
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.versions import Versions
-from unirender_evaluation.workers import Order, Run, cluster_scene
+from unirender_evaluation.workers import AHEAD, Order, Run, cluster_scene, run_on_cluster
+from unirender_reference import cluster
 
 SMALL = Subsets(sample=0, optimise=0, views=0, shade=1, physics=1, mitsuba=0)
 RENDERED = ("physics", "shade")  # labels of records that Mitsuba makes
@@ -81,6 +84,77 @@ def test_records_and_pictures_are_those_of_one_machine(
     made = {path.name: path.read_bytes() for path in elsewhere.pictures.iterdir()}
     assert made.items() >= pictures.items()
     assert not [name for name in made if not name.endswith(".png")]
+
+
+class SlowFirst:
+    """An executor of two workers: of twelve scenes the first is done when all others have been taken."""
+
+    workers, scenes = 2, 12
+
+    def __init__(self) -> None:
+        self.open: list[str] = []
+        self.taken: list[str] = []
+        self.most = 0
+
+    def submit(self, _: Callable[..., Any], order: Order, scene: str, wanted: frozenset[str]) -> "Answer":
+        self.open.append(scene)
+        self.most = max(self.most, len(self.open))
+        return Answer(self, scene, next(iter(wanted)))
+
+
+class Answer:
+    """What it promises of one scene: one record, one picture."""
+
+    def __init__(self, executor: SlowFirst, scene: str, key: str) -> None:
+        self.executor, self.scene, self.key = executor, scene, key
+
+    def done(self) -> bool:
+        return self.scene != "s0" or len(self.executor.taken) == self.executor.scenes - 1
+
+    def result(self) -> tuple[list[Record], dict[str, bytes]]:
+        assert self.done(), "waits for one scene while others are done"
+        self.executor.open.remove(self.scene)
+        self.executor.taken.append(self.scene)
+        record = Record("physics", "given", "method", self.scene, "ball", {}, self.key)
+        return [record], {f"{self.scene}.png": self.scene.encode()}
+
+
+def test_a_slow_scene_holds_up_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is taken when it is done, so that a killed run has it; the next one then takes its place."""
+    executor = SlowFirst()
+    monkeypatch.setattr(cluster, "connect", lambda _: contextlib.nullcontext(executor))
+    suite = make_suite(tmp_path / "suite")
+    run = Run(suite, (), list(suite.scenes), Versions("test"), (), tmp_path / "pictures")
+    wanted = {f"s{i}": frozenset({f"key{i}"}) for i in range(executor.scenes)}
+    found = [record for records in run_on_cluster(run, tuple, "ball", wanted, "somewhere") for record in records]
+    assert {record.sample: frozenset({record.key}) for record in found} == wanted
+    assert found[-1].sample == "s0"
+    assert executor.most == AHEAD * executor.workers
+    assert {path.name: path.read_bytes().decode() for path in run.pictures.iterdir()} == {f"{k}.png": k for k in wanted}
+
+
+def test_a_finished_run_asks_for_no_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its tables can be written again where there is none; with one record less it does ask."""
+    config, run = trivial(tmp_path)
+    jobs = [replace(job, kept=True) for scene in run.scenes for job in run.jobs(scene)]
+    monkeypatch.setattr(run, "jobs", lambda scene: [job for job in jobs if scene == run.scenes[0]])
+    asked: list[str] = []
+
+    def connect(address: str) -> Any:
+        asked.append(address)
+        raise UnirenderError("no scheduler")
+
+    monkeypatch.setattr(cluster, "connect", connect)
+    config, store = replace(config, cluster="tcp://127.0.0.1:1"), Store(tmp_path / "records.jsonl")
+    for job in jobs[1:]:
+        store.lay_by(Record("physics", "given", "method", job.key, "ball", {}, job.key))
+    with pytest.raises(UnirenderError, match="no scheduler"):
+        _work(run, config, store, Progress(disable=True))
+    assert asked == [config.cluster]
+    store.lay_by(Record("physics", "given", "method", jobs[0].key, "ball", {}, jobs[0].key))
+    _work(run, config, store, Progress(disable=True))
+    assert asked == [config.cluster]
+    assert store.used.keys() == {job.key for job in jobs}
 
 
 def test_a_worker_that_is_not_like_this_machine_is_refused(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[o
 def test_values_outside_their_range(
     command: str, option: str, value: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    more = {"truth": ["--suite", "tiny"], "check": []}.get(command, ["--out", str(tmp_path / "out")])
+    more = {"truth": ["tiny"], "check": []}.get(command, ["--out", str(tmp_path / "out")])
     status, printed = refused(["bench", command, option, value, *more], capsys)
     assert (status, printed) == (2, f"unirender: error: {option} {value}: expected {expected}\n")
     assert not any(tmp_path.iterdir())
@@ -113,7 +113,7 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
     file.write_text("kept")
     with pytest.raises(UnirenderError, match=r"file: cannot be made \(File exists\); choose another --out"):
         run(BenchConfig(suite=str(suite), out=file, methods=()), Console(quiet=True))
-    with pytest.raises(UnirenderError, match=r"cannot be written \(Not a directory\); choose another --work"):
+    with pytest.raises(UnirenderError, match=r"cannot be made \(Not a directory\); choose another --work"):
         next(make_truth(suite, file))
     assert file.read_text() == "kept"
 

@@ -74,8 +74,8 @@ def test_rows_of_a_test(tmp_path: Path) -> None:
     assert set(sampled) == {MITSUBA, OURS, TWIN}
 
 
-def test_our_samples_are_drawn_once_for_a_scene(tmp_path: Path) -> None:
-    """Nineteen materials in the cube that differ; the second test that asks has the same."""
+def test_our_samples_are_drawn_once_for_a_picture(tmp_path: Path) -> None:
+    """Nineteen materials in the cube that differ; the second test that asks has the same, another picture its own."""
     suite = make_suite(tmp_path, objects=1)
     stage, sampler = Stage(suite, suite.scenes[0]), Sampler(make_pipeline())
     image = stage.image(stage.own_material)
@@ -84,7 +84,14 @@ def test_our_samples_are_drawn_once_for_a_scene(tmp_path: Path) -> None:
     assert 0 <= drawn.min() <= drawn.max() <= 1
     assert np.ptp(drawn, axis=0).min() > 1e-4
     assert sampler(stage, stage.own_material, image) is drawn
-    assert (Sampler(make_pipeline())(stage, stage.own_material, image) == drawn).all(), "seeded by the scene"
+    assert (Sampler(make_pipeline())(stage, stage.own_material, image) == drawn).all(), "seeded by the picture"
+    other = stage.suite.spec.edits[0]
+    assert other != stage.own_material
+    shown = stage.image(other)
+    theirs = sampler(stage, other, shown)
+    assert (theirs == Sampler(make_pipeline())(stage, other, shown)).all(), "not by what was asked before"
+    assert np.abs(theirs - drawn).max() > 1e-4
+    assert sampler(stage, stage.own_material, image) is drawn
 
 
 def test_moved_meshes_stay_outside_out() -> None:

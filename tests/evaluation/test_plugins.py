@@ -99,7 +99,7 @@ def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
     ("spec", "message"),
     [
         ("{folder}/absent.py:Grey", "no file .*absent.py, expected module:Class or path/to/file.py:Class"),
-        ("{folder}/my_method.py:Gray", "has no 'Gray'; with one of decompose, .* it has Grey"),
+        ("{folder}/my_method.py:Gray", "has no 'Gray'; of what it has, Grey, .* has one of decompose"),
         ("{folder}/my_method.py:Empty", "is not a method"),
         ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
         ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),

@@ -183,6 +183,10 @@ def test_chromaticity_by_hand() -> None:
 
     labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(srgb_encode(c))) for c in (np.array([0.3] * 3), t[0])]
     assert chromaticity(grey, t, weights) == pytest.approx(float(colour.delta_E(labs[0], labs[1])) / 4, abs=0.01)
+    bright, white = np.array([[0.3, 0.25, 0.2]]), np.array([[0.85, 0.85, 0.85]])
+    once = np.ones(1)
+    assert chromaticity(bright, white, once) == pytest.approx(10.33, abs=0.01)
+    assert chromaticity(bright, white, once) < 10.5  # 10.70 without the clip at 1
     green = t[:, [1, 0, 2]]  # where the first surface is magenta
     assert chromaticity(green, t, weights) > chromaticity(grey, t, weights)
 

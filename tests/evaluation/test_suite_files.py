@@ -14,12 +14,13 @@ from tiny_suites import write_suite
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 from unirender_evaluation import results_check
 from unirender_evaluation.results_listing import suites as listed_suites
 from unirender_evaluation.stratification import constant_mse
 from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
 from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
-from unirender_evaluation.suite_objects import broken_meshes, file_sha256, scene_object, suite_sources
+from unirender_evaluation.suite_objects import broken_meshes, scene_object, suite_sources
 from unirender_evaluation.suite_spec import SuiteSpec, parse_spec, read_spec, suite_path
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import make_truth
@@ -149,6 +150,20 @@ def test_what_a_folder_lacks_is_said_all_at_once(more: str, message: str, tmp_pa
 
 
 @pytest.mark.parametrize(
+    ("scenes", "strangers"), [("[[3, 0]]", ""), ('[["3", 0]]', "'3'"), ('[["b.obj", 0], ["a.obj", 1]]', "'b.obj'")]
+)
+def test_a_scene_with_a_twin_is_of_an_object_of_the_suite(scenes: str, strangers: str, tmp_path: Path) -> None:
+    """A seed in quotes is the name of a mesh: no scene would get that twin."""
+    write_meshes(tmp_path / "models", ["a.obj"])
+    spec = spec_with(tmp_path, MESHES, objects="[3]", ceiling_scenes=scenes)
+    if not strangers:
+        assert [source.name for source in suite_sources(spec)] == [3, "a.obj"]
+        return
+    with pytest.raises(UnirenderError, match=f"ceiling_scenes has {strangers}, expected seeds"):
+        suite_sources(spec)
+
+
+@pytest.mark.parametrize(
     ("more", "changes", "messages"),
     [
         ("", {"resolution": '"64"', "batches": "2"}, ["resolution is '64', expected", "batches is 2, expected"]),
@@ -158,7 +173,7 @@ def test_what_a_folder_lacks_is_said_all_at_once(more: str, message: str, tmp_pa
         ("", {"objects": "[]"}, ["it has no objects"]),
         ("[[meshes]]\ncount = 0\nfile = 1\n", {}, ["meshes[0] has unknown keys ['file']", "meshes[0].count is 0"]),
         ("[light_files]\nholdout = 1\n", {}, ["light_files.holdout is 1, expected 0 (all files) or at least 2"]),
-        ("[folders]\nobject = 1\n", {}, ["unknown keys ['object']"]),
+        ("[folders]\nobject = 1\n", {}, ["unknown keys: object"]),
     ],
 )
 def test_every_wrong_value_is_named(more: str, changes: dict[str, str], messages: list[str], tmp_path: Path) -> None:
@@ -187,7 +202,12 @@ def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) 
     write_pictures(tmp_path / "lights", 3)
     (tmp_path / "lights" / "1.png").write_bytes(b"no picture")
     (tmp_path / "lights" / "2.png").write_bytes(b"")
-    spec = spec_with(tmp_path, '[folders]\nlights = "lights"\n[light_files]\n', bundled_lights="0")
+    folders = '[folders]\nlights = "lights"\n'
+    spec.path.write_text(spec.path.read_text().replace("[folders]\n", folders) + "[light_files]\n")
+    with pytest.raises(UnirenderError, match=r"(?s)2 of its meshes .*flat\.obj.*2 of its lights .*1\.png.*2\.png"):
+        next(make_truth(spec.path, tmp_path / "work"))
+    assert not (tmp_path / "work").exists()
+    spec = spec_with(tmp_path, folders + "[light_files]\n", bundled_lights="0")
     pool = light_sources(spec)
     with pytest.raises(UnirenderError, match=r"(?s)2 of its lights cannot be read.*1\.png.*2\.png"):
         load_lights(spec, list(pool), pool)
@@ -205,16 +225,38 @@ def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) 
         'name = "x"',
         'name = "x"\n[folders]',
         'name = "x"\n[folders]   # of files\nlights = "l"\n\n[[meshes]]\nobjects = "no"\n',
+        'name = "x"\n[ folders ]\nobjects = "a\\"b"#\n',
+        "name = 'x'\n[folders]\nobjects = 'C:\\old' # \"mine\"\n",
         'name = "x"\n[folders]\n  objects = "old"  # mine\nobjects_from = "there"\n[truth]\nobjects = "no"\n',
     ],
 )
 def test_a_folder_is_written_into_the_table_of_folders(text: str) -> None:
     import tomllib
 
-    changed = with_folder(text, "objects", 'C:\\a "b"')
+    changed = with_folder(text, Path("x.toml"), "objects", 'C:\\a "b"')
     before, after = tomllib.loads(text), tomllib.loads(changed)
     assert after == before | {"folders": before.get("folders", {}) | {"objects": 'C:\\a "b"'}}
     assert all(line in changed for line in text.splitlines() if "objects =" not in line)
+    assert [line.partition("#")[1:] for line in text.splitlines() if "#" in line] == [
+        line.partition("#")[1:] for line in changed.splitlines() if "#" in line
+    ], "comments stay, that on the changed line too"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'folders.objects = "a"',
+        'folders = { objects = "a" }',
+        '[folders]\n"objects" = "a"',
+        '[folders]\nobjects = """a"""',
+        '["folders"]\nobjects = "a"',
+        'title = """\n[folders]\n"""',
+    ],
+)
+def test_a_folder_that_cannot_be_written_is_not_called_a_broken_file(text: str) -> None:
+    """Valid TOML, written otherwise than by lines: the message says how to write it."""
+    with pytest.raises(UnirenderError, match=r'x\.toml: .*write \[folders\] with `objects = "\.\.\."` on a line'):
+        with_folder(text, Path("x.toml"), "objects", "b")
 
 
 def mesh_suite(folder: Path) -> Suite:

@@ -138,7 +138,7 @@ def test_an_absent_backbone_is_not_available_and_an_absent_value_is_a_dash() -> 
     constant = next(line for line in text.splitlines() if line.startswith("| Constant"))
     assert "n/a" in ours
     assert "n/a" not in constant
-    assert "weights are not on this machine" in text
+    assert "are not on this machine" in text
 
 
 def test_a_limited_run_is_watermarked_in_every_format() -> None:
@@ -262,6 +262,18 @@ def test_terminal_output_keeps_its_width() -> None:
         buffer = StringIO()
         print_table(Console(file=buffer, width=width), table())
         assert max(map(len, buffer.getvalue().splitlines())) <= width
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_narrow_terminal_cuts_no_number_short(width: int) -> None:
+    """A group of columns that is too wide is split, and every block names its methods."""
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=width), table())
+    text = buffer.getvalue().partition("Protocol")[0]
+    assert "…" not in text
+    blocks = [line for line in text.splitlines() if "Method" in line]
+    assert len(blocks) > 1 or width == 100
+    assert text.count("Ours") >= len(blocks)
 
 
 def test_a_column_that_nobody_was_asked_for_is_left_out() -> None:

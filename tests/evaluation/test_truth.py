@@ -13,13 +13,16 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
+from unirender.files import file_sha256
 from unirender_evaluation.ceiling import similarity_ceiling
 from unirender_evaluation.scoring import score_image
-from unirender_evaluation.suite_objects import file_sha256, scene_object
+from unirender_evaluation.suite_home import target
+from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
+from unirender_evaluation.suite_objects import scene_object, suite_sources
 from unirender_evaluation.suites import Suite, load_suite, read_spec, suite_path
 from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
-from unirender_evaluation.truth_object import object_hash
+from unirender_evaluation.truth_object import ObjectJob, object_hash, render_object
 from unirender_evaluation.truth_render import good_spp, render_to_ceiling, stored_ceiling_db
 from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
 
@@ -184,6 +187,86 @@ def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) 
     list(make_truth(path, tmp_path / "work", workers=1))
     assert len(list((tmp_path / "work").glob("*/*.tar"))) == 2
     assert (tmp_path / "mini.tar").read_bytes() != first
+
+
+MESHES_ALONE = {
+    "objects": "[]",
+    "ceiling_scenes": "[]",
+    "bundled_lights": "2",
+    "procedural_lights": "[0]",
+    "resolution": "16",
+    "light_rows": "8",
+    "per_scene": "1",
+    "spp": "8",
+    "light_spp": "8",
+    "max_spp": "64",
+    "geometry_spp": "64",
+    "target_db": "10.0",
+    "light_target_db": "10.0",
+    "sha256": '""',
+    "file": '"mine.tar"',
+}
+TETRAHEDRON = "v -1 -1 -1\nv 1 -1 -1\nv 0 1 -1\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
+def write_mesh_suite(folder: Path, names: str) -> Path:
+    """A suite of small pictures of equal meshes, without its truth."""
+    (folder / "meshes").mkdir()
+    for name in names:
+        (folder / "meshes" / f"{name}.obj").write_text(TETRAHEDRON)
+    text = suite_path("tiny").read_text()
+    for name, value in MESHES_ALONE.items():
+        text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    path = folder / "mine.toml"
+    path.write_text(text + '\n[folders]\nobjects = "meshes"\n\n[[meshes]]\n')
+    return path
+
+
+def test_a_part_is_kept_for_the_same_file_lights_turns_and_materials_alone(tmp_path: Path) -> None:
+    spec, _ = target(write_mesh_suite(tmp_path, "a"))
+    (source,), pool = suite_sources(spec), light_sources(spec)
+    lights = {name: light.environment for name, light in load_lights(spec, list(pool), pool).items()}
+    a, b, c = lights
+    materials = (((0.1, 0.2),), ((0.3, 0.4),))
+    (tmp_path / "work").mkdir()
+    job = ObjectJob(spec, source, ((a, 1), (b, 2)), lights, materials, tmp_path / "work")
+    first = render_object(job)
+    made = first.stat().st_mtime_ns
+    assert render_object(job) == first
+    assert first.stat().st_mtime_ns == made
+    others = [
+        render_object(replace(job, lights=((a, 1), (c, 2)))),
+        render_object(replace(job, lights=((a, 1), (b, 3)))),
+        render_object(replace(job, materials=materials[::-1])),
+    ]
+    (tmp_path / "meshes" / "a.obj").write_text(TETRAHEDRON + "# a comment\n")
+    others.append(render_object(job))
+    assert len({first, *others}) == 5
+    assert all(path.is_file() for path in others)
+
+
+@pytest.mark.slow
+def test_a_truth_follows_the_files_that_are_in_the_folder(tmp_path: Path) -> None:
+    """A mesh is deleted and another gets a comment: same suite file, same lights, same shapes; but lights, turns and
+    materials are dealt out anew, and the file is another."""
+    path, work = write_mesh_suite(tmp_path, "abc"), tmp_path / "work"
+    assert len(list(make_truth(path, work))) == 3
+    (tmp_path / "meshes" / "a.obj").unlink()
+    (tmp_path / "meshes" / "c.obj").write_text(TETRAHEDRON + "# a comment\n")
+    truth = load_suite(path).spec.truth_path
+    before = truth.read_bytes()
+    with pytest.raises(UnirenderError, match=r"was made from other contents of c\.obj.*another --out, or remove it"):
+        list(make_truth(path, work))
+    assert truth.read_bytes() == before
+    truth.unlink()
+    assert len(list(make_truth(path, work))) == 2
+    assert len(list(work.iterdir())) == 1, "the folder of the parts is the same: their names have to differ"
+    suite = load_suite(path)
+    assigned = assign_lights(suite.spec, list(light_sources(suite.spec)), 2)
+    assert [(scene.light, scene.turn_columns) for scene in suite.scenes] == assigned
+    assert [list(scene.materials) for scene in suite.scenes] == suite.spec.materials(2)
+    for scene in suite.scenes:
+        assert object_hash(scene_object(suite, scene)) == suite.provenance["objects"][scene.object]["sha256"]
 
 
 @pytest.mark.slow

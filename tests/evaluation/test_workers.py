@@ -1,4 +1,5 @@
-"""Worker processes end with their parent, even if that is killed: each holds torch and Mitsuba."""
+"""Worker processes end with their parent, even if that is killed: each holds torch and Mitsuba. They may write the same
+picture at the same time."""
 
 import fcntl
 import os
@@ -7,10 +8,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from tiny_suites import write_suite
+
+from unirender_evaluation.figures import Grid, Line, Tile, save
+from unirender_evaluation.pictures import write_sheet
 
 SECONDS = 120  # to start a worker, and to see it end: a busy machine takes its time
 
@@ -87,3 +94,23 @@ def wait_until(condition: Callable[[], bool]) -> None:
         if time.monotonic() > end:
             raise TimeoutError(f"waited {SECONDS} s")
         time.sleep(0.1)
+
+
+def sheet(path: Path) -> None:
+    write_sheet(path, {"image": np.zeros((2, 2, 3), np.float32)}, "key")
+
+
+def figure(path: Path) -> None:
+    save(Grid(("A",), (Line("row", (Tile(np.zeros((2, 2, 3), np.float32)),)),)), path)
+
+
+@pytest.mark.parametrize("write", [sheet, figure])
+def test_two_may_write_one_picture(write: Callable[[Path], None], tmp_path: Path) -> None:
+    """Neither takes the other's temporary file away; none stays."""
+    path = tmp_path / "pictures" / "one.png"
+    with ThreadPoolExecutor(4) as pool:
+        for done in [pool.submit(write, path) for _ in range(40)]:
+            done.result()
+    with Image.open(path) as image:
+        image.load()
+    assert [found.name for found in path.parent.iterdir()] == [path.name]

@@ -2,6 +2,7 @@
 
 import json
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -179,6 +180,20 @@ def test_damaged_results_are_named(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "none", "no folder and no EXR"), (tmp_path, r"has no intrinsics\.exr")):
         with pytest.raises(UnirenderError, match=words):
             read_result(path)
+
+
+def test_several_write_a_file_at_once(tmp_path: Path) -> None:
+    """Each finds a whole content, whoever wrote it, and none takes another's file away."""
+    path, contents = tmp_path / "file", [character * 100_000 for character in "abcd"]
+    replace_file(path, contents[0])
+
+    def write_and_read(content: str) -> bool:
+        return all(replace_file(path, content).read_text() in contents for _ in range(20))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(write_and_read, contents))
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+    assert path.stat().st_mode & 0o777 == 0o644
 
 
 def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

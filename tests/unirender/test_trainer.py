@@ -23,6 +23,7 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
+from unirender.training import reader
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.checkpoint import (
     STATE_FILE,
@@ -413,7 +414,8 @@ def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> No
     assert standing(7, 1.25, None, 5.0) == "resumed at step 7, after 1.2 of 5 minutes"
     both = standing(8, 5.5, 8, 5.0)
     assert both.startswith("finished at step 8 of 8, after 5.5 of 5 minutes: nothing to train")
-    assert "pass --steps (more than 8) and --minutes (more than 5)" in both
+    assert "pass --steps (more than 8) and --minutes (more than 5.5)" in both
+    assert "pass --steps (more than 3)" in standing(3, 1.0, 2, None), "past the length that is asked for"
     assert "--steps" not in standing(7, 5.5, 8, 5.0)
 
 
@@ -421,11 +423,17 @@ def test_a_batch_that_cannot_be_made_is_asked_for_again(tmp_path: Path, monkeypa
     data = write_dataset(tmp_path, size=32)
     whole = ShardSource(data, 2, 0, workers=0)
     batches = [whole.next()["image"] for _ in range(2)]
+    make = reader.make_batch
     for workers in (0, 1):
-        source = ShardSource(data, 2, 0, workers=workers)
-        assert torch.equal(source.next()["image"], batches[0])
+        source, made = ShardSource(data, 2, 0, workers=workers), list[int]()
+
+        def only_the_first(*arguments: Any, made: list[int] = made) -> Any:
+            made.append(1)  # a thread reads ahead at once
+            return make(*arguments) if len(made) == 1 else 1 / 0
+
         with monkeypatch.context() as broken:
-            broken.setattr("unirender.training.reader.make_batch", lambda *_: 1 / 0)
+            broken.setattr(reader, "make_batch", only_the_first)
+            assert torch.equal(source.next()["image"], batches[0])
             for _ in range(2):
                 with pytest.raises(ZeroDivisionError):
                     source.next()

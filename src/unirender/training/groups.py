@@ -16,7 +16,6 @@ memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import re
@@ -33,6 +32,7 @@ from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
+from unirender.files import file_sha256
 from unirender.paths import cache_dir
 from unirender.training.environments import turned_environments
 
@@ -169,11 +169,6 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
         raise UnirenderError(f"{path}: not a readable tar shard ({error})") from error
     if members:
         yield key, members
-
-
-def file_sha256(path: str | Path) -> str:
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def open_packed(path: str | Path, sha256: str | None = None, name: str | None = None) -> Shard:

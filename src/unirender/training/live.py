@@ -1,6 +1,7 @@
 """What a user sees of a training run: one live line in a terminal, plain lines anywhere else."""
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -60,8 +61,9 @@ def standing(step: int, done_minutes: float, steps: int | None, minutes: float |
     """
     place = f"step {step}" + (f" of {steps}" if steps else "")
     place += f", after {done_minutes:.1f} of {minutes:g} minutes" if minutes else ""
-    ends = {f"--steps (more than {steps})": bool(steps and step >= steps)}
-    ends |= {f"--minutes (more than {minutes or 0:g})": bool(minutes and done_minutes >= minutes)}
+    ends = {f"--steps (more than {step})": bool(steps and step >= steps)}
+    longest = max(minutes or 0, math.ceil(10 * done_minutes) / 10)
+    ends |= {f"--minutes (more than {longest:g})": bool(minutes and done_minutes >= minutes)}
     reached = [option for option, end in ends.items() if end]
     if not reached:
         return f"resumed at {place}"
