@@ -1,6 +1,7 @@
 """The ambiguity test: the region is exact for any posterior, and Mitsuba finds the materials that explain a picture."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,3 +106,10 @@ def display_distance(stage: Stage, point: np.ndarray) -> float:
     shown = quantise(stage.image(stage.own_material), stage.mask)
     error = np.square(image_srgb(unpremultiply(made, stage.mask)) - shown)
     return float(np.sqrt((error * stage.mask).sum() / (3 * stage.mask.sum())))
+
+
+def test_the_example_of_the_documentation_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "physics.md").read_text(encoding="utf-8")
+    code = page.partition("```python\n")[2].partition("```")[0]
+    exec(code, {})
+    assert capsys.readouterr().out.split() == code.rpartition("#")[2].split()
