@@ -20,9 +20,9 @@ class Subsets:
     sample: int | None = 4
     shade: int | None = 12
     physics: int | None = 12
-    optimise: int | None = 3
+    optimise: int | None = 4
     pictures: int | None = 2
-    views: int | None = 3
+    views: int | None = 4
     mitsuba: int | None = 4
 
 

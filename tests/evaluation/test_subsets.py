@@ -42,7 +42,7 @@ def test_a_default_run_keeps_to_the_stated_subsets(suite: Suite, tmp_path: Path)
         zip(SLOW, (4, 12), strict=True)
     )
     assert physics_labels(suite, Subsets(physics=3), tmp_path) == 3
-    assert BenchRun().subsets == BenchConfig().subsets == STANDARD == Subsets(4, 12, 12, 3, 2, 3, 4)
+    assert BenchRun().subsets == BenchConfig().subsets == STANDARD == Subsets(4, 12, 12, 4, 2, 4, 4)
 
 
 def test_a_full_run_has_no_subset(suite: Suite, tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_a_full_run_has_no_subset(suite: Suite, tmp_path: Path) -> None:
 
 def test_the_slowest_rows_have_options_of_their_own() -> None:
     assert BenchRun(full=True, sample_scenes=3).subsets == Subsets(3, None, None, None, None, None, None)
-    assert BenchRun(sample_scenes=0).subsets == Subsets(0, 12, 12, 3, 2, 3, 4)
+    assert BenchRun(sample_scenes=0).subsets == Subsets(0, 12, 12, 4, 2, 4, 4)
     assert BenchRun(full=True, optimise_scenes=2, view_objects=0).subsets == Subsets(None, None, None, 2, None, 0, None)
     assert "ours-sample" not in rows_of(Subsets(sample=0))
 
