@@ -118,7 +118,7 @@ def _value(text: str, annotation: Any, what: str) -> Any:
             value = kind(text)
         except ValueError:
             value = None
-        if value is not None and (kind is not float or math.isfinite(value)):
+        if value is not None and not (isinstance(value, float) and not math.isfinite(value)):
             return value
     elif kind is not bool:
         raise UsageError(f"{what} is {annotation}: expected a number, text, path or true/false in a SPEC")

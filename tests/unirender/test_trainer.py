@@ -23,6 +23,7 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
+from unirender.training import data as data_module
 from unirender.training import reader
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.checkpoint import (
@@ -423,7 +424,7 @@ def test_a_batch_that_cannot_be_made_is_asked_for_again(tmp_path: Path, monkeypa
     data = write_dataset(tmp_path, size=32)
     whole = ShardSource(data, 2, 0, workers=0)
     batches = [whole.next()["image"] for _ in range(2)]
-    make = reader.make_batch
+    make = data_module.make_batch
     for workers in (0, 1):
         source, made = ShardSource(data, 2, 0, workers=workers), list[int]()
 
