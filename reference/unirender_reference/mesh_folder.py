@@ -82,6 +82,13 @@ class MeshFolder:
         return MeshFile(self.base / self.names[index], self.names[index])
 
 
+def in_split(index: int, split: Literal["train", "test"], holdout: int) -> bool:
+    """Whether file number `index`, in the order of `find_meshes`, belongs to a split: "test" gets every `holdout`-th,
+    "train" all others; 0: each gets all. The one rule of training sets and of suites, so that they never share a file.
+    """
+    return not holdout or (index % holdout == holdout - 1) == (split == "test")
+
+
 def mesh_folder(
     pattern: str | Path, split: Literal["train", "test"] = "train", holdout: int = 0, limit: int | None = None
 ) -> MeshFolder:
@@ -89,8 +96,8 @@ def mesh_folder(
 
     Args:
         pattern: a folder, searched recursively, or a glob.
-        split: "test" gets every `holdout`-th file in the order of `find_meshes`, "train" all others.
-        holdout: 0: the split gets all files.
+        split: whose files; see `in_split`.
+        holdout: likewise.
         limit: take no more files than this.
 
     Raises:
@@ -108,7 +115,7 @@ def mesh_folder(
     unreadable: list[tuple[str, str]] = []
     found = find_meshes(pattern, lambda folder, reason: unreadable.append((below(folder), reason)))
     for index, path in enumerate(found):
-        if not holdout or (index % holdout == holdout - 1) == (split == "test"):
+        if in_split(index, split, holdout):
             names.append(below(path))
             if len(names) == limit:
                 break

@@ -237,8 +237,10 @@ def test_throughput_is_measured_side_by_side(shards: Path) -> None:
         assert row["ratio"] == pytest.approx(row["trained"] / row["bare"])
         assert min(row.values()) > 0
     about = {"preset": "p", "batch": 4, "size": SIZE, "dtype": "float32", "device": "cpu", "parallel": parallel}
+    about |= {"least": 0.8, "largest": 1.0}
     table = training_table({"trained": 9.0, "bare": 10.0, "ratio": 0.9}, about, 2, 2)
     assert table.sections[0][2] == ("ratio", "0.90")
+    assert "between 0.80 and 1.00" in table.notes[0]
     assert table.notes[1] == "Aim: training / bare >= 0.85: 0.90, met."
 
 

@@ -25,6 +25,8 @@ from unirender_evaluation.suite_spec import SuiteSpec, parse_spec, read_spec, su
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import make_truth
 from unirender_evaluation.truth_file import list_tar, write_tar
+from unirender_reference.mesh_folder import MeshFile, mesh_folder
+from unirender_reference.recipe import read_recipe
 
 MESHES = '\n[folders]\nobjects = "models"\n\n[[meshes]]\nfiles = "*"\n'
 
@@ -71,6 +73,29 @@ def test_standard_is_a_third_real_and_its_constant_scores_a_tenth() -> None:
     counts = [sum(light == name for light, _ in assigned) for name in names]
     assert max(counts) - min(counts) <= 1
     assert all(first[0] != second[0] for first, second in zip(assigned[::2], assigned[1::2], strict=True))
+
+
+@pytest.mark.parametrize("recipe", ["train-64", "train-128"])
+def test_no_mesh_of_standard_is_in_a_training_recipe(recipe: str, tmp_path: Path) -> None:
+    """The suite lists all catalogues at once, a recipe each for itself: both must count alike, at any depth."""
+    catalogues = ("BlendSwap-CC-0", "BlendSwap-CC-BY", "KatorLegaz", "Reallusion", "Scopia")
+    for number, catalogue in enumerate(catalogues):
+        for i in range(125 + number):
+            path = tmp_path / catalogue / ("a" * (i % 3)) / f"{i % 7}{'/deep' * (i % 2)}" / f"{i}.obj"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch()
+    suite = replace(target("standard", None, tmp_path)[0], ceiling_scenes=())
+    test = {str(source.name) for source in suite_sources(suite) if isinstance(source.origin, MeshFile)}
+    assert len(test) == 40
+    train: set[str] = set()
+    for part in read_recipe(recipe).parts.values():
+        if "meshes" in part:
+            files = mesh_folder(tmp_path / part["meshes"], "train", part["holdout"])
+            train |= {f"{part['meshes']}/{name}" for name in files.names}
+    assert len(train) > 400
+    assert not train & test
+    everything = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.obj")}
+    assert test <= everything >= train  # they are named alike, or the comparison above would be of no worth
 
 
 def test_paper_takes_every_file_of_two_folders(tmp_path: Path) -> None:
