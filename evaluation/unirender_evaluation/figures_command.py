@@ -1,15 +1,18 @@
 """`unirender figures`. Light to import; the command loads what it needs when it runs."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 import tyro
 
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, at_least
 
 if TYPE_CHECKING:
+    from unirender.pictures import Picture
     from unirender_evaluation.figures import Grid
     from unirender_evaluation.figures_panels import MitsubaTruth, Subject
     from unirender_evaluation.suites import Scene, Suite
@@ -24,7 +27,8 @@ class Figures:
     """Draw the paper's kinds of figure from any checkpoint, beside Mitsuba's truth: PNG files with labels and PSNR.
 
     Strips of edited metallic and roughness, a grid of relightings, a sheet that compares checkpoints and methods, and
-    an overview of what is found in one picture.
+    an overview of what is found in one picture. Of pictures of your own, whose truth is not known: maps, edits,
+    relightings.
     """
 
     out: Path = Path("figures")
@@ -37,13 +41,15 @@ class Figures:
     """A bundled suite, or the path of a suite's TOML file."""
     scenes: tuple[str, ...] = ()
     """Keys of scenes of the suite. None: two, from its first and second half."""
+    pictures: tuple[Path, ...] = ()
+    """Pictures of your own instead of the suite's, with an alpha channel that cuts the object out: `pictures.png`."""
     kinds: tuple[Kind, ...] = KINDS
     """metallic, roughness: the input edited over `--values`. relighting: under other lights of the suite. comparison: a
-    column for each checkpoint and method. overview: maps, edits and relighting of one picture."""
+    column for each checkpoint and method. overview: maps, edits and relighting of one picture. Not with --pictures."""
     values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of metallic and roughness in the strips, in [0, 1]."""
     lights: int = 4
-    """Of the relighting grid."""
+    """Of the relighting grid, and for --pictures."""
     spp: int = 1024
     """Samples per pixel of the truth that is rendered for strips and relighting."""
     device: Device = "cpu"
@@ -56,7 +62,7 @@ class Figures:
             UsageError: one is outside its range, or named twice.
         """
         at_least(1, lights=self.lights, spp=self.spp)
-        for name in ("scenes", "kinds", "values", "checkpoint", "method"):
+        for name in ("scenes", "pictures", "kinds", "values", "checkpoint", "method"):
             given = getattr(self, name)
             if len(set(given)) < len(given):
                 raise UsageError(f"--{name} {' '.join(map(str, given))}: expected none of them twice")
@@ -64,6 +70,11 @@ class Figures:
         if outside or not self.values:
             shown = " ".join(f"{value:g}" for value in self.values)
             raise UsageError(f"--values {shown}: expected at least one number, all in [0, 1]")
+        beside = [name for name, default in (("scenes", ()), ("kinds", KINDS)) if getattr(self, name) != default]
+        if self.pictures and beside:
+            raise UsageError(
+                f"--{beside[0]}: got it beside --pictures, expected one of the two: scenes are the suite's"
+            )
         if not self.kinds:
             raise UsageError(f"--kinds: expected at least one of {', '.join(KINDS)}")
 
@@ -72,17 +83,49 @@ class Figures:
         self.check()
         from rich.console import Console
 
-        from unirender_evaluation.figures import save
-        from unirender_evaluation.figures_panels import MitsubaTruth
+        from unirender_evaluation.figures import Grid, save
+        from unirender_evaluation.figures_panels import MitsubaTruth, Subject
         from unirender_evaluation.suites import load_suite
 
         console, suite = Console(), load_suite(self.suite)
         scenes = [suite.scene(key) for key in self.scenes] or default_scenes(suite)
-        subjects, truth = self.subjects(), MitsubaTruth(suite, self.spp)
-        for kind in self.kinds:
-            path = save(self.draw(kind, subjects, suite, scenes, truth), self.out / f"{kind}.png")
+        truth = MitsubaTruth(suite, self.spp)
+        grids: dict[str, Callable[[list[Subject]], Grid]] = {
+            kind: partial(self.draw, kind, suite=suite, scenes=scenes, truth=truth) for kind in self.kinds
+        }
+        if self.pictures:
+            grids = {"pictures": partial(self.sheet, suite=suite, pictures=self.read())}
+        subjects = self.subjects()
+        for name, grid in grids.items():
+            path = save(grid(subjects), self.out / f"{name}.png")
             console.print(f"{path} ({path.stat().st_size / 1000:.0f} kB)", highlight=False, markup=False)
         return 0
+
+    def read(self) -> "list[Picture]":
+        """The user's pictures, framed.
+
+        Raises:
+            UnirenderError: some of them cannot be used; all are named.
+        """
+        from unirender_evaluation.figures_pictures import framed, read_cut_out
+
+        found, problems = [], []
+        for path in self.pictures:
+            try:
+                found.append(framed(read_cut_out(path)))
+            except UnirenderError as error:
+                problems.append(str(error))
+        if problems:
+            raise UnirenderError("; ".join(problems))
+        return found
+
+    def sheet(self, subjects: "list[Subject]", suite: "Suite", pictures: "list[Picture]") -> "Grid":
+        """The figure of the user's pictures, relit by lights of the suite."""
+        from unirender_evaluation.figures_panels import other_lights
+        from unirender_evaluation.figures_pictures import pictures_sheet
+
+        lights = {scene.light: suite.environment(scene) for scene in other_lights(suite, [], self.lights)}
+        return pictures_sheet(subjects, pictures, lights, suite.spec.camera)
 
     def subjects(self) -> "list[Subject]":
         """The checkpoints and methods that were named, checkpoints first.

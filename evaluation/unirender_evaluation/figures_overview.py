@@ -31,14 +31,14 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
         environment = suite.environment(other)
         for number, subject in enumerate(taking_part):
             method = subject.row.method
-            maps = _maps(method.decompose(**seen), mask)
+            maps = map_tiles(method.decompose(**seen), mask)
             made = [method.edit(**seen, **edit) if subject.can("edit") else None for edit in edits]
             made.append(method.relight(**seen, environment=environment) if subject.can("relight") else None)
             pictures = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
             lines.append(Line(subject.label, (input_tile(seen, number), *maps, *pictures), starts=number == 0))
         truth = [*(suite.image(scene, edit) for edit in suite.spec.edits), suite.image(other, base)]
         pictures = [Tile(picture_over_white(image, mask)) for image in truth]
-        lines.append(Line("Mitsuba", (None, *_maps(suite.intrinsics(scene, base), mask), *pictures)))
+        lines.append(Line("Mitsuba", (None, *map_tiles(suite.intrinsics(scene, base), mask), *pictures)))
     names = [f"{name} {value:g}" for edit in edits for name, value in edit.items()]
     caption = (
         f"From the picture at the left alone: its maps, then edits of metallic {base[0]:g}, roughness {base[1]:g}."
@@ -46,7 +46,7 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
     return Grid(("input", *MAPS, *names, "relit"), tuple(lines), caption)
 
 
-def _maps(found: Intrinsics, mask: Mask) -> list[Tile | None]:
+def map_tiles(found: Intrinsics, mask: Mask) -> list[Tile | None]:
     """A tile for each of `MAPS` that is there."""
     tiles: list[Tile | None] = []
     for name in MAPS:

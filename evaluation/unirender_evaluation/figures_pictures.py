@@ -1,0 +1,103 @@
+"""The figure of somebody's own pictures: what methods find in photographs, where nobody knows the truth.
+
+A row is a picture and a subject: the input, the maps found in it, the rendering of these maps, edits, relightings.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image as PillowImage
+
+from unirender.camera import Camera
+from unirender.color import image_srgb, srgb_decode, unpremultiply
+from unirender.errors import UnirenderError
+from unirender.pictures import Picture, read_picture
+from unirender_evaluation.figures import Grid, Line, Tile
+from unirender_evaluation.figures_overview import MAPS, map_tiles
+from unirender_evaluation.figures_panels import Subject, able, input_tile, picture_over_white
+
+SIDE = 128  # pixels of the square in which methods see an object
+MARGIN = 0.1  # of that square, left free on each side of the object at least
+EDITS: tuple[dict[str, float], ...] = ({"metallic": 1.0}, {"roughness": 0.1}, {"roughness": 0.9})
+
+Environment = Float[np.ndarray, "eh ew 3"]
+
+
+def read_cut_out(path: Path) -> Picture:
+    """A picture whose alpha channel cuts the object out.
+
+    Raises:
+        UnirenderError: it cannot be read, or has no alpha channel.
+    """
+    picture = read_picture(path)
+    if picture.mask is None:
+        raise UnirenderError(
+            f"{path}: has no alpha channel, which is to say where the object is; save it as a PNG with transparency"
+        )
+    return picture
+
+
+def framed(picture: Picture, side: int = SIDE) -> Picture:
+    """The object alone, in the middle of a square: what lies outside its bounding box is cut off.
+
+    Args:
+        picture: with a mask that covers something.
+        side: of the square, pixels.
+    """
+    assert picture.mask is not None, "read_cut_out has looked"
+    rows, columns = ((picture.mask[..., 0] > 0.5).any(axis=axis).nonzero()[0] for axis in (1, 0))
+    high, wide = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
+    scale = side * (1 - 2 * MARGIN) / max(high, wide)
+    # The square in the picture's pixels; Pillow resamples any box, and what lies outside the picture is added first.
+    middle = (columns[0] + wide / 2, rows[0] + high / 2)
+    border = int(np.ceil(side / scale))
+    premultiplied = np.concatenate([srgb_decode(picture.image_srgb) * picture.mask, picture.mask], axis=-1)
+    padded = np.pad(premultiplied, ((border, border), (border, border), (0, 0)))
+    box = [center + border + sign * side / scale / 2 for sign in (-1, 1) for center in middle]
+    channels = [
+        PillowImage.fromarray(np.ascontiguousarray(channel, np.float32)).resize(
+            (side, side), PillowImage.Resampling.BOX if scale < 1 else PillowImage.Resampling.BILINEAR, box=tuple(box)
+        )
+        for channel in np.moveaxis(padded, -1, 0)
+    ]
+    resampled = np.stack([np.asarray(channel) for channel in channels], axis=-1)
+    mask = np.clip(resampled[..., 3:], 0, 1)
+    return Picture(np.clip(image_srgb(unpremultiply(resampled[..., :3], mask)), 0, 1), mask, picture.name)
+
+
+def pictures_sheet(
+    subjects: Sequence[Subject], pictures: Sequence[Picture], lights: Mapping[str, Environment], camera: Camera
+) -> Grid:
+    """What every subject makes of pictures whose truth is unknown.
+
+    Args:
+        subjects: those that decompose take part.
+        pictures: squares, as `framed` gives them.
+        lights: environments to relight by, by name.
+        camera: that the pictures are taken to be seen through.
+    """
+    lines = []
+    for picture in pictures:
+        assert picture.mask is not None, "framed gives one"
+        seen, mask = {"image_srgb": picture.image_srgb, "mask": picture.mask, "camera": camera}, picture.mask
+        for number, subject in enumerate(able(subjects, "decompose", "sheet of pictures")):
+            method = subject.row.method
+            maps = method.decompose(**seen)
+            made = [method.render(maps.replace(mask=mask)) if subject.can("render") else None]
+            made += [method.edit(**seen, **edit) if subject.can("edit") else None for edit in EDITS]
+            made += [
+                method.relight(**seen, environment=light) if subject.can("relight") else None
+                for light in lights.values()
+            ]
+            tiles = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
+            label = picture.name if len(subjects) == 1 else f"{picture.name}, {subject.label}"
+            lines.append(Line(label, (input_tile(seen, number), *map_tiles(maps, mask), *tiles), starts=number == 0))
+    edits = [f"{name} {value:g}" for edit in EDITS for name, value in edit.items()]
+    columns = ("input", *MAPS, "rendered", *edits, *lights)
+    caption = (
+        "From the picture at the left alone: its maps, these rendered again, edits, and relightings. The truth is not "
+        "known. The object is cut out by the picture's alpha channel; the camera is taken to be the benchmark's."
+    )
+    return Grid(columns, tuple(lines), caption)

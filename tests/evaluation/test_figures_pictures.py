@@ -1,0 +1,114 @@
+"""The figure of one's own pictures: how they are framed, what is asked of whom, what is refused."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from tiny_suites import make_suite
+
+from unirender.camera import Camera
+from unirender.errors import UnirenderError, UsageError
+from unirender.intrinsics import Intrinsics
+from unirender.pictures import Picture
+from unirender_evaluation.figures_command import Figures
+from unirender_evaluation.figures_overview import MAPS
+from unirender_evaluation.figures_panels import Subject
+from unirender_evaluation.figures_pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
+from unirender_evaluation.methods import InputAsAlbedo, UneditedInput
+from unirender_evaluation.rows import make_row
+from unirender_evaluation.suites import load_suite
+
+
+def disc(height: int, width: int, centre: tuple[float, float], radius: float) -> Picture:
+    """A red disc, grey outside of the mask: what is hidden must not bleed in."""
+    y, x = np.mgrid[:height, :width] + 0.5
+    mask = ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2).astype(np.float32)[..., None]
+    image = np.where(mask > 0, np.float32([0.8, 0.2, 0.1]), np.float32(0.5)).astype(np.float32)
+    return Picture(image, mask, "disc.png")
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [disc(200, 320, (60, 130), 50), disc(40, 30, (15, 20), 9), disc(64, 64, (32, 32), 32), disc(90, 90, (3, 45), 30)],
+    ids=["large", "small", "full", "cut off at the left"],
+)
+def test_an_object_stands_in_the_middle_of_its_square(picture: Picture) -> None:
+    found = framed(picture, 64)
+    assert found.image_srgb.shape == (64, 64, 3)
+    assert found.mask is not None
+    covered = found.mask[..., 0] > 0.5
+    rows, columns = (covered.any(axis=axis).nonzero()[0] for axis in (1, 0))
+    for places in (rows, columns):
+        assert abs((places[0] + places[-1]) / 2 - 31.5) <= 1
+    assert max(np.ptp(rows), np.ptp(columns)) + 1 == pytest.approx(64 * (1 - 2 * MARGIN), abs=2)
+    np.testing.assert_allclose(found.image_srgb[covered], np.tile([0.8, 0.2, 0.1], (covered.sum(), 1)), atol=2e-3)
+
+
+class Told(UneditedInput):
+    """Writes down what it is asked."""
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        assert mask.shape == (*image_srgb.shape[:2], 1)
+        return Intrinsics(albedo=np.full_like(image_srgb, 0.5), environment=np.ones((4, 8, 3), np.float32))
+
+    def edit(self, image_srgb: np.ndarray, **given: Any) -> np.ndarray:
+        self.asked.append({name: value for name, value in given.items() if name in ("metallic", "roughness")})
+        return np.zeros_like(image_srgb)
+
+
+def test_every_subject_is_asked_for_maps_edits_and_relightings() -> None:
+    told = Told()
+    pictures = [framed(disc(40, 40, (20, 20), radius), 32) for radius in (8, 15)]
+    lights = {"left": np.ones((4, 8, 3), np.float32), "right": np.ones((8, 16, 3), np.float32)}
+    subjects = [
+        Subject("told", make_row(told, "trivial")),
+        Subject("as albedo", make_row(InputAsAlbedo(), "trivial")),
+    ]
+    grid = pictures_sheet(subjects, pictures, lights, Camera())
+    assert grid.columns[:2] == ("input", "albedo")
+    assert grid.columns[-2:] == ("left", "right")
+    assert [line.label for line in grid.lines] == ["disc.png, told", "disc.png, as albedo"] * 2
+    assert told.asked == list(EDITS) * 2
+    of_told, of_other = (dict(zip(grid.columns, line.tiles, strict=True)) for line in grid.lines[:2])
+    assert of_told["albedo"] is not None
+    assert of_told["normal"] is of_told["rendered"] is None
+    assert of_told["metallic 1"] is not None
+    assert of_other["metallic 1"] is None
+    assert set(MAPS) < set(grid.columns)
+
+
+def test_the_command_draws_pictures_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_suite(tmp_path / "suite")
+    suite = next((tmp_path / "suite").glob("*.toml"))
+    cut = disc(50, 40, (20, 25), 12)
+    assert cut.mask is not None
+    rgba = np.round(np.concatenate([cut.image_srgb, cut.mask], axis=-1) * 255).astype(np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "cut.png")
+    method = "unirender_evaluation.methods:InputAsAlbedo"
+    paths = (tmp_path / "cut.png",)
+    assert Figures(out=tmp_path / "out", suite=str(suite), method=(method,), pictures=paths, lights=1).run() == 0
+    assert "pictures.png" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["pictures.png"]
+    assert len(load_suite(str(suite)).scenes) >= 1
+
+
+def test_what_cannot_be_drawn_is_named_before_a_model_is_loaded(tmp_path: Path) -> None:
+    Image.new("RGB", (20, 20)).save(tmp_path / "opaque.png")
+    with pytest.raises(UnirenderError, match=r"opaque\.png: has no alpha channel"):
+        read_cut_out(tmp_path / "opaque.png")
+    given = Figures(
+        pictures=(tmp_path / "opaque.png", tmp_path / "absent.png"), checkpoint=(tmp_path / "none",), out=tmp_path / "o"
+    )
+    with pytest.raises(UnirenderError, match=r"opaque\.png: has no alpha.*; .*absent\.png: no such file"):
+        given.run()
+    assert not (tmp_path / "o").exists()
+    for beside in ({"scenes": ("a",)}, {"kinds": ("metallic",)}):
+        with pytest.raises(UsageError, match="beside --pictures"):
+            Figures(pictures=(tmp_path / "opaque.png",), **beside).check()  # pyright: ignore[reportArgumentType] - two shapes
+    with pytest.raises(UsageError, match="expected none of them twice"):
+        Figures(pictures=(tmp_path / "a.png", tmp_path / "a.png")).check()
