@@ -47,7 +47,7 @@ def framed(picture: Picture, side: int = SIDE) -> Picture:
         side: of the square, pixels.
     """
     assert picture.mask is not None, "read_cut_out has looked"
-    rows, columns = ((picture.mask[..., 0] > 0.5).any(axis=axis).nonzero()[0] for axis in (1, 0))
+    rows, columns = (np.flatnonzero((picture.mask[..., 0] > 0.5).any(axis=axis)) for axis in (1, 0))
     high, wide = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
     scale = side * (1 - 2 * MARGIN) / max(high, wide)
     # The square in the picture's pixels; Pillow resamples any box, and what lies outside the picture is added first.

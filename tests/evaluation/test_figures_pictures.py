@@ -16,7 +16,7 @@ from unirender_evaluation.figures_command import Figures
 from unirender_evaluation.figures_overview import MAPS
 from unirender_evaluation.figures_panels import Subject
 from unirender_evaluation.figures_pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
-from unirender_evaluation.methods import InputAsAlbedo, UneditedInput
+from unirender_evaluation.methods import InputAsAlbedo
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites import load_suite
 
@@ -25,7 +25,7 @@ def disc(height: int, width: int, centre: tuple[float, float], radius: float) ->
     """A red disc, grey outside of the mask: what is hidden must not bleed in."""
     y, x = np.mgrid[:height, :width] + 0.5
     mask = ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2).astype(np.float32)[..., None]
-    image = np.where(mask > 0, np.float32([0.8, 0.2, 0.1]), np.float32(0.5)).astype(np.float32)
+    image = np.where(mask > 0, [0.8, 0.2, 0.1], 0.5).astype(np.float32)
     return Picture(image, mask, "disc.png")
 
 
@@ -39,15 +39,17 @@ def test_an_object_stands_in_the_middle_of_its_square(picture: Picture) -> None:
     assert found.image_srgb.shape == (64, 64, 3)
     assert found.mask is not None
     covered = found.mask[..., 0] > 0.5
-    rows, columns = (covered.any(axis=axis).nonzero()[0] for axis in (1, 0))
+    rows, columns = (np.flatnonzero(covered.any(axis=axis)) for axis in (1, 0))
     for places in (rows, columns):
         assert abs((places[0] + places[-1]) / 2 - 31.5) <= 1
     assert max(np.ptp(rows), np.ptp(columns)) + 1 == pytest.approx(64 * (1 - 2 * MARGIN), abs=2)
     np.testing.assert_allclose(found.image_srgb[covered], np.tile([0.8, 0.2, 0.1], (covered.sum(), 1)), atol=2e-3)
 
 
-class Told(UneditedInput):
+class Told:
     """Writes down what it is asked."""
+
+    name, config = "told", {"told": 1}
 
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
