@@ -18,6 +18,7 @@ from unirender_evaluation.physics_command import BenchPhysics
 from unirender_evaluation.public_command import BenchPublic
 from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
 from unirender_evaluation.sampling_study_command import BenchSampling
+from unirender_evaluation.shard_scores_command import BenchShards
 from unirender_evaluation.speed_study_command import BenchSpeed
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 from unirender_evaluation.throughput_command import BenchThroughput
@@ -309,6 +310,7 @@ class Bench:
             | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
             | Annotated[BenchRace, tyro.conf.subcommand("race")]
             | Annotated[BenchSampling, tyro.conf.subcommand("sampling")]
+            | Annotated[BenchShards, tyro.conf.subcommand("shards")]
             | Annotated[BenchSpeed, tyro.conf.subcommand("speed")]
             | Annotated[BenchTraining, tyro.conf.subcommand("training")]
             | Annotated[BenchUnknownMesh, tyro.conf.subcommand("unknown-mesh")]

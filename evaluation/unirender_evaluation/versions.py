@@ -64,6 +64,7 @@ COMMANDS = (
     "physics_twins",
     "prediction_check",
     "score_api",
+    "shard_scores",
     "subsets",
     "suite_check",
     "suite_home",
