@@ -88,6 +88,8 @@ def _training_rows(facts: Facts) -> dict[str, str | None]:
         "hardware": ", ".join(part for part in where if part),
         "software": ", ".join(f"{name} {version}" for name, version in software.items()),
         "weights stored as": facts.get("stored_as"),
+        "weights averaged": ", ".join(f"{share:g} of {run}" for run, share in facts.get("averaged", {}).items())
+        or None,
     }
 
 
