@@ -3,6 +3,7 @@
 A row is a picture and a subject: the input, the maps found in it, the rendering of these maps, edits, relightings.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from PIL import Image as PillowImage
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
-from unirender.pictures import Picture, read_picture
+from unirender.pictures import Picture, check_mask, read_picture
 from unirender_evaluation.figures import Grid, Line, Tile
 from unirender_evaluation.figures_overview import MAPS, map_tiles
 from unirender_evaluation.figures_panels import Subject, able, input_tile, picture_over_white
@@ -29,13 +30,14 @@ def read_cut_out(path: Path) -> Picture:
     """A picture whose alpha channel cuts the object out.
 
     Raises:
-        UnirenderError: it cannot be read, or has no alpha channel.
+        UnirenderError: it cannot be read, or has no alpha channel, or one that covers nothing.
     """
     picture = read_picture(path)
     if picture.mask is None:
         raise UnirenderError(
             f"{path}: has no alpha channel, which is to say where the object is; save it as a PNG with transparency"
         )
+    check_mask(picture.mask, str(path))
     return picture
 
 
@@ -47,20 +49,30 @@ def framed(picture: Picture, side: int = SIDE) -> Picture:
         side: of the square, pixels.
     """
     assert picture.mask is not None, "read_cut_out has looked"
-    rows, columns = (np.flatnonzero((picture.mask[..., 0] > 0.5).any(axis=axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((picture.mask[..., 0] >= 0.5).any(axis=axis)) for axis in (1, 0))
     high, wide = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
-    scale = side * (1 - 2 * MARGIN) / max(high, wide)
-    # The square in the picture's pixels; Pillow resamples any box, and what lies outside the picture is added first.
-    middle = (columns[0] + wide / 2, rows[0] + high / 2)
-    border = int(np.ceil(side / scale))
-    premultiplied = np.concatenate([srgb_decode(picture.image_srgb) * picture.mask, picture.mask], axis=-1)
-    padded = np.pad(premultiplied, ((border, border), (border, border), (0, 0)))
-    box = [center + border + sign * side / scale / 2 for sign in (-1, 1) for center in middle]
+    half = max(high, wide) / (1 - 2 * MARGIN) / 2  # of the square, in pixels of the picture; it may stick out
+    starts = [float(first) + extent / 2 - half for first, extent in ((rows[0], high), (columns[0], wide))]
+    ends = [start + 2 * half for start in starts]
+    height, width = picture.mask.shape[:2]
+    inside = [
+        slice(max(0, math.floor(s)), min(n, math.ceil(e)))
+        for s, e, n in zip(starts, ends, (height, width), strict=True)
+    ]
+    outside = [
+        (max(0, -math.floor(s)), max(0, math.ceil(e) - n))
+        for s, e, n in zip(starts, ends, (height, width), strict=True)
+    ]
+    image, mask = (values[inside[0], inside[1]] for values in (picture.image_srgb, picture.mask))
+    cut = np.pad(np.concatenate([srgb_decode(image) * mask, mask], axis=-1), (*outside, (0, 0)))
+    top, left = (start - math.floor(start) for start in starts)
     channels = [
         PillowImage.fromarray(np.ascontiguousarray(channel, np.float32)).resize(
-            (side, side), PillowImage.Resampling.BOX if scale < 1 else PillowImage.Resampling.BILINEAR, box=tuple(box)
+            (side, side),
+            PillowImage.Resampling.BOX if 2 * half > side else PillowImage.Resampling.BILINEAR,
+            box=(left, top, left + 2 * half, top + 2 * half),
         )
-        for channel in np.moveaxis(padded, -1, 0)
+        for channel in np.moveaxis(cut, -1, 0)
     ]
     resampled = np.stack([np.asarray(channel) for channel in channels], axis=-1)
     mask = np.clip(resampled[..., 3:], 0, 1)

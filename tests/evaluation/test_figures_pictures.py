@@ -103,6 +103,9 @@ def test_what_cannot_be_drawn_is_named_before_a_model_is_loaded(tmp_path: Path) 
     Image.new("RGB", (20, 20)).save(tmp_path / "opaque.png")
     with pytest.raises(UnirenderError, match=r"opaque\.png: has no alpha channel"):
         read_cut_out(tmp_path / "opaque.png")
+    Image.new("RGBA", (20, 20)).save(tmp_path / "empty.png")
+    with pytest.raises(UnirenderError, match=r"empty\.png"):
+        read_cut_out(tmp_path / "empty.png")
     given = Figures(
         pictures=(tmp_path / "opaque.png", tmp_path / "absent.png"), checkpoint=(tmp_path / "none",), out=tmp_path / "o"
     )
