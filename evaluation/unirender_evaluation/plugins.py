@@ -4,8 +4,9 @@
     --method SPEC    module:Class, among what is installed or in the current directory; or path/to/file.py:Class
 
 Each names a class, or any callable that returns a method, or a method itself (see `methods`). After a `?` a SPEC has
-arguments for the callable, `name=value` with `&` between: `my_method.py:Retinex?sigma=4&name=wide`. The current
-directory and the folder of a file are searched last: a stranger's `copy.py` never stands in for Python's.
+arguments for the callable, `name=value` with `&` between: `my_method.py:Retinex?sigma=4&name=wide`; in a value `%26` is
+an `&` and `%25` a `%`, as in a web address. The current directory and the folder of a file are searched last: a
+stranger's `copy.py` never stands in for Python's.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType, ModuleType, NoneType, UnionType
 from typing import Any, Union, get_args, get_origin
+from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.methods import CAPABILITIES, capabilities
@@ -102,7 +104,7 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
             raise UsageError(f"{what}: {name} is given twice, expected once")
         if name not in taken:
             raise UsageError(f"{what}: no argument {name!r}, expected some of {', '.join(taken) or 'none'}")
-        arguments[name] = _value(text, taken[name].annotation, f"{what}: {name}")
+        arguments[name] = _value(unquote(text), taken[name].annotation, f"{what}: {name}")
     return arguments
 
 

@@ -59,6 +59,7 @@ def test_arguments_have_the_types_of_the_signature(file: Path) -> None:
     found = named_plugin(f"{file}:Given?sigma=2&folder=a/b=c&count=3&fast=true&plain=7&depth=2").method.config
     assert found == {"sigma": 2.0, "folder": "a/b=c", "count": 3, "fast": True, "plain": "7", "depth": 2}
     assert isinstance(found["sigma"], float)
+    assert named_plugin(f"{file}:Given?plain=Q%26A, 100%25, 5%").method.config["plain"] == "Q&A, 100%, 5%"
     default = named_plugin(f"{file}:Given").method.config
     assert default == {"sigma": 1.0, "folder": "None", "count": 1, "fast": False, "plain": "", "depth": None}
 
