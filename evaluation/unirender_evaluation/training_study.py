@@ -21,6 +21,7 @@ QUESTIONS = {
     "physics": "Physics",
     "weights": "Weights of the loss",
     "batches": "Batches",
+    "optimizer": "Optimiser",
     "network": "Network",
 }
 
@@ -83,6 +84,7 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
             f"runs of {side_by_side} pictures differ in one thing only",
             group_size=side_by_side,
         ),
+        run("muon", "optimizer", "Muon for hidden matrices", optimizer=replace(base.optimizer, kind="muon")),
         model("light-encoder", "network", "light through an encoder of its own", light="encoder"),
         model("patch-1", "network", "pixels as they are", patch=1),
         model("patch-4", "network", "4 x 4 pixels a latent", patch=4),

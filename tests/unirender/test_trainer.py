@@ -1,6 +1,7 @@
 """The trainer: exact resume, averaged weights, overfitting one sample, and a run on shards."""
 
 import dataclasses
+import functools
 import io
 import json
 import math
@@ -8,7 +9,7 @@ import os
 import threading
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -85,10 +86,12 @@ def run_for(
     return lines
 
 
-@pytest.mark.parametrize("parallel", [1, 2])
-def test_resume_is_exact(tmp_path: Path, parallel: int) -> None:
-    whole = run_for(tmp_path / "a", 3, parallel=parallel)
-    parts = run_for(tmp_path / "b", 1, parallel=parallel) + run_for(tmp_path / "b", 3, parallel=parallel)
+@pytest.mark.parametrize(("parallel", "kind"), [(1, "adamw"), (2, "adamw"), (1, "muon"), (2, "muon")])
+def test_resume_is_exact(tmp_path: Path, parallel: int, kind: Literal["adamw", "muon"]) -> None:
+    train = dataclasses.replace(TRAIN, optimizer=dataclasses.replace(TRAIN.optimizer, kind=kind))
+    run = functools.partial(run_for, config=train, parallel=parallel)
+    whole = run(tmp_path / "a", 3)
+    parts = run(tmp_path / "b", 1) + run(tmp_path / "b", 3)
     assert parts == whole
     a, b = (load_state(tmp_path / name) for name in "ab")
     assert a is not None
@@ -96,7 +99,7 @@ def test_resume_is_exact(tmp_path: Path, parallel: int) -> None:
     for group in ("model", "ema"):
         first, second = (x[group].get("average", x[group]) for x in (a, b))
         assert all(torch.equal(first[name], second[name]) for name in first), group
-    other = run_for(tmp_path / "c", 1, config=dataclasses.replace(TRAIN, seed=1), parallel=parallel)
+    other = run(tmp_path / "c", 1, config=dataclasses.replace(train, seed=1))
     assert other != whole[:1]  # the twin that must differ
 
 

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from torch import nn
 
+from unirender.training.muon import is_hidden_matrix
+
 
 @dataclass(frozen=True)
 class TrainingBytes:
@@ -14,7 +16,7 @@ class TrainingBytes:
 
     weights: int
     gradients: int
-    moments: int  # AdamW's two
+    moments: int  # the optimiser's: AdamW's two, or Muon's one of the weights that it takes
     average: int  # of the weights
 
     @property
@@ -24,15 +26,24 @@ class TrainingBytes:
     def __str__(self) -> str:
         return (
             f"{readable(self.total)} besides activations: weights {readable(self.weights)}, gradients "
-            f"{readable(self.gradients)}, AdamW's moments {readable(self.moments)}, averaged weights "
+            f"{readable(self.gradients)}, moments {readable(self.moments)}, averaged weights "
             f"{readable(self.average)}"
         )
 
 
-def training_bytes(model: nn.Module) -> TrainingBytes:
-    """Bytes of the training of all parameters of a model, of which each is kept in its own precision."""
-    weights = sum(p.numel() * p.element_size() for p in model.parameters())
-    return TrainingBytes(weights, gradients=weights, moments=2 * weights, average=weights)
+def training_bytes(model: nn.Module, optimizer: str = "adamw") -> TrainingBytes:
+    """Bytes of the training of all parameters of a model, of which each is kept in its own precision.
+
+    Args:
+        model: the network.
+        optimizer: `OptimizerConfig.kind`.
+    """
+    one_moment = optimizer == "muon"
+    weights = moments = 0
+    for name, p in model.named_parameters():
+        weights += p.nbytes
+        moments += p.nbytes if one_moment and is_hidden_matrix(name, p) else 2 * p.nbytes
+    return TrainingBytes(weights, gradients=weights, moments=moments, average=weights)
 
 
 def readable(number: int) -> str:

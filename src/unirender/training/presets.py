@@ -60,8 +60,9 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, linear warm-up, cosine decay."""
+    """AdamW or Muon, linear warm-up, cosine decay."""
 
+    kind: Literal["adamw", "muon"] = "adamw"  # muon: of hidden matrices; see `unirender.training.muon`
     learning_rate: float = 1e-3
     beta1: float = 0.9
     beta2: float = 0.99
@@ -151,6 +152,12 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "tiny_cycle_sampled": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle_steps=2)),
     "tiny_composite_loss": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, composite=1.0)),
+    "tiny_muon": dataclasses.replace(
+        _TINY,
+        loss=dataclasses.replace(_TINY.loss, composite=1.0),
+        optimizer=OptimizerConfig(kind="muon"),
+        p_render=0.25,
+    ),
     "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),

@@ -214,7 +214,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     passes = "one pass at a time" if at_once == 1 else f"{at_once} passes side by side"
     say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}")
     if processes.is_main:
-        say(f"memory: {training_bytes(trainer.model)}")
+        say(f"memory: {training_bytes(trainer.model, config.optimizer.kind)}")
     resumed = (out / STATE_FILE).is_file()
     with contextlib.closing(source):
         with (

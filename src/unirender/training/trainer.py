@@ -32,6 +32,7 @@ from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
 from unirender.training.losses import LossFunction
+from unirender.training.muon import make_optimizer
 from unirender.training.passes import BatchGradient, Split, laid_out_like
 from unirender.training.pictures import save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
@@ -95,13 +96,9 @@ class Trainer:
         self.model = model
         self.generator = torch.Generator().manual_seed(config.seed)
         self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
-        o = config.optimizer
-        # fused: one pass over the weights instead of ten; a state from before keeps the way it was made with
-        self.optimizer = torch.optim.AdamW(
-            self.model.parameters(), o.learning_rate, (o.beta1, o.beta2), weight_decay=o.weight_decay, fused=True
-        )
-        self.ema = Ema(self.model, o.ema_decay)
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
+        self.optimizer = make_optimizer(self.model, config.optimizer, self.gradient.pool)
+        self.ema = Ema(self.model, config.optimizer.ema_decay)
         self.log = RunLog(run.out, processes)
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
