@@ -64,8 +64,10 @@ def test_zeros_stay_zeros() -> None:
     assert not orthogonal_factor(torch.zeros(1, 32, 64)).any()
 
 
-def stepped(weight: nn.Parameter, gradients: list[Tensor], **options: float) -> Tensor:
-    optimizer = Muon([weight], **{"lr": 1e-2, "weight_decay": 0.0} | options)
+def stepped(
+    weight: nn.Parameter, gradients: list[Tensor], lr: float = 1e-2, momentum: float = 0.95, decay: float = 0.0
+) -> Tensor:
+    optimizer = Muon([weight], lr, momentum, weight_decay=decay)
     for gradient in gradients:
         weight.grad = torch.empty_like(weight).copy_(gradient)
         optimizer.step()
@@ -76,7 +78,7 @@ def test_a_step_is_the_rule() -> None:
     torch.manual_seed(0)
     start, first, second = torch.randn(3, 40, 64)
     mu, lr, decay = 0.9, 0.02, 0.5
-    found = stepped(nn.Parameter(start.clone()), [first, second], lr=lr, momentum=mu, weight_decay=decay)
+    found = stepped(nn.Parameter(start.clone()), [first, second], lr, mu, decay)
     expected, momentum = start.double(), torch.zeros(40, 64).double()
     for gradient in (first, second):
         momentum = mu * momentum + (1 - mu) * gradient
