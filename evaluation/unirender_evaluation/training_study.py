@@ -62,6 +62,9 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
     def model(name: str, group: str, label: str, **changes: Any) -> Choice:
         return run(name, group, label, model=replace(base.model, **changes))
 
+    def optimizer(name: str, label: str, **changes: Any) -> Choice:
+        return run(name, "optimizer", label, optimizer=replace(base.optimizer, **changes))
+
     halves = get_preset("tiny_without_unified").model
     side_by_side = math.gcd(get_preset("tiny_one_at_a_time").group_size, base.batch_size)
     return (
@@ -84,7 +87,14 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
             f"runs of {side_by_side} pictures differ in one thing only",
             group_size=side_by_side,
         ),
-        run("muon", "optimizer", "Muon for hidden matrices", optimizer=replace(base.optimizer, kind="muon")),
+        optimizer("fast", "twice the learning rate", learning_rate=2 * base.optimizer.learning_rate),
+        optimizer("muon", "Muon for hidden matrices", kind="muon"),
+        optimizer(
+            "muon-fast",
+            "Muon at twice the learning rate",
+            kind="muon",
+            learning_rate=2 * base.optimizer.learning_rate,
+        ),
         model("light-encoder", "network", "light through an encoder of its own", light="encoder"),
         model("patch-1", "network", "pixels as they are", patch=1),
         model("patch-4", "network", "4 x 4 pixels a latent", patch=4),
