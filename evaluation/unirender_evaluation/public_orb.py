@@ -72,6 +72,7 @@ class StanfordOrb:
     tables: tuple[TableSpec, ...] = (scoring.MAPS_TABLE, scoring.RELIT_TABLE)
     modules: tuple[str, ...] = ("public_orb*", "public_metrics", "public_sets")
     variant = Variant("masked")
+    averaged_first: str | None = "captures"
 
     def __init__(self, folder: Path, resolution: int = RESOLUTION, tolerance_deg: float = TOLERANCE_DEG) -> None:
         self.folder, self.resolution, self.tolerance_deg = folder, resolution, tolerance_deg
@@ -126,6 +127,10 @@ class StanfordOrb:
     def samples(self) -> tuple[Sample, ...]:
         """The maps of every test photograph that has a truth, and every relighting."""
         return self._samples
+
+    def unit(self, sample: str) -> str:
+        """The capture that a method was given."""
+        return self._tests[sample].capture if sample in self._tests else sample.split("/")[0]
 
     def _map_sample(self, key: str, frame: Frame, capture: Capture) -> Sample:
         truths = frame_truths(self.folder, frame).values()

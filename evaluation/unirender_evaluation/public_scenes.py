@@ -20,6 +20,8 @@ class Scenes:
         resolution: the longest side of what methods are handed, pixels; larger photographs are scaled down to it.
     """
 
+    averaged_first: str | None = None
+
     def __init__(self, folder: Path, resolution: int = RESOLUTION) -> None:
         self.folder, self.resolution = folder, resolution
 
@@ -34,6 +36,10 @@ class Scenes:
     def frame(self, sample: Sample) -> tuple[tuple[int, int], Camera]:
         """The photograph's own size: a folder of predictions is made from the set itself."""
         return image_size(sample.files[0]), Camera()
+
+    def unit(self, sample: str) -> str:
+        """Every photograph counts."""
+        return sample
 
     def about_scenes(self) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs for the protocol line."""

@@ -96,6 +96,7 @@ class PublicSet(Protocol):
         modules: that measure, part of the records' keys.
         variant: what of a picture counts, for the tables' headings.
         resolution: of what methods are handed, pixels (see each reader); part of the keys.
+        averaged_first: what is averaged before the table's means, in the plural; None: nothing, every sample counts.
     """
 
     name: str
@@ -103,6 +104,7 @@ class PublicSet(Protocol):
     modules: tuple[str, ...]
     variant: Variant
     resolution: int
+    averaged_first: str | None
 
     def samples(self) -> tuple[Sample, ...]:
         """Every question. Raises `PublicSetError` with all that is wrong with the folder's layout."""
@@ -118,6 +120,10 @@ class PublicSet(Protocol):
 
     def score(self, sample: Sample, answer: Answer, lpips: Sequence[Lpips]) -> dict[str, float]:
         """Metric key -> value. Raises UnirenderError where a file of the truth is broken."""
+        ...
+
+    def unit(self, sample: str) -> str:
+        """What of `averaged_first` the sample of that key belongs to; the key itself where there is nothing."""
         ...
 
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:

@@ -5,6 +5,7 @@ import inspect
 import io
 import json
 import re
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from unirender_evaluation.public_orb import StanfordOrb
 from unirender_evaluation.public_rows import trivial_rows
 from unirender_evaluation.public_run import PublicResult, PublicRun, run
 from unirender_evaluation.public_sets import PublicSet
+from unirender_evaluation.public_tables import averaged
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, plugin_rows, prediction_rows
 from unirender_evaluation.versions import Versions, package_folder
@@ -140,6 +142,25 @@ def test_a_killed_run_leaves_no_table_and_goes_on(tmp_path: Path, monkeypatch: p
 
     assert told(continued.records) == told(whole.records)
     assert (out / "tables.md").read_text() == (tmp_path / "whole" / "tables.md").read_text()
+
+
+def test_orb_averages_each_capture_first(tmp_path: Path) -> None:
+    """The first capture has one photograph with maps, the second two."""
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32)
+    first = done(orb, plugin_rows([Plugin(Ramp(), "test")]), tmp_path / "out")
+    records = [
+        replace(r, values={"normal.angle": value}) for r, value in zip(first.records[:3], (1.0, 2.0, 6.0), strict=True)
+    ]
+    assert [r.sample for r in records] == ["cup_scene001_0000", "cup_scene002_0000", "cup_scene002_0001"]
+    units = averaged(orb, records)
+    assert [(r.sample, dict(r.values)) for r in units] == [
+        ("cup_scene001", {"normal.angle": 1.0}),
+        ("cup_scene002", {"normal.angle": 4.0}),
+    ]
+    iiw = Iiw(make_iiw(tmp_path / "iiw"))
+    assert averaged(iiw, records) == records
+    text = (tmp_path / "out" / "tables.md").read_text()
+    assert "3 samples of 1 objects or scenes; means over 2 captures, each the mean of its samples" in text
 
 
 def write_predictions(public: PublicSet, method: Ramp, folder: Path, leave_out: str = "") -> Path:
