@@ -30,6 +30,7 @@ from unirender.models.lean_imports import lean_imports
 from unirender.options import notice
 from unirender.training.run import Train
 from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
+from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.figures_command import Figures
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
@@ -97,6 +98,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Figures, tyro.conf.subcommand("figures")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
 MODEL = (Decompose, Edit, Relight, Render)  # in a process of their own these have a `quick_start`

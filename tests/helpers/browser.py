@@ -1,6 +1,6 @@
 """A real browser for tests: headless Chromium through chromedriver's HTTP interface (W3C WebDriver), no package needed.
 
-It opens a file from file:// as a reader would, clicks and types, and keeps what the page wrote to the console and every
+It opens a file from file:// or an address as a reader would, clicks and types, and keeps what the page wrote to the console and every
 address that it asked for. `Browser.start` raises where Chromium or chromedriver is missing: its tests then fail, they
 are not skipped.
 """
@@ -81,9 +81,9 @@ class Browser:
             process.terminate()
             process.wait(PATIENCE)
 
-    def open(self, path: Path) -> None:
-        """Opens a file from file:// and waits until it is loaded."""
-        _call(f"{self.address}/url", {"url": path.resolve().as_uri()})
+    def open(self, page: Path | str) -> None:
+        """Opens a file from file://, or an address, and waits until it is loaded."""
+        _call(f"{self.address}/url", {"url": page.resolve().as_uri() if isinstance(page, Path) else page})
 
     def ask(self, script: str, *arguments: Any) -> Any:
         """Runs JavaScript in the page and returns its value; `arguments[i]` are the arguments."""
@@ -103,6 +103,23 @@ class Browser:
     def press(self, selector: str, key: str) -> None:
         """Types one key (of `KEYS`, or a letter) into an element."""
         _call(f"{self.element(selector)}/value", {"text": KEYS.get(key, key)})
+
+    def upload(self, selector: str, path: Path) -> None:
+        """Chooses a file for an `<input type="file">`, which may be hidden, as its dialogue would."""
+        _call(f"{self.element(selector)}/value", {"text": str(path.resolve())})
+
+    def wait(self, script: str, *arguments: Any, seconds: float = PATIENCE) -> Any:
+        """The value of JavaScript, as soon as it is true.
+
+        Raises:
+            TimeoutError: it never was.
+        """
+        end = time.monotonic() + seconds
+        while not (value := self.ask(script, *arguments)):
+            if time.monotonic() > end:
+                raise TimeoutError(f"after {seconds:g} s still not true in the page: {script} {arguments or ''}")
+            time.sleep(0.02)
+        return value
 
     def drag(self, selector: str, start: float, end: float) -> None:
         """Drags the mouse inside an element, from and to fractions of its width, at half of its height."""

@@ -1,0 +1,197 @@
+"""What the page does, as plain functions: picture -> decomposition -> edit and light -> check by Mitsuba.
+
+A picture is taken apart once; each movement of a slider then costs one rendering. The anchored picture carries over
+what the decomposition could not explain (`unirender.pipelines.editing.anchor`), for which the rendering of the unedited
+maps is needed: it is kept, too.
+
+Notation: I the picture, R_0 and R_1 the renders of the maps before and after the edit.
+"""
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from unirender.color import srgb_decode
+from unirender.commands import MUCH_COARSE
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import rotate_environment
+from unirender.pictures import Picture
+from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
+from unirender.pipelines.inputs import as_environment, unit_value
+from unirender.pipelines.results import Decomposition
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender_evaluation.gallery import flip_map, image_picture
+from unirender_evaluation.metrics import psnr
+from unirender_reference.shade import shade
+
+SPP = 256  # of Mitsuba's check
+SAMPLES = 5  # of the spread
+
+Environment = Float[np.ndarray, "eh ew 3"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A picture that was taken apart.
+
+    Attributes:
+        picture: with a mask.
+        decomposition: of it, mode `mean`.
+        rendered: R_0, premultiplied linear.
+    """
+
+    picture: Picture
+    decomposition: Decomposition
+    rendered: Float[np.ndarray, "h w 3"]
+
+    @property
+    def mask(self) -> Float[np.ndarray, "h w 1"]:
+        return self.decomposition.intrinsics.require("mask")["mask"]
+
+    @property
+    def image_linear(self) -> Float[np.ndarray, "h w 3"]:
+        """I, premultiplied linear."""
+        return srgb_decode(self.picture.image_srgb) * self.mask
+
+
+@dataclass(frozen=True)
+class Controls:
+    """What a visitor has set.
+
+    Attributes:
+        metallic: of the whole object, [0, 1]; None: as predicted.
+        roughness: the same.
+        light: lat-long radiance in camera axes, any scale; None: the predicted light.
+        turn_deg: by which the light is turned about +y, from +z towards +x.
+        anchored: whether the change is applied to the picture; else the plain render is shown.
+    """
+
+    metallic: float | None = None
+    roughness: float | None = None
+    light: Environment | None = None
+    turn_deg: float = 0.0
+    anchored: bool = True
+
+
+@dataclass(frozen=True)
+class View:
+    """What is seen under some controls.
+
+    Attributes:
+        image_linear: premultiplied, linear, >= 0.
+        rendered: R_1, the plain render.
+        intrinsics: the maps and the light as set.
+        remarks: what the picture does not show, and why.
+    """
+
+    image_linear: Float[np.ndarray, "h w 3"]
+    rendered: Float[np.ndarray, "h w 3"]
+    intrinsics: Intrinsics
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Check:
+    """The same maps under the same light, by the model and by Mitsuba.
+
+    Attributes:
+        model: premultiplied linear.
+        mitsuba: the same.
+        flip: FLIP error in colours.
+        flip_mean: over the object.
+        psnr_db: inside the mask, sRGB.
+        seconds: that Mitsuba took, compilation included.
+    """
+
+    model: Float[np.ndarray, "h w 3"]
+    mitsuba: Float[np.ndarray, "h w 3"]
+    flip: Float[np.ndarray, "h w 3"]
+    flip_mean: float
+    psnr_db: float
+    seconds: float
+
+
+def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
+    """Inverse rendering, and the rendering of what was found.
+
+    Args:
+        pipeline: the model.
+        picture: with a mask.
+
+    Raises:
+        UnirenderError: the picture or its mask is not usable.
+    """
+    decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
+    return Subject(picture, decomposition, pipeline.render(decomposition.intrinsics))
+
+
+def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> View:
+    """The subject with another material, under another light.
+
+    Under the predicted light as it stands, s follows the new roughness as in `UniRenderPipeline.edit`; under any other
+    s and d are derived from the normals, as in `UniRenderPipeline.relight`.
+
+    Raises:
+        UnirenderError: a number is outside its range, or the light is not usable.
+    """
+    before = subject.decomposition.intrinsics
+    edited, remarks = before, []
+    if controls.metallic is not None:
+        edited = edited.replace(metallic=constant_map(unit_value("metallic", controls.metallic), subject.mask))
+    if controls.roughness is not None:
+        edited = edited.replace(roughness=constant_map(unit_value("roughness", controls.roughness), subject.mask))
+    if controls.light is not None or controls.turn_deg % 360:
+        predicted = before.require("environment")["environment"]
+        light = turned(predicted if controls.light is None else as_environment(controls.light), controls.turn_deg)
+        edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
+        remarks.append("Under a light that was changed, nothing casts a shadow.")
+    elif controls.roughness is not None:
+        target = edited.require("roughness")["roughness"]
+        edited = edited.replace(specular=specular_for_roughness(before, target)[0])
+        coarse = float(too_coarse(before, target)[subject.mask > 0].mean())
+        if coarse > MUCH_COARSE:
+            remarks.append(
+                f"The predicted light is too coarse to show what roughness {controls.roughness:g} reflects on "
+                f"{coarse:.0%} of the object: its highlights stay as wide as they were."
+            )
+    rendered = subject.rendered if edited is before else pipeline.render(edited)
+    image = anchor(subject.image_linear, subject.rendered, rendered) if controls.anchored else rendered
+    return View(image, rendered, edited, tuple(remarks))
+
+
+def turned(environment: Environment, turn_deg: float) -> Environment:
+    """A light turned about +y: what came from +z comes from +x after 90 degrees. Bilinear."""
+    if not turn_deg % 360:
+        return environment
+    c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    return rotate_environment(environment, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=np.float32))
+
+
+def check(seen: View, spp: int = SPP) -> Check:
+    """Mitsuba shades the maps that the model rendered, under the same light.
+
+    Raises:
+        UnirenderError: Mitsuba cannot run here, or the light is not usable.
+    """
+    mask = seen.intrinsics.require("mask")["mask"]
+    start = time.perf_counter()
+    truth = shade(seen.intrinsics, spp=spp)
+    seconds = time.perf_counter() - start
+    pictures = [image_picture(image, mask) for image in (seen.rendered, truth)]
+    flip, flip_mean = flip_map(*pictures, mask)
+    return Check(seen.rendered, truth, flip, flip_mean, psnr(*pictures, mask), seconds)
+
+
+def spread(pipeline: UniRenderPipeline, subject: Subject, samples: int = SAMPLES, seed: int = 0) -> Mapping:
+    """Standard deviation of every map over diffusion samples of the decomposition, by name of the map."""
+    generator = torch.Generator().manual_seed(seed)
+    found = pipeline.decompose(
+        subject.picture.image_srgb, subject.picture.mask, mode="sample", num_samples=samples, generator=generator
+    )
+    assert found.std is not None, "several samples have a spread"
+    return found.std

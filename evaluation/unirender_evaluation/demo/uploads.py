@@ -1,0 +1,183 @@
+"""What a visitor hands in: a picture, a mask, a light. Files are looked at before they are decoded.
+
+An upload lives in memory. The file that the web server wrote is deleted when it is taken; the readers of the package
+want files again, so they get one in a temporary folder that is gone when they are done. Messages name the file as its
+owner does.
+"""
+
+import contextlib
+import io
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+from jaxtyping import Float
+from PIL import Image
+
+from unirender.errors import UnirenderError
+from unirender.lighting import resample_environment
+from unirender.options import MANY_CLIPPED
+from unirender.pictures import Picture, read_mask, read_picture
+from unirender_evaluation.figures_pictures import framed
+from unirender_reference.lights import load_light
+
+SIDES = (64, 128)  # pixels of the square in which the page works
+LIGHT_SHAPE = (128, 256)  # rows and columns to which a larger light is brought: finer ones do not show at these sides
+RADIANCE_SIZE = re.compile(rb"^[-+]Y +(\d+) +[-+]X +(\d+)\s*$", re.MULTILINE)
+FLOAT_MAP_SIZE = re.compile(rb"^P[Ff]\s+(\d+)\s+(\d+)\s")
+HEAD = 4096  # bytes in which the sizes of .hdr and .pfm files stand
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What is taken, and for how long a request may run.
+
+    Attributes:
+        megabytes: size of a file, in millions of bytes.
+        pixels: width times height.
+        seconds: of a single request.
+    """
+
+    megabytes: float
+    pixels: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Upload:
+    """A file in memory.
+
+    Attributes:
+        name: as its owner calls it, without folders.
+        data: its bytes.
+    """
+
+    name: str
+    data: bytes
+
+    @classmethod
+    def take(cls, path: str | Path) -> "Upload":
+        """Reads a file and deletes it.
+
+        Raises:
+            UnirenderError: it is not there.
+        """
+        path = Path(path)
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise UnirenderError(f"{path.name}: did not arrive ({error.strerror}); drop it in again") from error
+        path.unlink(missing_ok=True)
+        return cls(path.name, data)
+
+
+def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[Picture, tuple[str, ...]]:
+    """A picture with a mask, and remarks on what was assumed and what the picture cannot show.
+
+    Args:
+        picture: PNG, JPG or EXR.
+        mask: picture of the coverage; None: the alpha channel, else the whole frame.
+        limits: of both files.
+
+    Raises:
+        UnirenderError: a file is too large, or no readable picture; or the mask does not fit or is empty.
+    """
+    remarks = []
+    with _as_file(picture, limits) as path:
+        found = read_picture(path)
+    height, width = found.image_srgb.shape[:2]
+    if mask is not None:
+        with _as_file(mask, limits) as path:
+            found = replace(found, mask=read_mask(path, (height, width)))
+    elif found.mask is None:
+        remarks.append(
+            "The picture has no alpha channel, and there is no mask: the whole frame is taken as the object."
+        )
+        found = replace(found, mask=np.ones((height, width, 1), dtype=np.float32))
+    if found.clipped > MANY_CLIPPED:
+        remarks.append(f"{found.clipped:.0%} of the object is clipped at display white: radiance is lost there.")
+    return found, tuple(remarks)
+
+
+def square(picture: Picture, side: int) -> Picture:
+    """The object in the middle of a square of `side` pixels.
+
+    Raises:
+        UnirenderError: another side than one of `SIDES`.
+    """
+    if side not in SIDES:
+        raise UnirenderError(f"resolution: got {side}, expected one of {', '.join(map(str, SIDES))} pixels")
+    return framed(picture, side)
+
+
+def read_light(light: Upload, limits: Limits) -> Float[np.ndarray, "eh ew 3"]:
+    """Radiance of a lat-long HDR, EXR or PFM, or of a photograph as a light; at most `LIGHT_SHAPE` large.
+
+    Raises:
+        UnirenderError: the file is too large or cannot be used as a light.
+    """
+    with _as_file(light, limits) as path:
+        environment = load_light(path).environment
+    if environment.shape[0] > LIGHT_SHAPE[0]:
+        return resample_environment(environment, LIGHT_SHAPE)
+    return environment
+
+
+@contextlib.contextmanager
+def _as_file(upload: Upload, limits: Limits) -> Iterator[Path]:
+    """The upload as a file of its name, for readers; its errors name no folder.
+
+    Raises:
+        UnirenderError: it has more bytes or pixels than the limits allow.
+    """
+    check_size(upload, limits)
+    with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
+        path = Path(folder) / upload.name
+        path.write_bytes(upload.data)
+        try:
+            yield path
+        except UnirenderError as error:
+            raise UnirenderError(str(error).replace(f"{folder}/", "")) from error
+
+
+def check_size(upload: Upload, limits: Limits) -> None:
+    """Looks at the size of a file and of the picture in it, without decoding it.
+
+    Raises:
+        UnirenderError: it is above the limits.
+    """
+    if len(upload.data) > limits.megabytes * 1e6:
+        raise UnirenderError(
+            f"{upload.name}: {len(upload.data) / 1e6:.1f} MB, expected at most {limits.megabytes:g} MB; scale it down "
+            "first"
+        )
+    size = pixel_size(upload)
+    if size is not None and size[0] * size[1] > limits.pixels:
+        raise UnirenderError(
+            f"{upload.name}: {size[0]} x {size[1]} pixels, expected at most {limits.pixels:,}; scale it down first"
+        )
+
+
+def pixel_size(upload: Upload) -> tuple[int, int] | None:
+    """Width and height as the file's head says; None where it has none: whoever reads it will say so."""
+    suffix, head = Path(upload.name).suffix.lower(), upload.data[:HEAD]
+    if suffix == ".exr":
+        try:
+            window = OpenEXR.File(io.BytesIO(upload.data), header_only=True).header()["dataWindow"]
+        except Exception:  # the binding raises several types for broken data
+            return None
+        width, height = (int(value) for value in window[1] - window[0] + 1)
+        return width, height
+    if found := RADIANCE_SIZE.search(head):
+        return int(found[2]), int(found[1])
+    if found := FLOAT_MAP_SIZE.match(head):
+        return int(found[1]), int(found[2])
+    try:
+        with Image.open(io.BytesIO(upload.data)) as file:
+            return file.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None

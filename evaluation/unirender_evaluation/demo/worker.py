@@ -1,0 +1,135 @@
+"""A process that works for the page: each job within a time limit, and a crash in it costs that job alone.
+
+    with Worker(start, seconds=60) as worker:       # start() makes the context, in the process
+        answer = worker.run(job, 1, 2)              # job(context, 1, 2), in the process
+
+A job that is not done in time is stopped with its process, and the next one finds a new process. Files of strangers are
+decoded in there, too: what a decoder does to its process it does not do to the page.
+"""
+
+import logging
+import multiprocessing
+import signal
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any
+
+from unirender.errors import UnirenderError
+from unirender_reference.processes import exit_with_parent
+
+START_SECONDS = 300.0  # for loading a model on a busy machine
+logger = logging.getLogger(__name__)
+
+
+class Worker:
+    """One process, one job at a time; others wait.
+
+    Args:
+        start: makes what every job gets first; importable by name, like the jobs, and so are their arguments.
+        seconds: that a job may take.
+    """
+
+    def __init__(self, start: Callable[[], Any], seconds: float) -> None:
+        self.start, self.seconds = start, seconds
+        self._lock = threading.Lock()
+        self._process: multiprocessing.process.BaseProcess | None = None
+        self._pipe: Connection | None = None
+
+    def __enter__(self) -> "Worker":
+        """Waits until the process can work.
+
+        Raises:
+            UnirenderError: `start` did.
+        """
+        with self._lock:
+            self._begin()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def run(self, job: Callable[..., Any], *arguments: Any) -> Any:
+        """What `job(context, *arguments)` returns.
+
+        Raises:
+            UnirenderError: the job did; or it took too long, or its process died.
+        """
+        with self._lock:
+            if self._process is None or not self._process.is_alive():
+                self._begin()
+            return self._ask((job, arguments), self.seconds)
+
+    def _begin(self) -> None:
+        self._end()
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_work, args=(self.start, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._answer(START_SECONDS)
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+            self._process = None
+        if self._pipe is not None:
+            self._pipe.close()
+            self._pipe = None
+
+    def _ask(self, question: tuple[Callable[..., Any], tuple], seconds: float) -> Any:
+        assert self._pipe is not None, "there is a process"
+        self._pipe.send(question)
+        return self._answer(seconds)
+
+    def _answer(self, seconds: float) -> Any:
+        assert self._pipe is not None, "there is a process"
+        begun = time.monotonic()
+        try:
+            if not self._pipe.poll(seconds):
+                self._end()
+                raise UnirenderError(
+                    f"not done after {time.monotonic() - begun:.0f} s, and stopped; expected at most {seconds:g} s; "
+                    "try a smaller picture, or again when the machine is less busy"
+                )
+            succeeded, answer = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            self._end()
+            raise UnirenderError("the process that worked on it died; expected an answer; try another file") from error
+        if not succeeded:
+            raise answer
+        return answer
+
+
+def _work(start: Callable[[], Any], pipe: Connection) -> None:
+    """The process: answers (whether it succeeded, the result or the error) until nobody asks any more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends this
+    exit_with_parent()
+    context: Any = None
+
+    def prepare(_: Any) -> None:
+        nonlocal context
+        context = start()
+
+    pipe.send(_answered(prepare, None, ()))
+    while True:
+        try:
+            job, arguments = pipe.recv()
+        except EOFError:
+            return
+        pipe.send(_answered(job, context, arguments))
+
+
+def _answered(job: Callable[..., Any], context: Any, arguments: tuple) -> tuple[bool, Any]:
+    try:
+        return True, job(context, *arguments)
+    except UnirenderError as error:
+        return False, error
+    except Exception as error:
+        logger.exception("demo: a job failed")
+        return False, UnirenderError(f"internal error: {type(error).__name__}; the server's log says where")
