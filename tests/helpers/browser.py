@@ -1,8 +1,8 @@
 """A real browser for tests: headless Chromium through chromedriver's HTTP interface (W3C WebDriver), no package needed.
 
-It opens a file from file:// or an address as a reader would, clicks and types, and keeps what the page wrote to the console and every
-address that it asked for. `Browser.start` raises where Chromium or chromedriver is missing: its tests then fail, they
-are not skipped.
+It opens a file from file:// or an address as a reader would, clicks and types, and keeps what the page wrote to the
+console and every address that it asked for. `Browser.start` raises where Chromium or chromedriver is missing: its tests
+then fail, they are not skipped.
 """
 
 import base64

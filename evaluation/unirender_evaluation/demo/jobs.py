@@ -18,7 +18,7 @@ from unirender_evaluation.demo.session import Controls, Environment, Subject
 from unirender_evaluation.demo.uploads import Limits, Upload, read_light, read_upload, square
 
 ARCHIVES = {
-    "maps.zip": "OpenEXR and PNG, as `unirender decompose` writes them",
+    "maps.zip": "OpenEXR and PNG, as unirender decompose writes them",
     "gltf.zip": "a card with the maps as glTF materials",
     "mitsuba.zip": "the same card and its light as a Mitsuba 3 scene",
 }

@@ -154,12 +154,25 @@ class Page:
                 with gr.Column(scale=2, min_width=320):
                     view = gr.HTML(f'<p class="remark">{NOTHING}</p>', elem_id="view")
                     with gr.Row():
-                        metallic = gr.Slider(0, 1, 0, step=0.01, label="Metallic", elem_id="metallic", buttons=[])
-                        roughness = gr.Slider(0, 1, 0.5, step=0.01, label="Roughness", elem_id="roughness", buttons=[])
+                        metallic = gr.Slider(
+                            0, 1, 0, step=0.01, label="Metallic", elem_id="metallic", min_width=240, buttons=[]
+                        )
+                        roughness = gr.Slider(
+                            0, 1, 0.5, step=0.01, label="Roughness", elem_id="roughness", min_width=240, buttons=[]
+                        )
                     with gr.Row():
-                        light = gr.Dropdown(light_choices(), value=PREDICTED, label="Light", elem_id="light")
+                        light = gr.Dropdown(
+                            light_choices(), value=PREDICTED, label="Light", elem_id="light", min_width=240
+                        )
                         turn = gr.Slider(
-                            -180, 180, 0, step=5, label="Light turned, degrees", elem_id="turn", buttons=[]
+                            -180,
+                            180,
+                            0,
+                            step=5,
+                            label="Light turned, degrees",
+                            elem_id="turn",
+                            min_width=240,
+                            buttons=[],
                         )
                     anchored = gr.Checkbox(True, label="Keep the picture's own detail", elem_id="anchored")
                     with gr.Accordion("A light of your own", open=False, elem_id="light-section"):
@@ -171,7 +184,7 @@ class Page:
                             "Check with Mitsuba", elem_id="check", variant="primary", size="md", min_width=160
                         )
                     checked = gr.HTML(elem_id="checked")
-            gr.HTML("<h2>Maps</h2>")
+            gr.HTML("<h2>Maps</h2>", elem_classes="heading")
             maps = gr.HTML(elem_id="maps")
             with gr.Row():
                 uncertain = gr.Button("How sure is the model?", elem_id="spread-button", size="md", min_width=160)

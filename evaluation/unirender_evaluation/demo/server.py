@@ -32,7 +32,7 @@ ELSEWHERE = re.compile(
     r"<(?:script|link|meta)\b[^>]*\b(?:src|href|content)=[\"']https?://[^>]*>(?:\s*</script>)?", re.S
 )
 Message = MutableMapping[str, Any]  # of ASGI
-EXAMPLES = {"gear": "test-000020_l1", "knot": "test-000012_l0", "vase": "test-000019_l0", "blob": "test-000004_l0"}
+EXAMPLES = {"gear": "test-000020_l1", "knot": "test-000012_l0", "ball": "test-000019_l0", "rock": "test-000004_l0"}
 
 
 def serve(worker: Worker, limits: Limits, host: str, port: int) -> None:
@@ -74,7 +74,9 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
                 run_history=False,
                 footer_links=[],
                 max_file_size=int(limits.megabytes * 1e6),
-                theme=gr.themes.Default(font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]),
+                theme=gr.themes.Default(
+                    primary_hue="teal", font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]
+                ),
                 css=styles + example_styles(examples),
                 app_kwargs={"middleware": [Middleware(NothingElsewhere)]},
             )
