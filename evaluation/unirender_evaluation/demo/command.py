@@ -60,15 +60,12 @@ class Demo:
             if error.name != "gradio":
                 raise
             raise UnirenderError("demo: gradio is not installed; pip install 'unirender[demo]'") from error
-        from unirender.models.precision import resolve_device
         from unirender_evaluation.demo.jobs import start
         from unirender_evaluation.demo.server import serve
         from unirender_evaluation.demo.uploads import Limits
         from unirender_evaluation.demo.worker import Worker
 
         limits = Limits(self.max_megabytes, self.max_pixels, self.max_seconds)
-        with Worker(
-            partial(start, self.checkpoint, str(resolve_device(self.device)), limits), self.max_seconds
-        ) as worker:
+        with Worker(partial(start, self.checkpoint, self.device, limits), self.max_seconds) as worker:
             serve(worker, limits, self.host, self.port)
         return 0

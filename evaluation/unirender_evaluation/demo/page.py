@@ -2,6 +2,7 @@
 visitors share the worker and nothing else.
 """
 
+import functools
 import html
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,6 +27,9 @@ STATE_SECONDS = 3600  # for which a session that does nothing is remembered
 FILE_SECONDS = (60, 600)  # how often stray uploads are looked for, and from which age they are deleted
 QUEUE = 32  # requests that may wait
 NOTHING = "Drop in a picture or choose an example first."
+# One worker: one queue for all that is asked of it.
+EVENT: dict[str, Any] = {"concurrency_id": "worker", "concurrency_limit": 1, "api_visibility": "private"}
+Handler = Callable[..., Any]
 INTRODUCTION = """
 <h1>unirender</h1>
 <p>A picture of one object in, and out come its material, shape and light. Change them, and let a physical renderer
@@ -62,76 +66,66 @@ class Page:
     def __init__(self, worker: Worker, limits: Limits, examples: Mapping[str, Picture]) -> None:
         self.worker, self.limits, self.examples = worker, limits, examples
 
-    def ask(self, job: Callable[..., Any], *arguments: Any) -> Any:
-        """The worker's answer.
-
-        Raises:
-            gr.Error: with the reason why there is none, which the page shows until it is closed.
-        """
-        try:
-            return self.worker.run(job, *arguments)
-        except UnirenderError as error:
-            raise refusal(error) from error
-
     def open_file(self, path: str, side: int, session: Session) -> list[Any]:
         """A picture was dropped in; the mask of the last one is not for it."""
-        return self.opened(replace(session, picture=taken(path), mask=None), side)
+        return self.opened(replace(session, picture=Upload.take(path), mask=None), side, gr.skip(), None)
 
     def open_mask(self, path: str, side: int, session: Session) -> list[Any]:
         """A mask was dropped in."""
-        mask = taken(path)
+        mask = Upload.take(path)
         if not isinstance(session.picture, Upload):
-            raise gr.Error("A mask belongs to a picture of your own: drop that in first.", print_exception=False)
-        return self.opened(replace(session, mask=mask), side)
+            raise UnirenderError("A mask belongs to a picture of your own: drop that in first.")
+        return self.opened(replace(session, mask=mask), side, gr.skip(), gr.skip())
 
     def open_example(self, name: str, side: int, session: Session) -> list[Any]:
         """An example was chosen."""
-        return self.opened(replace(session, picture=self.examples[name], mask=None), side)
+        return self.opened(replace(session, picture=self.examples[name], mask=None), side, None, None)
 
-    def reopen(self, side: int, session: Session) -> list[Any]:
+    def reopen(self, side: int, session: Session) -> Any:
         """Another resolution was chosen."""
-        return [gr.skip()] * OPENED if session.picture is None else self.opened(session, side)
+        return gr.skip() if session.picture is None else self.opened(session, side, gr.skip(), gr.skip())
 
-    def opened(self, session: Session, side: int) -> list[Any]:
-        """Values of the outputs when a picture is opened: all controls as predicted."""
+    def opened(self, session: Session, side: int, *files: Any) -> list[Any]:
+        """Values of the outputs when a picture is opened: session, names of files, maps, spread, then the controls."""
         if isinstance(session.picture, Upload):
-            found: jobs.Opened = self.ask(jobs.open_upload, session.picture, session.mask, side)
+            found: jobs.Opened = self.worker.run(jobs.open_upload, session.picture, session.mask, side)
         else:
-            found = self.ask(jobs.open_picture, session.picture, side)
-        return [replace(session, subject=found.subject), found.maps, *self.as_predicted(found.subject, found.view)]
+            found = self.worker.run(jobs.open_picture, session.picture, side)
+        values = self.as_predicted(found.subject, found.view)
+        return [replace(session, subject=found.subject), *files, found.maps, "", *values]
 
     def as_predicted(self, subject: Subject, view: str) -> list[Any]:
         """Values of the controls at which nothing is changed, and of what depends on them."""
         found = subject.decomposition
-        return [round(found.metallic, DECIMALS), round(found.roughness, DECIMALS), PREDICTED, 0, view, "", "", ""]
+        return [round(found.metallic, DECIMALS), round(found.roughness, DECIMALS), PREDICTED, 0, view, "", ""]
 
     def reset(self, session: Session) -> list[Any]:
         """Everything as predicted."""
         subject = opened_subject(session)
-        return self.as_predicted(subject, self.ask(jobs.show, subject, Controls()))[:-1]
+        return self.as_predicted(subject, self.worker.run(jobs.show, subject, Controls()))
 
     def open_light(self, path: str, session: Session, *controls: Any) -> list[Any]:
         """A light was dropped in."""
-        session = replace(session, light=self.ask(jobs.open_light, taken(path)))
+        session = replace(session, light=self.worker.run(jobs.open_light, Upload.take(path)))
         metallic, roughness, _, *others = controls
         shown = [gr.skip()] * 3 if session.subject is None else self.show(session, metallic, roughness, OWN, *others)
         return [session, OWN, *shown]
 
     def show(self, session: Session, *controls: Any) -> list[Any]:
         """A control was moved; what was checked and packed before is not of this view."""
-        return [self.ask(jobs.show, opened_subject(session), read_controls(session, *controls)), "", ""]
+        return [self.worker.run(jobs.show, opened_subject(session), read_controls(session, *controls)), "", ""]
 
     def check(self, session: Session, *controls: Any) -> str:
         """Mitsuba is asked."""
-        return self.ask(jobs.check, opened_subject(session), read_controls(session, *controls))
+        return self.worker.run(jobs.check, opened_subject(session), read_controls(session, *controls))
 
     def spread(self, session: Session) -> str:
         """The spread is asked for."""
-        return self.ask(jobs.spread, opened_subject(session))
+        return self.worker.run(jobs.spread, opened_subject(session))
 
     def pack(self, session: Session, *controls: Any) -> str:
         """The files are asked for."""
-        return self.ask(jobs.pack, opened_subject(session), read_controls(session, *controls))
+        return self.worker.run(jobs.pack, opened_subject(session), read_controls(session, *controls))
 
     def build(self) -> gr.Blocks:
         """The page."""
@@ -193,68 +187,52 @@ class Page:
             downloads = gr.HTML(elem_id="downloads")
 
             controls = [metallic, roughness, light, turn, anchored]
-            sliders_on = [*controls[:-1], view, checked, downloads, spread]
-            all_opened = [session, maps, *sliders_on]
-            assert len(all_opened) == OPENED, "reopen skips them all"
-            for trigger, handler, source in (
-                (picture.upload, self.open_file, picture),
-                (mask.upload, self.open_mask, mask),
-            ):
-                trigger(handler, [source, side, session], all_opened, show_progress_on=view, **EVENT)
-            side.input(self.reopen, [side, session], all_opened, show_progress_on=view, **EVENT)
+            seen = [view, checked, downloads]  # what is there follows from the controls
+            as_predicted = [*controls[:-1], *seen]
+            opened = [session, picture, mask, maps, spread, *as_predicted]
+            with_controls = [session, *controls]
+
+            def on(trigger: Any, handler: Handler, inputs: Any, outputs: Any, **options: Any) -> None:
+                gr.on(trigger, refusing(handler), inputs, outputs, **EVENT, **options)
+
+            on(picture.upload, self.open_file, [picture, side, session], opened, show_progress_on=view)
+            on(mask.upload, self.open_mask, [mask, side, session], opened, show_progress_on=view)
+            on(side.input, self.reopen, [side, session], opened, show_progress_on=view)
             for button in examples:
-                button.click(self.open_example, [button, side, session], all_opened, show_progress_on=view, **EVENT)
-            predicted.click(self.reset, session, sliders_on[:-1], show_progress_on=view, **EVENT)
-            own.upload(
-                self.open_light, [own, session, *controls], [session, light, view, checked, downloads],
-                show_progress_on=view, **EVENT,
-            )  # fmt: skip
-            gr.on(
-                [control.input for control in controls],
-                self.show,
-                [session, *controls],
-                [view, checked, downloads],
-                trigger_mode="always_last",
-                show_progress="hidden",
-                **EVENT,
-            )
-            mitsuba.click(self.check, [session, *controls], checked, **EVENT)
-            uncertain.click(self.spread, session, spread, **EVENT)
-            files.click(self.pack, [session, *controls], downloads, **EVENT)
+                on(button.click, self.open_example, [button, side, session], opened, show_progress_on=view)
+            on(predicted.click, self.reset, session, as_predicted, show_progress_on=view)
+            on(own.upload, self.open_light, [own, *with_controls], [session, light, *seen], show_progress_on=view)
+            moved = [control.input for control in controls]
+            on(moved, self.show, with_controls, seen, trigger_mode="always_last", show_progress="hidden")
+            on(mitsuba.click, self.check, with_controls, checked)
+            on(uncertain.click, self.spread, session, spread)
+            on(files.click, self.pack, with_controls, downloads)
         page.queue(max_size=QUEUE, default_concurrency_limit=1)
         return page
 
 
-# One worker: one queue for all that is asked of it.
-EVENT: dict[str, Any] = {"concurrency_id": "worker", "concurrency_limit": 1, "api_visibility": "private"}
-OPENED = 10  # outputs that are set when a picture is opened
+def refusing(handler: Handler) -> Handler:
+    """A handler whose errors become a sentence on the page, until it is closed; what is shown stays as it is."""
 
+    @functools.wraps(handler)
+    def handle(*arguments: Any) -> Any:
+        try:
+            return handler(*arguments)
+        except UnirenderError as error:
+            gr.Warning(html.escape(str(error), quote=False), duration=None, title="Not done")
+            return gr.skip()
 
-def refusal(error: UnirenderError) -> gr.Error:
-    """The reason as the page shows it, until it is closed."""
-    return gr.Error(html.escape(str(error), quote=False), duration=None, print_exception=False)
-
-
-def taken(path: str) -> Upload:
-    """A file that the web server received.
-
-    Raises:
-        gr.Error: it is not there.
-    """
-    try:
-        return Upload.take(path)
-    except UnirenderError as error:
-        raise refusal(error) from error
+    return handle
 
 
 def opened_subject(session: Session) -> Subject:
     """The picture that is open.
 
     Raises:
-        gr.Error: there is none.
+        UnirenderError: there is none.
     """
     if session.subject is None:
-        raise gr.Error(NOTHING, duration=None, print_exception=False)
+        raise UnirenderError(NOTHING)
     return session.subject
 
 
@@ -264,11 +242,11 @@ def read_controls(
     """What the controls say; a slider at the predicted value changes nothing.
 
     Raises:
-        gr.Error: an own light is chosen, and there is none.
+        UnirenderError: an own light is chosen, and there is none.
     """
     found = opened_subject(session).decomposition
     if light == OWN and session.light is None:
-        raise gr.Error("Drop in a light of your own first.", duration=None, print_exception=False)
+        raise UnirenderError("Drop in a light of your own first.")
     return Controls(
         metallic=None if metallic == round(found.metallic, DECIMALS) else metallic,
         roughness=None if roughness == round(found.roughness, DECIMALS) else roughness,

@@ -55,7 +55,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
     """
     with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
         os.environ.update(QUIET | {"GRADIO_TEMP_DIR": folder})
-        import gradio as gr
+        from gradio.themes import Default
         from starlette.middleware import Middleware
 
         from unirender_evaluation.demo.page import Page, example_styles
@@ -64,7 +64,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
         page = Page(worker, limits, examples).build()
         styles = (resources.files("unirender_evaluation") / "templates" / "demo.css").read_text(encoding="utf-8")
         try:
-            page.launch(
+            _, address, _ = page.launch(
                 server_name=host,
                 server_port=port,
                 prevent_thread_lock=True,
@@ -74,7 +74,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
                 run_history=False,
                 footer_links=[],
                 max_file_size=int(limits.megabytes * 1e6),
-                theme=gr.themes.Default(
+                theme=Default(
                     primary_hue="teal", font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]
                 ),
                 css=styles + example_styles(examples),
@@ -83,7 +83,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
         except OSError as error:
             raise UnirenderError(f"demo: {host}:{port} is not to be had ({error}); choose another --port") from error
         try:
-            yield page.local_url
+            yield address
         finally:
             page.close(verbose=False)
 

@@ -187,12 +187,14 @@ def check(seen: View, spp: int = SPP) -> Check:
     start = time.perf_counter()
     truth = shade(seen.intrinsics, spp=spp)
     seconds = time.perf_counter() - start
-    pictures = [image_picture(image, mask) for image in (seen.rendered, truth)]
-    flip, flip_mean = flip_map(*pictures, mask)
-    return Check(seen.rendered, truth, flip, flip_mean, psnr(*pictures, mask), seconds)
+    ours, theirs = (image_picture(image, mask) for image in (seen.rendered, truth))
+    flip, flip_mean = flip_map(ours, theirs, mask)
+    return Check(seen.rendered, truth, flip, flip_mean, psnr(ours, theirs, mask), seconds)
 
 
-def spread(pipeline: UniRenderPipeline, subject: Subject, samples: int = SAMPLES, seed: int = 0) -> Mapping:
+def spread(
+    pipeline: UniRenderPipeline, subject: Subject, samples: int = SAMPLES, seed: int = 0
+) -> Mapping[str, np.ndarray]:
     """Standard deviation of every map over diffusion samples of the decomposition, by name of the map."""
     generator = torch.Generator().manual_seed(seed)
     found = pipeline.decompose(

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any
 
@@ -35,7 +36,7 @@ class Worker:
     def __init__(self, start: Callable[[], Any], seconds: float) -> None:
         self.start, self.seconds = start, seconds
         self._lock = threading.Lock()
-        self._process: multiprocessing.process.BaseProcess | None = None
+        self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
 
     def __enter__(self) -> "Worker":
@@ -68,8 +69,9 @@ class Worker:
         self._end()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(self.start, theirs), daemon=True)
-        self._process.start()
+        process = context.Process(target=_work, args=(self.start, theirs), daemon=True)
+        process.start()
+        self._process = process
         theirs.close()
         self._answer(START_SECONDS)
 
