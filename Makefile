@@ -3,6 +3,7 @@
 # make test        install the development tools, then lint, type-check, docs and tests
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
+# make test-demo   likewise: the page of `unirender demo` in Chromium
 # make test-latex  likewise: the LaTeX tables compiled (pdflatex with booktabs; an error where it is missing)
 # make docs        the HTML documentation (docs/_build/html)
 #
@@ -23,7 +24,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-large test-report test-latex lint docs format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-large test-report test-demo test-latex lint docs format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -34,7 +35,7 @@ $(VENV)/.runtime: $(REQUIREMENTS)
 
 $(VENV)/.dev: $(REQUIREMENTS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[dev,docs,cluster,denoise,sd]'
+	$(INSTALL) --editable '.[dev,docs,cluster,denoise,sd,demo]'
 	touch $(VENV)/.runtime $@
 
 setup: $(VENV)/.dev
@@ -64,6 +65,10 @@ test-large: $(VENV)/.dev
 
 test-report: $(VENV)/.dev
 	$(BIN)/python -m pytest -m report
+
+# It prints the time from a slider to its picture.
+test-demo: $(VENV)/.dev
+	$(BIN)/python -m pytest -m demo -s
 
 test-latex: $(VENV)/.dev
 	$(BIN)/python -m pytest -m latex

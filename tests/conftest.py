@@ -47,7 +47,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 # Markers of what needs a program or a machine that not everybody has: such tests never skip; they run by their own
 # command alone, and fail there where what they need is missing.
-OWN_COMMANDS = {"large": "make test-large", "latex": "make test-latex", "report": "make test-report"}
+OWN_COMMANDS = {
+    "demo": "make test-demo",
+    "large": "make test-large",
+    "latex": "make test-latex",
+    "report": "make test-report",
+}
 
 
 def left_out(config: pytest.Config) -> dict[str, str]:

@@ -31,7 +31,7 @@ VOCABULARY = {
         "symmetries",
     )
 }
-HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage")
+HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage", "gradio")
 
 
 def run_python(code: str, cwd: Path) -> str:

@@ -22,6 +22,7 @@ from typing import Any
 INSTALL = "install both (Debian: apt-get install chromium chromium-driver)"
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the key of an element's reference, fixed by W3C WebDriver
 KEYS = {"right": "\ue014", "left": "\ue012", "home": "\ue011", "end": "\ue010", "enter": "\ue007", "escape": "\ue00c"}
+DOWNLOADS = "downloads"
 PATIENCE = 120  # seconds; a busy machine starts Chromium slowly
 OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--force-device-scale-factor=1")
 
@@ -50,7 +51,8 @@ class Browser:
     @classmethod
     @contextlib.contextmanager
     def start(cls, folder: Path, width: int = 1280, height: int = 900) -> Iterator["Browser"]:
-        """Starts Chromium with an empty profile in `folder` and a window of that many CSS pixels.
+        """Starts Chromium with an empty profile in `folder` and a window of that many CSS pixels; what it downloads
+        lies in the folder `DOWNLOADS` there.
 
         Raises:
             RuntimeError: Chromium or chromedriver is missing, or does not start.
@@ -65,10 +67,13 @@ class Browser:
             _await(base)
             # A phone is narrower than a window may be: the screen is emulated.
             screen = {"deviceMetrics": {"width": width, "height": height, "pixelRatio": 1, "touch": False}}
+            downloads = folder / DOWNLOADS
+            downloads.mkdir(parents=True, exist_ok=True)
             options = {
                 "binary": chromium,
                 "args": [*OPTIONS, f"--user-data-dir={folder / 'profile'}"],
                 "mobileEmulation": screen,
+                "prefs": {"download.default_directory": str(downloads.resolve())},
             }
             wanted = {"goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"}}
             made = _call(f"{base}/session", {"capabilities": {"alwaysMatch": wanted}})

@@ -25,6 +25,7 @@ from unirender.pipelines.derived_light import derived_specular
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, unit_value
 from unirender.pipelines.results import Decomposition
+from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender_evaluation.gallery import flip_map, image_picture
 from unirender_evaluation.metrics import psnr
@@ -53,8 +54,13 @@ class Subject:
     lobe: Float[np.ndarray, "h w 3"]
 
     @property
+    def maps(self) -> Intrinsics:
+        """The maps that were found, with the picture's mask."""
+        return self.decomposition.intrinsics
+
+    @property
     def mask(self) -> Float[np.ndarray, "h w 1"]:
-        return self.decomposition.intrinsics.require("mask")["mask"]
+        return self.maps.require("mask")["mask"]
 
     @property
     def image_linear(self) -> Float[np.ndarray, "h w 3"]:
@@ -132,7 +138,7 @@ def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
     found = decomposition.intrinsics
     lobe = derived_specular(found, found.require("environment")["environment"])
-    return Subject(picture, decomposition, pipeline.render(found), lobe)
+    return Subject(picture, decomposition, render(pipeline, found), lobe)
 
 
 def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> View:
@@ -144,7 +150,7 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
     Raises:
         UnirenderError: a number is outside its range, or the light is not usable.
     """
-    before = subject.decomposition.intrinsics
+    before = subject.maps
     edited, remarks = before, []
     if controls.metallic is not None:
         edited = edited.replace(metallic=constant_map(unit_value("metallic", controls.metallic), subject.mask))
@@ -164,9 +170,14 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
                 f"The predicted light is too coarse to show what roughness {controls.roughness:g} reflects on "
                 f"{coarse:.0%} of the object: its highlights stay as wide as they were."
             )
-    rendered = subject.rendered if edited is before else pipeline.render(edited)
+    rendered = subject.rendered if edited is before else render(pipeline, edited)
     image = anchor(subject.image_linear, subject.rendered, rendered) if controls.anchored else rendered
     return View(image, rendered, edited, tuple(remarks))
+
+
+def render(pipeline: UniRenderPipeline, intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+    """The mean rendering, with the noise of `UniRenderPipeline.edit` and `relight`: what is seen here is theirs."""
+    return pipeline.render(intrinsics, generator=same_noise(Sampling.of().draw_seed(), 1)[0])
 
 
 def turned(environment: Environment, turn_deg: float) -> Environment:

@@ -9,6 +9,7 @@ import contextlib
 import io
 import re
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,7 +178,9 @@ def pixel_size(upload: Upload) -> tuple[int, int] | None:
     if found := FLOAT_MAP_SIZE.match(head):
         return int(found[1]), int(found[2])
     try:
-        with Image.open(io.BytesIO(upload.data)) as file:
-            return file.size
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(upload.data)) as file:
+                return file.size
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None

@@ -1,0 +1,64 @@
+"""The demo's worker process: answers, refusals, a time limit that stops it, a crash that costs one job."""
+
+import os
+import threading
+import time
+
+import demo_jobs
+import pytest
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.demo.worker import Worker
+
+pytestmark = pytest.mark.slow
+
+
+def test_jobs_run_in_another_process_and_errors_come_back() -> None:
+    with Worker(demo_jobs.start, seconds=60) as worker:
+        assert worker.run(demo_jobs.add, 2) == 42
+        assert worker.run(demo_jobs.process) != os.getpid()
+        with pytest.raises(UnirenderError, match="refused with 40"):
+            worker.run(demo_jobs.refuse)
+        with pytest.raises(UnirenderError, match="internal error: ZeroDivisionError"):
+            worker.run(demo_jobs.fail)
+        assert worker.run(demo_jobs.add, 1) == 41, "a refusal costs nothing"
+
+
+def test_a_job_that_takes_too_long_is_stopped_and_the_next_one_runs() -> None:
+    with Worker(demo_jobs.start, seconds=1.5) as worker:
+        before = worker.run(demo_jobs.process)
+        assert worker.run(demo_jobs.sleep, 0.1) == 40, "the twin: in time"
+        begun = time.monotonic()
+        with pytest.raises(UnirenderError, match=r"expected at most 1\.5 s"):
+            worker.run(demo_jobs.sleep, 600)
+        assert time.monotonic() - begun < 60
+        with pytest.raises(ProcessLookupError):
+            os.kill(before, 0)
+        assert worker.run(demo_jobs.process) != before
+
+
+def test_a_process_that_dies_costs_its_job_alone() -> None:
+    with Worker(demo_jobs.start, seconds=60) as worker:
+        with pytest.raises(UnirenderError, match="died"):
+            worker.run(demo_jobs.die)
+        assert worker.run(demo_jobs.add, 2) == 42
+
+
+def test_whoever_cannot_start_says_why() -> None:
+    with pytest.raises(UnirenderError, match="no checkpoint"), Worker(demo_jobs.no_start, seconds=60):
+        pass
+
+
+def test_many_threads_get_their_own_answers() -> None:
+    found: dict[int, int] = {}
+    with Worker(demo_jobs.start, seconds=60) as worker:
+
+        def ask(value: int) -> None:
+            found[value] = worker.run(demo_jobs.add, value)
+
+        threads = [threading.Thread(target=ask, args=(value,)) for value in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert found == {value: 40 + value for value in range(8)}

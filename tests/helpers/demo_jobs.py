@@ -1,0 +1,40 @@
+"""Jobs for a worker process of the demo, which imports them by name."""
+
+import os
+import time
+
+from unirender.errors import UnirenderError
+
+
+def start() -> int:
+    """A context."""
+    return 40
+
+
+def no_start() -> int:
+    raise UnirenderError("no checkpoint: expected one")
+
+
+def add(context: int, value: int) -> int:
+    return context + value
+
+
+def refuse(context: int) -> None:
+    raise UnirenderError(f"refused with {context}")
+
+
+def fail(context: int) -> float:
+    return context / 0
+
+
+def sleep(context: int, seconds: float) -> int:
+    time.sleep(seconds)
+    return context
+
+
+def die(context: int) -> None:
+    os._exit(3)
+
+
+def process(context: int) -> int:
+    return os.getpid()
