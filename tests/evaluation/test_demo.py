@@ -77,6 +77,7 @@ def png_head(width: int, height: int) -> bytes:
         ("a.png", b"no picture", None),
         ("a.exr", b"no picture", None),
     ],
+    ids=["png", "large png", "exr", "hdr", "pfm", "no png", "no exr"],
 )
 def test_the_size_of_a_picture_is_known_without_decoding_it(
     name: str, data: bytes, size: tuple[int, int] | None

@@ -2,7 +2,7 @@
 
 A picture is taken apart once; each movement of a slider then costs one rendering. The anchored picture carries over
 what the decomposition could not explain (`unirender.pipelines.editing.anchor`), for which the rendering of the unedited
-maps is needed: it is kept, too, and so is what the predicted light reflects at the predicted roughness.
+maps is needed: it is kept, too.
 
 Notation: I the picture, R_0 and R_1 the renders of the maps before and after the edit.
 """
@@ -21,7 +21,6 @@ from unirender.commands import MUCH_COARSE
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender.pictures import Picture
-from unirender.pipelines.derived_light import derived_specular
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, unit_value
 from unirender.pipelines.results import Decomposition
@@ -45,13 +44,11 @@ class Subject:
         picture: with a mask.
         decomposition: of it, mode `mean`.
         rendered: R_0, premultiplied linear.
-        lobe: what its normals and roughness reflect of the predicted light, without shadows.
     """
 
     picture: Picture
     decomposition: Decomposition
     rendered: Float[np.ndarray, "h w 3"]
-    lobe: Float[np.ndarray, "h w 3"]
 
     @property
     def maps(self) -> Intrinsics:
@@ -136,9 +133,7 @@ def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
         UnirenderError: the picture or its mask is not usable.
     """
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
-    found = decomposition.intrinsics
-    lobe = derived_specular(found, found.require("environment")["environment"])
-    return Subject(picture, decomposition, render(pipeline, found), lobe)
+    return Subject(picture, decomposition, render(pipeline, decomposition.intrinsics))
 
 
 def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> View:
@@ -163,7 +158,7 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
         remarks.append("Under a light that was changed, nothing casts a shadow.")
     elif controls.roughness is not None:
         target = edited.require("roughness")["roughness"]
-        edited = edited.replace(specular=specular_for_roughness(before, target, subject.lobe)[0])
+        edited = edited.replace(specular=specular_for_roughness(before, target)[0])
         coarse = float(too_coarse(before, target)[subject.mask > 0].mean())
         if coarse > MUCH_COARSE:
             remarks.append(

@@ -22,7 +22,7 @@ ANCHOR_FLOOR = 0.02  # radiance added to both: where the old render is dark, the
 
 
 def specular_for_roughness(
-    before: Intrinsics, roughness: Float[np.ndarray, "h w 1"], old_lobe: Float[np.ndarray, "h w 3"] | None = None
+    before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]
 ) -> tuple[Float[np.ndarray, "h w 3"], float]:
     """s of a decomposition at a new roughness: the old s times the ratio of the predicted light's lobes.
 
@@ -30,16 +30,11 @@ def specular_for_roughness(
 
     Shadowing and what the predicted light misses stay in s_0.
 
-    Args:
-        before: the decomposition.
-        roughness: the new one, r_1.
-        old_lobe: L(environment, r_0), `derived_specular(before, environment)`, if it is at hand.
-
     Returns:
         s_1, and the share of the covered values where the bound held the ratio.
     """
     maps = before.require("normal", "roughness", "specular", "environment", "mask")
-    old = derived_specular(before, maps["environment"]) if old_lobe is None else old_lobe
+    old = derived_specular(before, maps["environment"])
     new = derived_specular(before.replace(roughness=roughness), maps["environment"])
     ratio = (new + LOBE_FLOOR) / (old + LOBE_FLOOR)
     bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
