@@ -298,6 +298,15 @@ def mean_colour(page: Browser) -> list[float]:
     )
 
 
+def test_a_port_that_is_taken_is_named(server: Server) -> None:
+    port = server.address.rstrip("/").rsplit(":", 1)[1]
+    command = [sys.executable, "-m", "unirender.cli", "demo", "--port", port]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=STARTS)
+    assert done.returncode == 1
+    assert f"cannot listen on 127.0.0.1:{port}" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_a_phone_does_not_scroll_sideways(server: Server, tmp_path: Path, theme: str) -> None:
     with visit(server, tmp_path, PHONE, 844, theme) as page:

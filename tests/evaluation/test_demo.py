@@ -149,7 +149,7 @@ def test_a_picture_becomes_a_square_of_a_side_that_is_known() -> None:
 @pytest.mark.parametrize("edit", [{"roughness": 0.9}, {"metallic": 1.0}, {"roughness": 0.1, "metallic": 0.0}])
 @pytest.mark.parametrize("anchored", [True, False])
 def test_an_edit_is_the_pipelines(
-    pipeline: UniRenderPipeline, subject: Subject, edit: dict[str, float], anchored: bool
+    pipeline: UniRenderPipeline, subject: Subject, edit: dict[str, Any], anchored: bool
 ) -> None:
     seen = session.view(pipeline, subject, Controls(**edit, anchored=anchored))
     picture = subject.picture

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from unirender.errors import UnirenderError, UsageError
@@ -54,12 +55,8 @@ class Demo:
             UnirenderError: gradio is not installed, the checkpoint is not there, or the address is not to be had.
         """
         self.check()
-        try:
-            import gradio  # noqa: F401 - only whether it is there
-        except ModuleNotFoundError as error:
-            if error.name != "gradio":
-                raise
-            raise UnirenderError("demo: gradio is not installed; pip install 'unirender[demo]'") from error
+        if find_spec("gradio") is None:  # which `served` imports, after it has told it to be quiet
+            raise UnirenderError("demo: gradio is not installed; pip install 'unirender[demo]'")
         from unirender_evaluation.demo.jobs import start
         from unirender_evaluation.demo.server import serve
         from unirender_evaluation.demo.uploads import Limits

@@ -97,7 +97,7 @@ def check_panel(found: Check, intrinsics: Intrinsics) -> str:
     mask = intrinsics.require("mask")["mask"]
     figures = [
         figure("Model", image_picture(found.model, mask), mask, "plain rendering of the maps"),
-        figure("Mitsuba", image_picture(found.mitsuba, mask), mask, f"the same maps and light, {found.seconds:.1f} s"),
+        figure("Mitsuba", image_picture(found.mitsuba, mask), mask, f"the same maps and light, {found.seconds:.2f} s"),
         figure("FLIP", found.flip, mask, f"bright: seen to differ; mean {found.flip_mean:.3f}"),
     ]
     return row(figures, [f"PSNR {found.psnr_db:.1f} dB inside the mask, sRGB; FLIP {found.flip_mean:.3f}.", CAVEAT])

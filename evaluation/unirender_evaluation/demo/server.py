@@ -32,6 +32,7 @@ HEADERS = {"content-security-policy": POLICY, "referrer-policy": "no-referrer", 
 ELSEWHERE = re.compile(
     r"<(?:script|link|meta)\b[^>]*\b(?:src|href|content)=[\"']https?://[^>]*>(?:\s*</script>)?", re.S
 )
+VISITORS = 64  # that are remembered at a time; whoever comes later takes the place of the oldest
 Message = MutableMapping[str, Any]  # of ASGI
 EXAMPLES = {"gear": "test-000020_l1", "knot": "test-000012_l0", "ball": "test-000019_l0", "rock": "test-000004_l0"}
 
@@ -75,6 +76,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
                 ssr_mode=False,
                 run_history=False,
                 footer_links=[],
+                state_session_capacity=VISITORS,
                 max_file_size=int(limits.megabytes * 1e6),
                 theme=Default(
                     primary_hue="teal", font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]
@@ -83,7 +85,9 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
                 app_kwargs={"middleware": [Middleware(NothingElsewhere)]},
             )
         except OSError as error:
-            raise UnirenderError(f"demo: {host}:{port} is not to be had ({error}); choose another --port") from error
+            raise UnirenderError(
+                f"demo: cannot listen on {host}:{port}, expected a free port of this machine; choose another --port"
+            ) from error
         try:
             yield address
         finally:
