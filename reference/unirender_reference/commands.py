@@ -41,6 +41,8 @@ class Dataset:
     holdout: int = 0
     """Every N-th mesh file, in order of name, belongs to `--split test`, the others to `--split train`. 0: all files
     belong to the split asked for."""
+    turn_objects: bool = False
+    """See each object from a side and a height drawn at random, another for each seed, instead of from the front."""
     pairs: int | None = None
     """Pairs an object. basis: 3 x lights x roughness values, so a multiple of 3. None: 36; 121 with paper and sweep, 8
     with --materials maps."""
@@ -110,6 +112,7 @@ class Dataset:
                 workers=self.workers,
                 meshes=self.meshes,
                 holdout=self.holdout,
+                turn_objects=self.turn_objects,
                 materials=self.materials,
                 noise_floor=self.noise_floor,
                 denoise=self.denoise,

@@ -17,6 +17,7 @@ Split = Literal["train", "test"]
 MAX_LIGHTS = 8
 METALLIC_NODES = (0, 50, 100)
 PERCENTS = 101  # 0 .. 100
+MAX_TILT_DEG = 20.0  # of turned objects
 GRID = tuple(range(0, PERCENTS, 10))
 DEFAULT_OBJECTS = 20
 MOST_FLOOR_DB = 80.0
@@ -44,6 +45,7 @@ class DatasetConfig:
         workers: processes; 0 means one for each CPU core.
         meshes: a folder of mesh files or a glob, instead of procedural objects.
         holdout: every how many mesh files one belongs to the test split; 0: all belong to the split asked for.
+        turn_objects: each object is turned about +y by any angle and tilted by up to `MAX_TILT_DEG`, by the seed.
         materials: "scalar": one roughness and metallic per picture; "maps": the object's own.
         noise_floor: dB (masked sRGB PSNR of a noise-free prediction) up to which each picture, s and d is sampled.
         denoise: denoise every picture, s and d.
@@ -77,6 +79,7 @@ class DatasetConfig:
     light_height: int = LIGHT_OPTIONS["light_height"]
     cluster: str | None = None
     lights_digest: str | None = None
+    turn_objects: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "out", Path(self.out))
@@ -148,6 +151,8 @@ class DatasetConfig:
         values = dataclasses.asdict(self)
         left_out = ("out", "workers", "objects", "cluster", "lights", "lights_digest")
         kept = {name: value for name, value in values.items() if name not in left_out}
+        if not self.turn_objects:  # data sets that are older than the option go on
+            del kept["turn_objects"]
         return kept | {"meshes": self.meshes is not None, "lights": self._lights_hash()}
 
     def _lights_hash(self) -> str | None:

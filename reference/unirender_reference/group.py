@@ -2,13 +2,18 @@
 
 import dataclasses
 import functools
+import math
 import time
 
+import numpy as np
+from jaxtyping import Float
+
 from unirender.errors import UnirenderError
-from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig
 from unirender_reference.faults import FileNotSeen, ObjectFault, blamed_on
 from unirender_reference.lights import Light, LightPool, make_light
 from unirender_reference.members import GroupMembers
+from unirender_reference.passes import derive_seed
 from unirender_reference.plan import GroupPlan
 from unirender_reference.processes import time_limit
 from unirender_reference.render import Renderer
@@ -31,7 +36,8 @@ def render(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
     lights = [make_light(light.seed, config.split, pool) for light in plan.lights]
     with blamed_on(plan.mesh, ObjectFault):
         with time_limit(LOAD_SECONDS, "loading it"):
-            renderer = Renderer(_load(config, plan), resolution=config.resolution)
+            obj = _load(config, plan)
+            renderer = Renderer(_turned(obj, plan) if config.turn_objects else obj, resolution=config.resolution)
         group = GroupMembers(config, plan, renderer)
         group.render(lights)
     return RenderedGroup(
@@ -66,6 +72,24 @@ def user_lights(config: DatasetConfig) -> LightPool | None:
 def _skipped(light: Light) -> list[str]:
     """The files that a draw of this light passed over, with reasons."""
     return light.provenance.get("skipped", "").splitlines()
+
+
+def _turned(obj: MeshObject, plan: GroupPlan) -> MeshObject:
+    """Seen from a side and a height that the object's seed decides; the name says so, since other parts of a training
+    set may have the object from the front."""
+    rng = np.random.default_rng(derive_seed("turn", plan.object_seed))
+    yaw, tilt = rng.uniform(0, 360), rng.uniform(-MAX_TILT_DEG, MAX_TILT_DEG)
+    turned = obj.turned(turn_matrix(yaw, tilt))
+    provenance = {**obj.provenance, "turned": f"{yaw:.3f} degrees about +y, then {tilt:.3f} about +x"}
+    return dataclasses.replace(turned, name=f"{obj.name}-turned{plan.object_seed}", provenance=provenance)
+
+
+def turn_matrix(yaw_deg: float, tilt_deg: float) -> Float[np.ndarray, "3 3"]:
+    """The rotation about +y, from +z towards +x, then about +x, from +y towards +z."""
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    c, s = math.cos(math.radians(tilt_deg)), math.sin(math.radians(tilt_deg))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ about_y
 
 
 def _load(config: DatasetConfig, plan: GroupPlan) -> MeshObject:

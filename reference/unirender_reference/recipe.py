@@ -25,7 +25,7 @@ OPTIONS: Mapping[str, type] = {
     **dict.fromkeys(("objects", "holdout", "pairs", "resolution", "seed", "spp"), int),
     **dict.fromkeys(("light_holdout", "light_height"), int),
     **dict.fromkeys(("noise_floor", "light_share"), float),
-    **dict.fromkeys(("denoise", "turn_lights"), bool),
+    **dict.fromkeys(("denoise", "turn_lights", "turn_objects"), bool),
     **dict.fromkeys(("vary", "materials", *FOLDERS), str),
 }
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")

@@ -1,6 +1,7 @@
 """Data sets of mesh files: what fails is listed and skipped, resume, holdout, own maps; folders of any size."""
 
 import json
+import re
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,11 @@ from unirender.training.data import GroupDataset
 from unirender.training.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
-from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig
+from unirender_reference.group import turn_matrix
 from unirender_reference.mesh_folder import MeshFile, mesh_folder, pattern_base
 from unirender_reference.plan import plan_groups
+from unirender_reference.shapes import make_object
 from unirender_reference.workers import WorkerDied
 
 SIZE, SPP = 8, 16
@@ -119,6 +122,55 @@ def test_an_interrupted_run_ends_at_the_same_bytes(
     assert again.failures == once.failures
     for name in ("manifest.json", "failures.jsonl"):
         assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
+
+
+def test_a_turned_object_is_the_mesh_turned(tmp_path: Path) -> None:
+    """Against a file with the vertices where they came to lie, seen from the front."""
+    before, after = tmp_path / "before", tmp_path / "after"
+    write_solid(before / "box.obj")
+
+    def group(meshes: Path, out: str, **changes: Any) -> tuple[str, dict[str, Any], np.ndarray]:
+        generate(config(tmp_path / out, meshes, resolution=16, spp=64, **changes), executor=Inline())
+        ((key, members),) = read_groups(tmp_path / out / "shard-000000.tar")
+        shared, _ = read_exr_bytes(members["shared.exr"])
+        normal = np.stack([shared[f"normal.{axis}"] for axis in "XYZ"], axis=-1)
+        return key, json.loads(members["json"]), normal
+
+    key, record, normal = group(before, "turned", turn_objects=True, seed=5)
+    said = re.fullmatch(r"(\S+) degrees about \+y, then (\S+) about \+x", record["object_provenance"]["turned"])
+    assert said is not None
+    yaw, tilt = float(said[1]), float(said[2])
+    assert 0 <= yaw < 360
+    assert abs(tilt) <= MAX_TILT_DEG
+    mesh = trimesh.load(before / "box.obj", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    mesh.vertices = mesh.vertices @ turn_matrix(yaw, tilt).T
+    after.mkdir()
+    mesh.export(after / "box.obj")
+    plain_key, plain, expected = group(after, "by-hand", seed=5)
+    assert np.abs(normal - expected).mean() < 0.01
+    _, _, frontal = group(before, "frontal", seed=5)
+    assert np.abs(normal - frontal).mean() > 0.05
+    assert "turned" not in plain["object_provenance"]
+    assert key == plain_key.replace("_g0", "-turned5000000_g0")
+    _, other, _ = group(before, "another-seed", turn_objects=True, seed=6)
+    assert other["object_provenance"]["turned"] != record["object_provenance"]["turned"]
+
+
+def test_turning_is_yaw_and_then_tilt() -> None:
+    assert np.allclose(turn_matrix(90, 0) @ [0, 0, 1], [1, 0, 0])
+    assert np.allclose(turn_matrix(0, 90) @ [0, 1, 0], [0, 0, 1])
+    assert np.allclose(turn_matrix(90, 90) @ [0, 1, 0], [0, 0, 1])
+    obj = make_object(0, "train")
+    assert np.allclose(obj.turned(turn_matrix(360, 0)).vertices, obj.vertices, atol=1e-6)
+    assert obj.turned(turn_matrix(30, 10)).signed_volume == pytest.approx(obj.signed_volume, rel=1e-4)
+    with pytest.raises(UnirenderError, match="expected the matrix of a rotation"):
+        obj.turned(np.diag([1.0, 1.0, -1.0]))
+
+
+def test_data_sets_that_are_older_than_the_option_go_on(tmp_path: Path) -> None:
+    assert "turn_objects" not in config(tmp_path, None).content()
+    assert config(tmp_path, None, turn_objects=True).content()["turn_objects"] is True
 
 
 def test_the_same_command_again_says_the_failures_again(

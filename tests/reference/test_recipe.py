@@ -39,7 +39,7 @@ def recipe(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("name", ["train-64", "train-128"])
 def test_the_package_s_recipes_leave_the_test_meshes_out(name: str, tmp_path: Path) -> None:
     made = read_recipe(name)
-    catalogues = [str(part["meshes"]) for part in made.parts.values() if "meshes" in part]
+    catalogues = {str(part["meshes"]) for part in made.parts.values() if "meshes" in part}
     assert len(catalogues) == 4
     assert "Reallusion" not in catalogues
     for catalogue in catalogues:

@@ -108,6 +108,20 @@ class MeshObject:
         """The object without roughness, metallic and normal maps; base colour and texture coordinates stay."""
         return dataclasses.replace(self, roughness=None, metallic=None, normal_map=None)
 
+    def turned(self, rotation: Float[np.ndarray, "3 3"]) -> "MeshObject":
+        """The object turned about the origin; its bounding sphere stays.
+
+        Args:
+            rotation: p -> rotation @ p, of determinant 1.
+        """
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise UnirenderError(f"{self.name}: got {rotation.tolist()}, expected the matrix of a rotation")
+
+        def turn(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+            return (vectors.astype(np.float64) @ rotation.T).astype(np.float32)
+
+        return dataclasses.replace(self, vertices=turn(self.vertices), normals=turn(self.normals))
+
     @property
     def signed_volume(self) -> float:
         """Volume enclosed by the faces; positive when they are oriented outwards."""
