@@ -110,7 +110,8 @@ class Browser:
         _call(f"{self.element(selector)}/value", {"text": KEYS.get(key, key)})
 
     def upload(self, selector: str, path: Path) -> None:
-        """Chooses a file for an `<input type="file">`, which may be hidden, as its dialogue would."""
+        """Chooses a file for an `<input type="file">`, as its dialogue would; it may be hidden, or still to come."""
+        self.wait("return document.querySelector(arguments[0]) != null", selector)
         _call(f"{self.element(selector)}/value", {"text": str(path.resolve())})
 
     def wait(self, script: str, *arguments: Any, seconds: float = PATIENCE) -> Any:
