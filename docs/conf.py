@@ -90,12 +90,13 @@ def _docstring(app: Sphinx, what: str, name: str, obj: object, options: object, 
 
 
 def _results(app: Sphinx, docname: str, source: list[str]) -> None:
-    """Puts the committed result tables into the results page; without any, a sentence that says so."""
+    """Puts the committed result tables of each suite where the results page names it."""
     if docname == "results":
-        tables = sorted(RESULTS.glob("*.md"))
-        text = "\n\n".join(path.read_text(encoding="utf-8") for path in tables)
-        text = re.sub(r"^### ", "## ", text, flags=re.MULTILINE)  # the tables are made for a README
-        source[0] = source[0].replace("<!-- results -->", text or "No results are stored in this version.")
+        source[0] = re.sub(r"<!-- tables: (\w+) -->", lambda found: _tables(RESULTS / found[1]), source[0])
+
+
+def _tables(folder: Path) -> str:
+    return "\n\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md")))
 
 
 def setup(app: Sphinx) -> None:

@@ -2,9 +2,11 @@
 
     python -m unirender_evaluation.readme RUN [--readme README.md] [--stored FOLDER]
 
-`RUN` is the folder that `unirender bench run` wrote. The README gets the tables of `SHOWN` and the facts of the
-checkpoint, between comments made for them; the stored folder (`evaluation/results` of a checkout, which the
-documentation includes) gets one Markdown file per table. A partial run (`--limit`) is refused.
+`RUN` is the folder that `unirender bench run` wrote, or its results file. The README gets tables of the suite and the
+facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`.
+The stored folder (`evaluation/results` of a checkout, which the documentation reads) gets a folder by the name of the
+suite, with every value (`results.json.gz`) and one Markdown file per table; from that file the command makes both anew.
+A partial run (`--limit`) is refused.
 """
 
 import argparse
@@ -19,11 +21,13 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.records import RunInfo
-from unirender_evaluation.report import read_results
+from unirender_evaluation.results_data import NAME, PACKED, Results
+from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
-from unirender_evaluation.tables import Table
+from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.tables import Table, build_tables
 
+SHIPPED_SUITE = "tiny"
 SHIPPED = Path(str(resources.files("unirender"))) / "checkpoints" / "tiny"
 SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
@@ -32,20 +36,21 @@ SHOWN = (  # table, protocol, subset
     ("multi-view", "known-mesh", "main"),
     ("physics", "physics", "main"),
 )
+HEADLINES = SHOWN[:3]
 
 
-def run_tables(folder: Path) -> tuple[RunInfo, list[Table]]:
-    """The tables of a run folder.
+def whole_run(path: Path) -> tuple[Results, list[Table]]:
+    """The results in a run's folder or in a results file, and their tables.
 
     Raises:
-        UnirenderError: the folder holds no complete run.
+        UnirenderError: there is no complete run.
     """
-    run, _, tables = read_results(folder)
-    if run.limit is not None:
+    results = read_results(path)
+    if results.run.limit is not None:
         raise UnirenderError(
-            f"{folder}: a partial run (--limit {run.limit}), expected a whole one; run it without --limit"
+            f"{path}: a partial run (--limit {results.run.limit}), expected a whole one; run it without --limit"
         )
-    return run, tables
+    return results, build_tables(results.records, results.run, ALL_TABLES)
 
 
 def fill(readme: str, name: str, text: str) -> str:
@@ -78,19 +83,19 @@ def checkpoint_text(folder: Path) -> str:
     )
 
 
-def selection(tables: Sequence[Table]) -> str:
-    """The tables of `SHOWN`, masked, as Markdown."""
-    shown = [
+def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = SHOWN) -> str:
+    """Those tables, masked, as Markdown."""
+    chosen = [
         table
         for table in tables
-        if (table.name, table.protocol_key, table.subset) in SHOWN and table.variant.mask == "masked"
+        if (table.name, table.protocol_key, table.subset) in shown and table.variant.mask == "masked"
     ]
-    return "\n".join(to_markdown(table) for table in shown)
+    return "\n".join(to_markdown(table) for table in chosen)
 
 
-def store(folder: Path, tables: Sequence[Table]) -> None:
-    """One Markdown file per table, numbered in order; those of an earlier run with other tables go."""
-    folder.mkdir(parents=True, exist_ok=True)
+def store(folder: Path, results: Results, tables: Sequence[Table]) -> None:
+    """Every value, and one Markdown file per table, numbered in order; those of an earlier run with other tables go."""
+    write_results(folder / (NAME + PACKED), results.run, results.records)
     names = [
         f"{number:02d}-{table.name}-{table.protocol_key}-{table.variant.mask}-{table.subset}.md"
         for number, table in enumerate(tables)
@@ -107,21 +112,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m unirender_evaluation.readme", description="Copies result tables into the README."
     )
-    parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote")
+    parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote, or its results file")
     parser.add_argument(
         "--readme", type=Path, help="rewritten in place, between its comments `results` and `checkpoint`"
     )
     parser.add_argument("--checkpoint", type=Path, default=SHIPPED, help="pipeline folder of the model that was scored")
-    parser.add_argument("--stored", type=Path, help="folder for one Markdown file per table")
+    parser.add_argument("--stored", type=Path, help="gets a folder by the suite's name: values, and a file per table")
     arguments = parser.parse_args(argv)
     try:
-        run, tables = run_tables(arguments.run)
+        results, tables = whole_run(arguments.run)
+        suite, date = results.run.suite, results.run.date
         if arguments.readme:
-            head = f"Printed by `make bench` ({run.suite}, {run.date}); masked. The report has the other variants."
-            text = fill(arguments.readme.read_text(), "results", f"{head}\n\n{selection(tables)}")
+            shipped = suite == SHIPPED_SUITE
+            command = "make bench" if shipped else f"unirender bench run --suite {suite}"
+            head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
+            slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
+            text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")
             arguments.readme.write_text(fill(text, "checkpoint", checkpoint_text(arguments.checkpoint)))
         if arguments.stored:
-            store(arguments.stored, tables)
+            store(arguments.stored / suite, results, tables)
     except (UnirenderError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -41,7 +41,7 @@ class BenchValidate:
     """Check files of results: layout, content, and that they fit this version and suite. Every problem has its line."""
 
     files: Files
-    """`results.json`, or folders of runs."""
+    """`results.json`, packed by gzip or not, or folders of runs."""
 
     def run(self) -> int:
         """Returns 1 where a file is not valid."""
@@ -58,7 +58,7 @@ class BenchTables:
     """
 
     files: Files
-    """`results.json`, or folders of runs, of one suite."""
+    """`results.json`, packed by gzip or not, or folders of runs, of one suite."""
     table: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Print only this table (rendering, inverse, relighting, multi-view, physics); repeatable. None: all."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -97,7 +97,7 @@ class BenchCompare:
     """
 
     a: Annotated[Path, tyro.conf.Positional]
-    """`results.json`, or the folder of a run: A."""
+    """`results.json`, packed by gzip or not, or the folder of a run: A."""
     b: Annotated[Path, tyro.conf.Positional]
     """The same: B."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

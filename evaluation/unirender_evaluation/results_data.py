@@ -11,6 +11,7 @@ from unirender_evaluation.specs import PROTOCOLS
 from unirender_evaluation.table_list import ALL_METRICS
 
 NAME = "results.json"
+PACKED = ".gz"  # what the name of a file that gzip has packed ends in
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Results:
     @property
     def label(self) -> str:
         """A short name: the file's, or its folder's where the file has the usual name."""
-        path = Path(self.source).absolute()
+        path = Path(self.source.removesuffix(PACKED)).absolute()
         return path.parent.name if path.name == NAME else path.stem
 
 

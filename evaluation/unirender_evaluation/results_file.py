@@ -6,11 +6,14 @@
     definitions   what each protocol gives a method, and each metric's formula and direction, as they were in the run
     records       every value of every row on every sample (`records.Record`), one a line
 
-`bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. Reading validates: by
-the schema (`schema`), and by what no schema can say (`results_check`).
+`bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. One whose name ends in `.gz`
+is packed by gzip, to a fifth of its size; the same results are always the same bytes. Reading validates: by the
+schema (`schema`), and by what no schema can say (`results_check`).
 """
 
+import gzip
 import json
+import zlib
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -27,7 +30,7 @@ from unirender_evaluation.records import (
     run_from_plain,
 )
 from unirender_evaluation.results_check import content_problems
-from unirender_evaluation.results_data import NAME, Definitions, Results, definitions
+from unirender_evaluation.results_data import NAME, PACKED, Definitions, Results, definitions
 from unirender_evaluation.schema import FORMAT, json_schema
 from unirender_evaluation.schema_check import Problem, quoted, schema_problems
 
@@ -44,7 +47,7 @@ NEIGHBOURS = {
 
 
 def write_results(path: Path, run: RunInfo, records: Sequence[Record]) -> None:
-    """Writes a file, atomically.
+    """Writes a file, atomically; packed, if the name ends in `.gz`.
 
     Raises:
         UnirenderError: it would not be valid; nothing is written.
@@ -53,7 +56,8 @@ def write_results(path: Path, run: RunInfo, records: Sequence[Record]) -> None:
     from_document(document, str(path))
     lines = [json.dumps(record, sort_keys=True, allow_nan=False) for record in document.pop("records")]
     head = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False).removesuffix("\n}")
-    replace_file(path, head + ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n")
+    text = head + ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
+    replace_file(path, gzip.compress(text.encode(), mtime=0) if path.suffix == PACKED else text)
 
 
 def to_document(run: RunInfo, records: Sequence[Record], meaning: Definitions) -> dict[str, Any]:
@@ -85,17 +89,21 @@ def read_document(path: Path) -> Any:
         UnirenderError: no such file, or no JSON: the message says what the file is instead, as far as it can be told.
     """
     if path.is_dir():
-        return read_document(path / NAME) if (path / NAME).is_file() else _document_of_folder(path)
+        files = [path / name for name in (NAME, NAME + PACKED) if (path / name).is_file()]
+        return read_document(files[0]) if files else _document_of_folder(path)
     if path.name in NEIGHBOURS and path.is_file():
         raise UnirenderError(f"{path}: {NEIGHBOURS[path.name]}; expected {NAME} or the folder of the run")
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = (gzip.decompress if path.suffix == PACKED else bytes)(path.read_bytes()).decode("utf-8-sig")
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise UnirenderError(f"{path}: cannot be unpacked ({error}); was it copied whole, and is it gzip?") from None
     except FileNotFoundError:
         raise UnirenderError(
             f"{path}: no such file, expected the {NAME} that `unirender bench run` writes, or the folder of the run"
         ) from None
     except UnicodeDecodeError:
-        raise UnirenderError(f"{path}: is no text in UTF-8, expected JSON; unpack it if it is compressed") from None
+        expected = f"expected JSON, or JSON packed by gzip in a file whose name ends in {PACKED}"
+        raise UnirenderError(f"{path}: is no text in UTF-8, {expected}") from None
     except OSError as error:
         raise UnirenderError(f"{path}: cannot be read ({error.strerror})") from None
     try:

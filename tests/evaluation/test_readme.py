@@ -1,6 +1,8 @@
 """Result tables reach the README and the documentation from a run's records, never by hand."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +13,12 @@ from unirender.errors import UnirenderError
 from unirender_evaluation import readme
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
 
+STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
 README = f"# title\n\n{SLOT.format('results')}\n{SLOT.format('checkpoint')}\nend\n"
 
 
-def write_example(folder: Path, limit: int | None = None) -> Path:
+def write_example(folder: Path, limit: int | None = None, suite: str = "tiny") -> Path:
     """A run of one method on two samples of the inverse table."""
     folder.mkdir()
     values = ({"albedo.psnr@masked-srgb-raw": 20.0}, {"albedo.psnr@masked-srgb-raw": 23.0})
@@ -25,7 +28,7 @@ def write_example(folder: Path, limit: int | None = None) -> Path:
     ]
     write_records(folder / "records.jsonl", records)
     methods = (MethodInfo("mine", "Mine", "external"),)
-    write_run(folder / "run.json", RunInfo("tiny", "0" * 64, 64, methods, date="2026-11-21", limit=limit))
+    write_run(folder / "run.json", RunInfo(suite, "0" * 64, 64, methods, date="2026-11-21", limit=limit))
     return folder
 
 
@@ -43,9 +46,10 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     target = tmp_path / "README.md"
     target.write_text(README)
     checkpoint = write_checkpoint(tmp_path / "checkpoint")
+    folder = tmp_path / "stored" / "tiny"
+    folder.mkdir(parents=True)
     for name in ("98-a-table-of-before.md", "notes.md"):
-        (tmp_path / "stored").mkdir(exist_ok=True)
-        (tmp_path / "stored" / name).write_text("of an earlier run")
+        (folder / name).write_text("of an earlier run")
 
     for _ in range(2):  # filling a filled README changes nothing
         options = ["--readme", str(target), "--stored", str(tmp_path / "stored"), "--checkpoint", str(checkpoint)]
@@ -59,16 +63,48 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     assert "21.50" in text
     assert "what was here" not in text
     assert "Protocol:" in text
-    stored = [path.read_text() for path in (tmp_path / "stored").glob("*.md")]
+    stored = [path.read_text() for path in folder.glob("*.md")]
     assert any("21.50" in table for table in stored)
-    assert not (tmp_path / "stored" / "98-a-table-of-before.md").exists()
-    assert (tmp_path / "stored" / "notes.md").exists()
+    assert not (folder / "98-a-table-of-before.md").exists()
+    assert (folder / "notes.md").exists()
+
+
+def test_what_is_stored_gives_the_same_again(tmp_path: Path) -> None:
+    assert readme.main([str(write_example(tmp_path / "run")), "--stored", str(tmp_path / "a")]) == 0
+    assert readme.main([str(tmp_path / "a" / "tiny"), "--stored", str(tmp_path / "b")]) == 0
+    first, second = ({path.name: path.read_bytes() for path in (tmp_path / x / "tiny").iterdir()} for x in "ab")
+    assert first == second
+    assert "results.json.gz" in first
+
+
+def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> None:
+    run = write_example(tmp_path / "run", suite="large")
+    target = tmp_path / "README.md"
+    target.write_text(README + SLOT.format("results-large"))
+    options = ["--readme", str(target), "--checkpoint", str(write_checkpoint(tmp_path / "checkpoint"))]
+    assert readme.main([str(run), *options]) == 0
+    before, after = target.read_text().split("<!-- results-large:begin -->")
+    assert "what was here" in before
+    assert "Printed by `unirender bench run --suite large`" in after
+    assert "21.50" in after
+
+
+@pytest.mark.parametrize("suite", sorted(path.name for path in STORED.iterdir()))
+def test_the_projects_tables_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
+    # In a process of its own: the checks of every call that tests run under take ten times as long as the work.
+    command = [sys.executable, "-m", "unirender_evaluation.readme", str(STORED / suite), "--stored", str(tmp_path)]
+    subprocess.run(command, check=True)
+    folders = STORED / suite, tmp_path / suite
+    committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
+    assert committed == made, (
+        "make them again: python -m unirender_evaluation.readme evaluation/results/SUITE --stored evaluation/results"
+    )
 
 
 def test_a_method_without_values_gets_no_row(tmp_path: Path) -> None:
     run = write_example(tmp_path / "run")
     append_record(run / "records.jsonl", Record("inverse", "single-image", "silent", "s0", "object0", {}, key="k"))
-    _, tables = readme.run_tables(run)
+    _, tables = readme.whole_run(run)
     rows = [row.key for table in tables for row in table.rows]
     assert "mine" in rows
     assert "silent" not in rows

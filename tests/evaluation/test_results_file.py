@@ -1,5 +1,6 @@
 """Results files: round trip, what they are mistaken for, and every contradiction that a reader must hear of."""
 
+import gzip
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,6 +38,16 @@ def test_what_is_written_comes_back(tmp_path: Path) -> None:
     assert "Infinity" not in path.read_text()
 
 
+def test_a_packed_file_is_the_same_results_in_the_same_bytes(tmp_path: Path) -> None:
+    for name in ("a.json", "a.json.gz", "b/results.json.gz", "c/results.json.gz"):
+        write_results(tmp_path / name, RUN, small_records())
+    assert gzip.decompress((tmp_path / "a.json.gz").read_bytes()) == (tmp_path / "a.json").read_bytes()
+    assert (tmp_path / "b/results.json.gz").read_bytes() == (tmp_path / "c/results.json.gz").read_bytes()
+    assert read_results(tmp_path / "a.json.gz").records == read_results(tmp_path / "a.json").records
+    labels = [read_results(tmp_path / name).label for name in ("a.json.gz", "b/results.json.gz", "c")]
+    assert labels == ["a", "b", "c"]
+
+
 def test_the_folder_of_a_run_needs_no_file_of_results(tmp_path: Path) -> None:
     write_run(tmp_path / "run.json", RUN)
     write_records(tmp_path / "records.jsonl", small_records())
@@ -59,7 +70,9 @@ def test_nothing_invalid_is_written(tmp_path: Path) -> None:
         ("a.json", b"", r"is no JSON: .* \(the file ends too early: was it copied whole\?\)"),
         ("a.json", b'{"format": "unirender-results", "schema"', "the file ends too early"),
         ("a.json", b"suite,psnr\ntiny,20\n", "is no JSON: Expecting value"),
-        ("a.json", b"\x1f\x8b\x08\x00\xff", "is no text in UTF-8, expected JSON; unpack it if it is compressed"),
+        ("a.json", b"\x1f\x8b\x08\x00\xff", "is no text in UTF-8, expected JSON, or JSON packed by gzip in a file"),
+        ("a.json.gz", b"\x1f\x8b\x08\x00\xff", "cannot be unpacked"),
+        ("b.json.gz", b"{}", "cannot be unpacked"),
         ("a.json", b'{"format": NaN}', "has the number NaN, which JSON does not know"),
         ("a.json", b'{"format": 1, "format": 2}', "an object has the field 'format' twice"),
         ("a.json", b"[" * 100_000, "nested too deeply"),
