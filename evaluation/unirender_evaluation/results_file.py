@@ -6,8 +6,8 @@
     definitions   what each protocol gives a method, and each metric's formula and direction, as they were in the run
     records       every value of every row on every sample (`records.Record`), one a line
 
-`bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. One whose name ends in `.gz`
-is packed by gzip, to a fifth of its size; the same results are always the same bytes. Reading validates: by the
+`bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. One whose name ends in
+`.gz` is packed by gzip, to a fifth of its size; the same results are always the same bytes. Reading validates: by the
 schema (`schema`), and by what no schema can say (`results_check`).
 """
 
