@@ -1,0 +1,187 @@
+"""Questions put to stored results, answered in Markdown: what the page *What the tables say* is made of.
+
+Nothing is measured here: every figure is a mean of records, or a paired difference of two rows over the samples that
+both answered, with the interval of the bootstrap over objects.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
+from unirender_evaluation.metrics import METRICS, SCALES, Variant, metric_key
+from unirender_evaluation.published import published_tables
+from unirender_evaluation.records import Record
+from unirender_evaluation.results_data import Results
+
+MASKED = Variant("masked", "srgb", "raw")
+NOT_RUN = "not run"
+_MATERIAL = re.compile(r"_m(\d{3})_r(\d{3})$")  # of a sample with one number each; others have maps of their own
+# Metallic and roughness in thirds: the outer ones are where a material shows what it is.
+_THIRDS = (("0 to 0.3", 0.0, 0.35), ("0.4 to 0.6", 0.35, 0.65), ("0.7 to 1", 0.65, 1.01))
+
+
+@dataclass(frozen=True)
+class Question:
+    """One number of row `a` against that of row `b`."""
+
+    text: str
+    table: str
+    protocol: str
+    quantity: str
+    metric: str
+    a: str
+    b: str
+
+    @property
+    def key(self) -> str:
+        return metric_key(self.quantity, METRICS[self.metric], MASKED)
+
+
+def run_line(results: Results) -> str:
+    """Which results these are, in a line."""
+    run = results.run
+    objects = len({record.object for record in results.records})
+    return (
+        f"`{run.suite}`: {objects} objects at {run.resolution} x {run.resolution} pixels, {len(results.records):,} "
+        f"answers; truth `{run.suite_hash[:12]}`, code `{run.code}`, {run.date}"
+    )
+
+
+def answers(results: Results, questions: Sequence[Question]) -> str:
+    """A table with a line for each question: both means, their difference with its interval, and the verdict."""
+    lines = [_answer(results, question) for question in questions]
+    head = ["", "A", "B", "A", "B", "A - B", "", "pairs (objects)"]
+    return _table(head, lines, left=3)
+
+
+def _answer(results: Results, question: Question) -> list[str]:
+    labels = [_label(results, key) for key in (question.a, question.b)]
+    records = Selection(question.table, question.protocol).of(results.records)
+    a, b = (values_of(records, key, question.key) for key in (question.a, question.b))
+    shared = sorted(a.keys() & b.keys())
+    if not shared:
+        return [question.text, *labels, NOT_RUN, NOT_RUN, "", "", "0"]
+    metric = METRICS[question.metric]
+    found = compare(records, metric, question.key, question.a, question.b)
+    means = [f"{np.mean([values[sample] for sample in shared]):.{metric.decimals}f}" for values in (a, b)]
+    difference, decimals = found.difference, metric.decimals
+    shown = f"{difference.mean:+.{decimals}f} [{difference.low:+.{decimals}f}, {difference.high:+.{decimals}f}]"
+    return [question.text, *labels, *means, shown, _word(found), f"{difference.n} ({difference.clusters})"]
+
+
+def _word(found: Comparison) -> str:
+    if not found.decided:
+        return "one object: no interval"
+    return "**A is better**" if found.a_beats_b else "**B is better**" if found.b_beats_a else "no difference shown"
+
+
+def by_material(results: Results, method: str, numbers: Sequence[tuple[str, str]]) -> str:
+    """Means of a row of the inverse table by the true material.
+
+    Args:
+        results: a run's.
+        method: the row.
+        numbers: (quantity, metric) of the columns.
+    """
+    records = [r for r in Selection("inverse", "single-image").of(results.records) if r.method == method]
+    groups: list[tuple[str, Callable[[float, float], bool]]] = [("all with one number each", lambda m, r: True)]
+    groups += [(f"metallic {name}", _between(low, high, 0)) for name, low, high in _THIRDS]
+    groups += [(f"roughness {name}", _between(low, high, 1)) for name, low, high in _THIRDS]
+    lines = []
+    for name, belongs in groups:
+        lines.append([name, *_means([r for r in records if (m := material_of(r)) and belongs(*m)], numbers)])
+    own = [record for record in records if material_of(record) is None]
+    if own:
+        lines.append(["with maps of their own", *_means(own, numbers)])
+    return _table(["true material", "pictures", *map(_column, numbers)], lines)
+
+
+def material_of(record: Record) -> tuple[float, float] | None:
+    """(metallic, roughness) of a sample's material by its name; None where it has maps."""
+    found = _MATERIAL.search(record.sample)
+    return (int(found[1]) / 100, int(found[2]) / 100) if found else None
+
+
+def by_object(results: Results, method: str, numbers: Sequence[tuple[str, str]], count: int) -> str:
+    """Means of the objects on which a row is worst, by the first number: the worst `count`."""
+    records = [r for r in Selection("inverse", "single-image").of(results.records) if r.method == method]
+    objects = dict.fromkeys(record.object for record in records)
+    quantity, name = numbers[0]
+    key, metric = metric_key(quantity, METRICS[name], MASKED), METRICS[name]
+    means = {o: float(np.mean([r.values[key] for r in records if r.object == o and key in r.values])) for o in objects}
+    worst = sorted(objects, key=lambda o: means[o] if metric.higher_is_better else -means[o])[:count]
+    lines = [[o, *_means([r for r in records if r.object == o], numbers)] for o in worst]
+    return _table(["object", "pictures", *map(_column, numbers)], lines)
+
+
+def by_scale(results: Results, methods: Sequence[str]) -> str:
+    """The albedo's PSNR of rows: as it is, and after a least-squares factor for the picture or for each channel."""
+    records = Selection("inverse", "single-image").of(results.records)
+    lines = []
+    for method in methods:
+        found = [record for record in records if record.method == method]
+        keys = [metric_key("albedo", METRICS["psnr"], Variant("masked", "srgb", scale)) for scale in SCALES]
+        means = [f"{np.mean([r.values[key] for r in found]):.2f}" if found else NOT_RUN for key in keys]
+        lines.append([_label(results, method), *means])
+    return _table(["", "as it is", "one factor", "one a channel"], lines)
+
+
+def published_against_constant(results: Results) -> str:
+    """The paper's errors of metallic and roughness beside those of one constant, which looks at no picture."""
+    records = Selection("inverse", "single-image").of(results.records)
+    keys = [metric_key(quantity, METRICS["mse"], MASKED) for quantity in ("metallic", "roughness")]
+    lines = [
+        [f"{row.name} (*published*)", f"{row.values['metallic.mse']:.4f}", f"{row.values['roughness.mse']:.4f}"]
+        for row in published_tables()["inverse"]
+        if {"metallic.mse", "roughness.mse"} <= row.values.keys()
+    ]
+    for method in ("constant-0-5", "ours-mean"):
+        found = [values_of(records, method, key) for key in keys]
+        shown = [f"{np.mean(list(values.values())):.4f}" if values else NOT_RUN for values in found]
+        lines.append([f"{_label(results, method)} (measured here)", *shown])
+    return _table(["", "metallic MSE", "roughness MSE"], lines)
+
+
+def seconds(results: Results, rows: Sequence[tuple[str, str, str]]) -> str:
+    """Median seconds of an answer as the run recorded them, for (table, protocol, method)."""
+    lines = []
+    for table, protocol, method in rows:
+        records = Selection(table, protocol).of(results.records)
+        times = [r.seconds for r in records if r.method == method and r.seconds is not None]
+        shown = f"{np.median(times):.2f}" if times else NOT_RUN
+        lines.append([_label(results, method), f"{table}, {protocol}", shown, str(len(times))])
+    return _table(["", "question", "seconds", "answers"], lines, left=2)
+
+
+def _means(records: Sequence[Record], numbers: Sequence[tuple[str, str]]) -> list[str]:
+    cells = [str(len(records))]
+    for quantity, name in numbers:
+        key = metric_key(quantity, METRICS[name], MASKED)
+        values = [record.values[key] for record in records if key in record.values]
+        cells.append(f"{np.mean(values):.{METRICS[name].decimals}f}" if values else "-")
+    return cells
+
+
+def _between(low: float, high: float, which: int) -> Callable[[float, float], bool]:
+    return lambda *material: low <= material[which] < high
+
+
+def _label(results: Results, key: str) -> str:
+    found = [info.label for info in results.run.methods if info.key == key]
+    return found[0] if found else key
+
+
+def _column(number: tuple[str, str]) -> str:
+    quantity, metric = number[0], METRICS[number[1]]
+    return f"{quantity}, {metric.label} ({metric.unit})" if metric.unit else f"{quantity}, {metric.label}"
+
+
+def _table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:
+    if any(len(line) != len(head) for line in lines):
+        raise UnirenderError(f"table: got lines of {sorted({len(line) for line in lines})} cells, expected {len(head)}")
+    rule = [":--" if i < left else "--:" for i in range(len(head))]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *lines)) + "\n"
