@@ -17,8 +17,11 @@ if TYPE_CHECKING:
     from unirender_evaluation.figures_panels import MitsubaTruth, Subject
     from unirender_evaluation.suites import Scene, Suite
 
-Kind = Literal["metallic", "roughness", "relighting", "comparison", "overview"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview"]  # of checkpoints and methods
+Contract = Literal["maps", "camera"]  # of the documentation of the data contract; of nobody
+Kind = Asked | Contract
+KINDS: tuple[Asked, ...] = get_args(Asked)
+CONTRACT: tuple[Contract, ...] = get_args(Contract)
 SCENES = 2  # that are shown where none is named
 
 
@@ -45,7 +48,8 @@ class Figures:
     """Pictures of your own instead of the suite's, with an alpha channel that cuts the object out: `pictures.png`."""
     kinds: tuple[Kind, ...] = KINDS
     """metallic, roughness: the input edited over `--values`. relighting: under other lights of the suite. comparison: a
-    column for each checkpoint and method. overview: maps, edits and relighting of one picture. Not with --pictures."""
+    column for each checkpoint and method. overview: maps, edits and relighting of one picture. maps, camera: what the
+    data contract says, without a method; only where they are named. Not with --pictures."""
     values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of metallic and roughness in the strips, in [0, 1]."""
     lights: int = 4
@@ -76,7 +80,7 @@ class Figures:
                 f"--{beside[0]}: got it beside --pictures, expected one of the two: scenes are the suite's"
             )
         if not self.kinds:
-            raise UsageError(f"--kinds: expected at least one of {', '.join(KINDS)}")
+            raise UsageError(f"--kinds: expected at least one of {', '.join([*KINDS, *CONTRACT])}")
 
     def run(self) -> int:
         """Draws, and prints a line for each figure; returns the exit status."""
@@ -87,19 +91,36 @@ class Figures:
         from unirender_evaluation.figures_panels import MitsubaTruth, Subject
         from unirender_evaluation.suites import load_suite
 
-        console, suite = Console(), load_suite(self.suite)
+        suite = load_suite(self.suite)
         scenes = [suite.scene(key) for key in self.scenes] or default_scenes(suite)
         truth = MitsubaTruth(suite, self.spp)
         grids: dict[str, Callable[[list[Subject]], Grid]] = {
-            kind: partial(self.draw, kind, suite=suite, scenes=scenes, truth=truth) for kind in self.kinds
+            kind: partial(self.draw, kind, suite=suite, scenes=scenes, truth=truth)
+            for kind in self.kinds
+            if kind not in CONTRACT
         }
         if self.pictures:
             grids = {"pictures": partial(self.sheet, suite=suite, pictures=self.read())}
-        subjects = self.subjects()
-        for name, grid in grids.items():
-            path = save(grid(subjects), self.out / f"{name}.png")
+        console = Console()
+
+        def say(path: Path) -> None:
             console.print(f"{path} ({path.stat().st_size / 1000:.0f} kB)", highlight=False, markup=False)
+
+        for kind in CONTRACT:
+            if kind in self.kinds:
+                say(self.explain(kind, suite, scenes[0]))
+        subjects = self.subjects() if grids else []
+        for name, grid in grids.items():
+            say(save(grid(subjects), self.out / f"{name}.png"))
         return 0
+
+    def explain(self, kind: Contract, suite: "Suite", scene: "Scene") -> Path:
+        """A figure of the data contract."""
+        from unirender.files import replace_file
+        from unirender_evaluation import figures_contract as contract
+
+        drawn = contract.maps_figure(suite, scene) if kind == "maps" else contract.camera_figure(suite.spec.camera)
+        return replace_file(self.out / f"{kind}.png", contract.png(drawn))
 
     def read(self) -> "list[Picture]":
         """The user's pictures, framed.
