@@ -1,20 +1,30 @@
-"""The documentation against the program: commands and options that it shows exist, and so do the files it links to."""
+"""The documentation against the program: the command lines that it shows are taken, the options that it names exist,
+and so do the files and headings that it links to. What blocks hold besides commands is run by `test_docs_code.py`.
+"""
 
 import contextlib
+import importlib.util
 import io
 import pkgutil
 import re
 import shlex
+import tomllib
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
+from doc_blocks import anchors, blocks, pages
 
 from unirender import cli
+from unirender.command_line import parse
+from unirender.errors import UnirenderError
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
+HEADING = re.compile(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)")
+EXTRA = re.compile(r"unirender\[([\w,]+)\]")
 
 
 def shown_commands(text: str) -> list[list[str]]:
@@ -51,6 +61,85 @@ def problems(text: str) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_and_options_exist(page: Path) -> None:
     assert not problems(page.read_text(encoding="utf-8"))
+
+
+def typed(text: str) -> Iterator[list[str]]:
+    """The words of every command that a console block shows, without comments and the dots that stand for more."""
+    for line in re.sub(r"\\\n\s*", " ", text).splitlines():
+        if line.startswith("$ "):
+            yield [word for word in shlex.split(line.removeprefix("$ "), comments=True) if word not in ("...", "…")]
+
+
+def refusal(words: list[str]) -> str:
+    """Why a command that the documentation shows would not start; empty where it would, or is not ours to know."""
+    if "unirender.cli" in words:  # started by another program, with -m
+        words = ["unirender", *words[words.index("unirender.cli") + 1 :]]
+    if words[:1] == ["unirender"]:
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            try:
+                parse(cli.Command, words[1:], "unirender", "")
+            except (SystemExit, UnirenderError) as error:
+                return f"{' '.join(words)}: {error} {said.getvalue()}"
+    elif words[:1] == ["make"]:
+        known = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        return "".join(f"no target: {word}" for word in words[1:] if "=" not in word and word not in known)
+    elif words[:2] == ["python", "-m"] and importlib.util.find_spec(words[2]) is None:
+        return f"no module: {words[2]}"
+    return ""
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: page.name)
+def test_command_lines_are_taken(page: Path) -> None:
+    """Read as the program reads them: values, choices and what has to be there, too. Nothing is run."""
+    shown = [(block, words) for block in blocks(page) if block.language == "console" for words in typed(block.text)]
+    assert not [f"{block.place}: {why}" for block, words in shown if (why := refusal(words))]
+
+
+def test_console_blocks_show_commands() -> None:
+    """With the prompt by which they are known, or they would not be looked at."""
+    shown = [block for page in pages() for block in blocks(page) if block.language == "console"]
+    assert not [block.place for block in shown if not list(typed(block.text))]
+
+
+def test_a_command_that_would_not_start_is_found() -> None:
+    lines = (
+        "$ unirender dataset --out a --vary moods # --no-such",
+        "$ unirender dataset --out a \\\n  --objects 3 ...",
+        "$ unirender edit",
+        "$ torchrun -m unirender.cli train --steps many",
+        "$ make bunch",
+        "$ make bench A=1",
+        "$ python -m no_such_module",
+        "$ ls",
+        "unirender no-command",
+    )
+    refused = [bool(refusal(words)) for words in typed("\n".join(lines))]
+    assert refused == [True, False, True, True, True, False, True, False]
+
+
+def test_extras_exist() -> None:
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    shown = {name for page in PAGES for found in EXTRA.findall(page.read_text("utf-8")) for name in found.split(",")}
+    assert shown
+    assert shown <= set(known)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_linked_headings_exist(page: Path) -> None:
+    """Sphinx refuses a wrong one of the site; README is no page of it, and is read elsewhere."""
+    links = HEADING.findall(page.read_text(encoding="utf-8"))
+    targets = [
+        (page.parent / name if name else page, anchor) for name, anchor in links if name.endswith(".md") or not name
+    ]
+    assert not [f"{path.name}#{anchor}" for path, anchor in targets if anchor not in anchors(path)]
+
+
+def test_anchors_are_those_of_github_and_myst(tmp_path: Path) -> None:
+    (tmp_path / "a.md").write_text(
+        "# Other sizes: `--tile`\n```console\n# no heading\n```\n## s and d, [again](b.md)\n(mark)=\n#### too deep\n"
+    )
+    assert anchors(tmp_path / "a.md") == {"other-sizes---tile", "s-and-d-again", "mark"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -24,6 +24,19 @@ def sphere(size: int, rng: np.random.Generator) -> Intrinsics:
     return Intrinsics(albedo=albedo, normal=normal, mask=inside[..., None])
 
 
+def own_picture(seed: int, size: int = 16) -> tuple[np.ndarray, Intrinsics]:
+    """A ball with roughness and metallic maps: its picture (h, w, 4), premultiplied, and all maps."""
+    rng = np.random.default_rng(seed)
+    shape = sphere(size, rng)
+    albedo, normal, mask = shape.require("albedo", "normal", "mask").values()
+    ramp = np.broadcast_to(np.linspace(0.1, 0.9, size, dtype=np.float32)[:, None], (size, size, 1)) * mask
+    environment = rng.uniform(0, 2, (16, 32, 3)).astype(np.float32)
+    light = {"diffuse": diffuse_light(normal, environment), "specular": specular_light(normal, 0.5, environment)}
+    maps = shape.replace(roughness=ramp, metallic=ramp[::-1], environment=environment, **light)
+    image = composite(albedo, ramp[::-1], light["diffuse"], light["specular"]) * mask
+    return np.concatenate([image, mask], axis=-1), maps
+
+
 def group_members(
     vary: str, size: int, lights: int, roughness: tuple[int, ...], metallic: tuple[int, ...], seed: int
 ) -> dict[str, bytes]:

@@ -5,29 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_shards import sphere
+from synthetic_shards import own_picture
 
-from unirender.composite import composite
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.data import GroupDataset
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
-SIZE = 16
-
-
-def own_picture(seed: int) -> tuple[np.ndarray, Intrinsics]:
-    """A ball with roughness and metallic maps: its picture (h, w, 4) and all maps."""
-    rng = np.random.default_rng(seed)
-    shape = sphere(SIZE, rng)
-    albedo, normal, mask = shape.require("albedo", "normal", "mask").values()
-    ramp = np.broadcast_to(np.linspace(0.1, 0.9, SIZE, dtype=np.float32)[:, None], (SIZE, SIZE, 1)) * mask
-    environment = rng.uniform(0, 2, (16, 32, 3)).astype(np.float32)
-    light = {"diffuse": diffuse_light(normal, environment), "specular": specular_light(normal, 0.5, environment)}
-    maps = shape.replace(roughness=ramp, metallic=ramp[::-1], environment=environment, **light)
-    image = composite(albedo, ramp[::-1], light["diffuse"], light["specular"]) * mask
-    return np.concatenate([image, mask], axis=-1), maps
 
 
 def written(folder: Path, pictures: dict[str, tuple[np.ndarray, Intrinsics]], monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -43,7 +27,7 @@ def written(folder: Path, pictures: dict[str, tuple[np.ndarray, Intrinsics]], mo
 def test_own_renders_are_read_back_as_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pictures = {"mug": own_picture(0), "cup": own_picture(1)}
     dataset = GroupDataset(written(tmp_path, pictures, monkeypatch))
-    assert (dataset.keys, dataset.resolution) == (("mug", "cup"), (SIZE, SIZE))
+    assert (dataset.keys, dataset.resolution) == (("mug", "cup"), (16, 16))
     image, maps = pictures["cup"]
     found_image, found = dataset.stored(1, dataset.pairs(1)[0])
     np.testing.assert_allclose(found_image, image[..., :3], rtol=2e-3, atol=2e-3)  # half floats

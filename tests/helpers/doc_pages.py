@@ -1,0 +1,249 @@
+"""What the examples of the documentation assume, page by page: files and names that a reader would have, made small."""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from accelerate.tracking import GeneralTracker, on_main_process
+from inline_executor import Inline
+from reference_scenes import environment, sphere
+from safetensors.torch import save_file
+from synthetic_shards import own_picture, write_dataset
+from tiny_models import TRAIN
+from tiny_suites import make_suite
+
+from unirender.color import image_srgb, unpremultiply
+from unirender.exr import image_channels, write_exr
+from unirender.files import write_png
+from unirender.training.groups import read_groups
+from unirender.training.source import ShardSource
+from unirender.training.trainer import RunConfig, Trainer
+from unirender_evaluation.export import export_inputs
+from unirender_evaluation.prediction_check import folder_problems, questions
+from unirender_evaluation.predictions import PredictionFolder
+from unirender_reference.dataset import generate
+from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.render import Renderer
+
+Names = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Example:
+    """How the Python blocks of a page are run, in an empty working folder.
+
+    Attributes:
+        names: makes the files that the page assumes in the working folder; returns the names that it assumes.
+        less: words of the page and what is run in their place, so that it takes seconds; each has to be on the page.
+        check: looks at what the blocks left, where running through is not enough.
+    """
+
+    names: Callable[[], Names] = dict
+    less: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    check: Callable[[Names], None] = lambda names: None
+
+
+def straight(image_rgba: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A picture as the model takes it: straight display values and coverage."""
+    mask = image_rgba[..., 3:]
+    return image_srgb(unpremultiply(image_rgba[..., :3], mask)), mask
+
+
+def photograph() -> Names:
+    shown, mask = straight(own_picture(0, size=64)[0])
+    return {"image_srgb": shown, "mask": mask}
+
+
+def mug() -> Names:
+    picture = photograph()
+    write_png(Path("mug.png"), np.concatenate([picture["image_srgb"], picture["mask"]], axis=-1))
+    return {}
+
+
+def check_tour(names: Names) -> None:
+    assert names["chrome"].coarse_share == 1.0, "the page says 1.0"
+    assert names["again"].shape == (64, 64, 3)
+
+
+def lights(folder: str, count: int) -> None:
+    Path(folder).mkdir()
+    for number in range(count):
+        radiance = environment(number)
+        write_exr(Path(folder) / f"hall_{number}k.exr", image_channels(radiance), half=False)
+
+
+def own_lights() -> Names:
+    lights("my_lights", 3)
+    return {}
+
+
+def data_set() -> Names:
+    """`data/train` under built-in lights; a light of another data set, all of whose lights are of `my_hdris`."""
+    small: dict[str, Any] = {"objects": 1, "resolution": 8, "spp": 16, "workers": 1}
+    generate(DatasetConfig(pairs=3, vary="basis", out=Path("data/train"), **small), executor=Inline())
+    lights("my_hdris", 9)
+    lit = {"lights": Path("my_hdris"), "light_share": 1.0, "turn_lights": True}
+    generate(DatasetConfig(pairs=9, vary="independent", out=Path("lit"), **small, **lit), executor=Inline())
+    drawn = [
+        light
+        for path in sorted(Path("lit").glob("*.tar"))
+        for _, members in read_groups(path)
+        for light in json.loads(members["json"])["lights"]
+    ]
+    return {"light": next(light for light in drawn if light["provenance"]["file"] == "hall_8k.exr")}
+
+
+def models() -> Names:
+    """A folder of meshes, the format of the page's glob among them."""
+    import trimesh
+
+    Path("models/chairs").mkdir(parents=True)
+    trimesh.creation.icosphere(subdivisions=1).export("models/chairs/0042.glb")
+    return {}
+
+
+def check_meshes(names: Names) -> None:
+    assert names["obj"].name == "0042"
+
+
+def lobes() -> Names:
+    return {"renderer": Renderer(sphere(subdivisions=2), resolution=8), "environment": environment()}
+
+
+def predicted() -> Names:
+    truth = own_picture(0)[1]
+    return {"prediction": truth.replace(albedo=truth.require("albedo")["albedo"] * np.float32(0.9)), "truth": truth}
+
+
+def check_score(names: Names) -> None:
+    assert 20 < names["values"]["albedo.psnr@masked-srgb-raw"] < 60
+
+
+def stranger() -> Names:
+    """The inputs of a tiny suite, and the arguments of the script that the page shows."""
+    export_inputs(make_suite(Path("suite")), Path("inputs"))
+    sys.argv[:] = ["predict.py", "inputs", "predictions"]
+    return {}
+
+
+def check_predictions(names: Names) -> None:
+    suite = make_suite(Path("again"))
+    assert not folder_problems(PredictionFolder(Path("predictions")), questions(suite), "ball")
+
+
+def shaded() -> Names:
+    maps = own_picture(0)[1]
+    gradient = np.ones((16, 16, 3), np.float32)
+    obj = sphere(subdivisions=2)
+    return {"intrinsics": maps, "environment": environment(), "image_gradient": gradient, "obj": obj}
+
+
+def check_gradients(names: Names) -> None:
+    assert names["image"].shape == (16, 16, 3)
+    assert np.abs(names["gradients"].albedo).max() > 0
+
+
+class MyTracker(GeneralTracker):
+    """A tracker as accelerate's documentation shows one; it keeps what it is told."""
+
+    name = "mine"
+    requires_logging_directory = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[dict[str, Any]] = []
+
+    @property
+    def tracker(self) -> list[dict[str, Any]]:
+        return self.lines
+
+    @on_main_process
+    def store_init_configuration(self, values: dict[str, Any]) -> None:
+        self.lines.append(values)
+
+    @on_main_process
+    def log(self, values: dict[str, Any], step: int | None = None, **options: Any) -> None:
+        self.lines.append(values)
+
+
+def training() -> Names:
+    """Pictures with maps, the weights of two runs, and a run of one step."""
+    for number in (5, 6):
+        save_file({"weight": torch.full((2, 2), float(number)).half()}, f"part{number}.safetensors")
+    config = dataclasses.replace(TRAIN, batch_size=2)
+    trainer = Trainer(config, RunConfig(Path("run"), steps=1, log_every=1), torch.device("cpu"), torch.float32)
+    source = ShardSource(write_dataset(Path("shards"), size=32), config.batch_size, config.seed)
+    pictures = {"mug": own_picture(0), "cup": own_picture(1)}
+    return {"pictures": pictures, "config": config, "trainer": trainer, "source": source, "MyTracker": MyTracker}
+
+
+def check_training(names: Names) -> None:
+    names["source"].close()
+    assert float(names["average"]["weight"][0, 0]) == 5.75
+    assert Path("run/log.jsonl").read_text(encoding="utf-8").count("\n") == 1
+
+
+def optimizer() -> Names:
+    """The two classes that the smaller configuration names; the page needs nothing else."""
+    from unirender_reference.optimize.refine_config import RefineConfig
+    from unirender_reference.optimize.transport_config import TransportConfig
+
+    return {"RefineConfig": RefineConfig, "TransportConfig": TransportConfig}
+
+
+OPTIMIZE = """OptimizeConfig(
+    transport=TransportConfig(pixels=300, fine_below=0.0, iterations=1, rounds=0),
+    refine=RefineConfig(iterations=2, spp=4, spp_gradient=4, depth=2),
+    texture_size=16,
+    light_rows=8,
+)"""
+SINGLE = "SingleConfig(coarse_pixels=150, pixels=300, steps=(1, 1, 1), fine_steps=1, light_rows=8)"
+
+
+def check_optimized(names: Names) -> None:
+    views = names["views"]
+    assert (len(views.seen), len(views.held_out)) == (2, 1)
+    assert Path("found/solution.json").is_file()
+    assert names["found"].albedo.shape == (24, 24, 3)
+    assert np.asarray(names["image"])[..., 3].max() > 0.9
+
+
+def printed_as_said(names: Names) -> None:
+    assert names["inside"](names["samples"], names["stated"]).mean() == pytest.approx(0.75), "the page says 0.75"
+
+
+EXAMPLES = {
+    "README.md": Example(photograph),
+    "dataset.md": Example(data_set),
+    "figures.md": Example(),
+    "lights.md": Example(own_lights),
+    "materials.md": Example(less={"metallic=0.5)": "metallic=0.5, resolution=16)", "spp=64": "spp=8"}),
+    "meshes.md": Example(models, check=check_meshes),
+    "model.md": Example(less={"range(8)": "range(1)", "resolution=128": "resolution=80", "spp=64": "spp=8"}),
+    "optimization.md": Example(
+        optimizer,
+        {
+            "resolution=64": "resolution=24",
+            "orbit(9, camera)": "orbit(3, camera)",
+            "spp=64": "spp=16",
+            "OptimizeConfig()": OPTIMIZE,
+            "place=place)": "place=place, pictures=False, threads=1)",
+            "SingleConfig()": SINGLE,
+        },
+        check_optimized,
+    ),
+    "passes.md": Example(lobes, {"spp=1152": "spp=144"}),
+    "physics.md": Example(check=printed_as_said),
+    "results_format.md": Example(predicted, check=check_score),
+    "score_your_method.md": Example(stranger, check=check_predictions),
+    "shade.md": Example(shaded, {"spp=256": "spp=16", "spp=64": "spp=16"}, check_gradients),
+    "tour.md": Example(mug, {"resolution=128": "resolution=32", "spp=256": "spp=16"}, check_tour),
+    "training.md": Example(training, check=check_training),
+}
+"""By the page's name. An example that needs nothing is `Example()`."""
