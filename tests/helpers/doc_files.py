@@ -32,7 +32,7 @@ LANGUAGES = ("json", "toml", "yaml", "text")
 def picture(path: Path, mode: str = "RGB", side: int = 12) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     levels = np.zeros((side, side, len(mode)), np.uint8)
-    levels[3:-3, 3:-3] = 200  # of RGBA, the alpha channel too: an object in the middle
+    levels[3:-3, 3:-3] = 255  # of RGBA, the alpha channel too: an object in the middle
     Image.fromarray(levels[..., 0] if mode == "L" else levels, mode).save(path)
 
 
@@ -53,7 +53,7 @@ def pair_record(text: str) -> None:
         light = pair["member"].partition(".")[0]
         assert pair["member"] == "{}.m{:03d}_r{:03d}.exr".format(light, *percents), "the page's pattern of names"
         assert pair["specular"] == f"{light}.r{percents[1]:03d}.specular.exr"
-        assert list(pair) == list(shown)
+        assert pair.keys() == shown.keys()
     assert shown == {
         "roughness": 0.3,
         "metallic": 0.5,
@@ -77,7 +77,7 @@ def views(text: str) -> None:
 def iiw(text: str) -> None:
     Path("1.json").write_text(text, encoding="utf-8")
     picture(Path("1.png"))
-    assert [sample.name for sample in Iiw(Path()).samples()] == ["1"]
+    assert [sample.key for sample in Iiw(Path()).samples()] == ["1"]
 
 
 def maw(text: str) -> None:
@@ -95,9 +95,16 @@ def slurm(text: str) -> None:
     from dask import config as dask_config
     from dask_jobqueue.slurm import SLURMJob
 
-    with dask_config.set(yaml.safe_load(text.replace("interface: ib0", "interface: lo"))):
+    merged = dask_config.merge(dask_config.config, yaml.safe_load(text))  # as dask reads the file over its defaults
+    with dask_config.set({"jobqueue": merged["jobqueue"]}):
         script = SLURMJob(scheduler="tcp://127.0.0.1:1", name="worker", processes=32).job_script()
-    for words in ("#SBATCH -p cpu", "#SBATCH --cpus-per-task=32", "#SBATCH -t 04:00:00", "--lifetime 225m", "lo"):
+    for words in (
+        "#SBATCH -p cpu",
+        "#SBATCH --cpus-per-task=32",
+        "#SBATCH -t 04:00:00",
+        "--interface ib0",
+        "--lifetime 225m",
+    ):
         assert words in script, script
 
 
