@@ -14,7 +14,7 @@ from doc_files import LANGUAGES, READERS
 from doc_pages import EXAMPLES, Example, Names
 
 CONSOLE = ("console", "bash")
-DRAWN = ("{code-cell} python", "{figure}", "{toctree}", "{include}", "{note}", "{warning}", "{tip}")  # by sphinx
+CELL = "{code-cell} python"  # sphinx runs it; other directives hold text, and blocks that are looked at
 NOT_RUN = {
     "physics.md": ["pseudo-code; unirender_evaluation/physics_ambiguity.py is the code"],
 }
@@ -24,6 +24,11 @@ NOT_RUN = {
 def shown(page: Path, *languages: str) -> list[Block]:
     """A page's blocks of these languages that are run."""
     return [block for block in blocks(page) if block.language in languages and block.not_run is None]
+
+
+def is_sphinx(language: str) -> bool:
+    """A cell that it runs, or a directive that holds no code: `{code-block}` would be neither run nor read."""
+    return language.startswith(CELL) or (language.startswith("{") and not language.startswith("{code"))
 
 
 def run_python(page: Path, found: list[Block], example: Example) -> Names:
@@ -90,7 +95,7 @@ def test_no_block_is_passed_over(page: Path) -> None:
     strange = [
         f"{block.place}: a block of {block.language or 'no language'!r}, which nothing runs"
         for block in blocks(page)
-        if block.not_run is None and block.language not in known and not block.language.startswith(DRAWN)
+        if block.not_run is None and block.language not in known and not is_sphinx(block.language)
     ]
     assert not strange
     assert [block.not_run for block in blocks(page) if block.not_run is not None] == NOT_RUN.get(page.name, [])
@@ -121,21 +126,24 @@ def test_a_block_that_does_not_run_is_found(working: Path) -> None:
     page = working / "page.md"
     page.write_text(
         "```python\na = 1\n```\n\n```{include} _part.md\n```\n\n<!-- not run: hours -->\n```python\nb\n```\n"
-        "- in a list\n\n  ```python\n  c = 3\n  ```\n"
+        "- in a list\n\n  ```python\n  c = 3\n  ```\n\n````{note}\n```python\nd = 4\n```\n````\n"
     )
     assert [(block.text, block.not_run) for block in blocks(page)] == [
         ("a = 1\n", None),
         ("assert a == 2\n", None),
         ("b\n", "hours"),
         ("c = 3\n", None),
+        ("```python\nd = 4\n```\n", None),
+        ("d = 4\n", None),
     ]
     found = shown(page, "python")
     assert run_python(page, found, Example(less={"a = 1": "a = 2"}))["c"] == 3
     with pytest.raises(AssertionError) as error:
         run_python(page, found, Example())
-    assert (error.traceback[-1].path.name, error.traceback[-1].lineno) == ("_part.md", 1)
+    assert (Path(error.traceback[-1].path).name, error.traceback[-1].lineno) == ("_part.md", 1)
     with pytest.raises(AssertionError, match="are not on the page"):
         run_python(page, found, Example(less={"d": "e"}))
+    assert [is_sphinx(name) for name in ("{note}", CELL, "{code-block} python", "rust")] == [True, True, False, False]
     page.write_text("```python\na = 1\n")
     with pytest.raises(ValueError, match=r"page\.md:1: nothing closes"):
         list(blocks(page))

@@ -96,8 +96,8 @@ class Figures:
         truth = MitsubaTruth(suite, self.spp)
         grids: dict[str, Callable[[list[Subject]], Grid]] = {
             kind: partial(self.draw, kind, suite=suite, scenes=scenes, truth=truth)
-            for kind in self.kinds
-            if kind not in CONTRACT
+            for kind in KINDS
+            if kind in self.kinds
         }
         if self.pictures:
             grids = {"pictures": partial(self.sheet, suite=suite, pictures=self.read())}
@@ -175,7 +175,7 @@ class Figures:
         return found
 
     def draw(
-        self, kind: Kind, subjects: "list[Subject]", suite: "Suite", scenes: "list[Scene]", truth: "MitsubaTruth"
+        self, kind: Asked, subjects: "list[Subject]", suite: "Suite", scenes: "list[Scene]", truth: "MitsubaTruth"
     ) -> "Grid":
         """One figure."""
         from unirender_evaluation import figures_overview

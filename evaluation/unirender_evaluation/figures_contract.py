@@ -158,5 +158,5 @@ def texel_of(direction: str) -> list[tuple[float, float]]:
 def _axis(axes: "Axes", name: str, end: tuple[float, float], start: tuple[float, float] = (0, 0)) -> None:
     colour = AXIS_COLOURS[name]
     axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2})
-    away = tuple(b + 0.13 * (b - a) for a, b in zip(start, end, strict=True))
-    axes.text(*away, name, color=colour, fontsize=11, weight="bold", ha="center", va="center")
+    x, y = (b + 0.13 * (b - a) for a, b in zip(start, end, strict=True))
+    axes.text(x, y, name, color=colour, fontsize=11, weight="bold", ha="center", va="center")

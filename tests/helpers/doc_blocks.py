@@ -44,7 +44,11 @@ def pages() -> list[Path]:
 
 def blocks(path: Path) -> Iterator[Block]:
     """Raises ValueError at a fence that nothing closes."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    yield from _blocks(path, path.read_text(encoding="utf-8").splitlines(), 0)
+
+
+def _blocks(path: Path, lines: list[str], above: int) -> Iterator[Block]:
+    """Those of some lines of a page, which has so many above them; a directive's, as of a note, come after itself."""
     number = 0
     while number < len(lines):
         opened = _OPEN.match(lines[number])
@@ -55,13 +59,16 @@ def blocks(path: Path) -> Iterator[Block]:
         closing = (i for i in range(number + 1, len(lines)) if lines[i].strip() == fence)
         end = next(closing, None)
         if end is None:
-            raise ValueError(f"{path.name}:{number + 1}: nothing closes this block")
+            raise ValueError(f"{path.name}:{above + number + 1}: nothing closes this block")
+        inside = [line.removeprefix(indent) for line in lines[number + 1 : end]]
         if included := _INCLUDE.match(language):
             yield from blocks(path.parent / included[1])
         else:
-            text = textwrap.dedent("\n".join(line.removeprefix(indent) for line in lines[number + 1 : end]) + "\n")
             said = _NOT_RUN.match(lines[number - 1]) if number else None
-            yield Block(path, number + 1, language, text, said and said[1])
+            text = textwrap.dedent("\n".join(inside) + "\n")
+            yield Block(path, above + number + 1, language, text, said and said[1])
+            if language.startswith("{") and not language.startswith("{code"):
+                yield from _blocks(path, inside, above + number + 1)
         number = end + 1
 
 
