@@ -142,7 +142,7 @@ def test_a_block_that_does_not_run_is_found(working: Path) -> None:
         run_python(page, found, Example())
     assert (Path(error.traceback[-1].path).name, error.traceback[-1].lineno) == ("_part.md", 1)
     with pytest.raises(AssertionError, match="are not on the page"):
-        run_python(page, found, Example(less={"d": "e"}))
+        run_python(page, found, Example(less={"no such words": ""}))
     assert [is_sphinx(name) for name in ("{note}", CELL, "{code-block} python", "rust")] == [True, True, False, False]
     page.write_text("```python\na = 1\n")
     with pytest.raises(ValueError, match=r"page\.md:1: nothing closes"):
