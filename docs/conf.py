@@ -3,7 +3,12 @@
 import re
 from pathlib import Path
 
+from docutils import nodes
+from docutils.utils.math import MathError
+from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
+from sphinx.util import logging
+from sphinx.writers.html5 import HTML5Translator
 
 import unirender
 
@@ -24,6 +29,7 @@ templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"unirender {version}"
 html_static_path = ["_static"]
+html_math_renderer = "mathml"
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -99,6 +105,19 @@ def _tables(folder: Path) -> str:
     return "\n\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md")))
 
 
+def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
+    """A formula as MathML, which browsers draw by themselves: MathJax would be fetched from another host."""
+    block = isinstance(node, nodes.math_block)
+    try:
+        markup = tex2mathml(node.astext().strip(), as_block=block)
+    except MathError as error:
+        logging.getLogger(__name__).warning("formula %r: %s", node.astext(), error, location=node)
+        raise nodes.SkipNode from error
+    writer.body.append(f'<div class="math">{markup}</div>' if block else markup)
+    raise nodes.SkipNode
+
+
 def setup(app: Sphinx) -> None:
+    app.add_html_math_renderer("mathml", inline_renderers=(_mathml, None), block_renderers=(_mathml, None))
     app.connect("source-read", _results)
     app.connect("autodoc-process-docstring", _docstring, priority=100)
