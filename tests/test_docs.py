@@ -5,6 +5,7 @@ and so do the files and headings that it links to. What blocks hold besides comm
 import contextlib
 import importlib.util
 import io
+import json
 import pkgutil
 import re
 import shlex
@@ -21,10 +22,23 @@ from unirender.command_line import parse
 from unirender.errors import UnirenderError
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")),
+]
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 HEADING = re.compile(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)")
 EXTRA = re.compile(r"unirender\[([\w,]+)\]")
+
+
+def page_text(page: Path) -> str:
+    """The text of a page; of a notebook what stands between its code."""
+    text = page.read_text(encoding="utf-8")
+    if page.suffix != ".ipynb":
+        return text
+    cells = (cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "markdown")
+    return "\n\n".join("".join(cell["source"]) for cell in cells)
 
 
 def shown_commands(text: str) -> list[list[str]]:
@@ -60,7 +74,7 @@ def problems(text: str) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_and_options_exist(page: Path) -> None:
-    assert not problems(page.read_text(encoding="utf-8"))
+    assert not problems(page_text(page))
 
 
 def typed(text: str) -> Iterator[list[str]]:
@@ -144,13 +158,13 @@ def test_anchors_are_those_of_github_and_myst(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_linked_files_exist(page: Path) -> None:
-    links = LINK.findall(page.read_text(encoding="utf-8"))
+    links = LINK.findall(page_text(page))
     assert not [link for link in links if not (page.parent / link).exists()]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_names_in_python_roles_exist(page: Path) -> None:
-    for name in re.findall(r"\{py:\w+\}`([\w.]+)`", page.read_text(encoding="utf-8")):
+    for name in re.findall(r"\{py:\w+\}`([\w.]+)`", page_text(page)):
         assert pkgutil.resolve_name(name) is not None
 
 
