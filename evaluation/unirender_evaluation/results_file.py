@@ -73,13 +73,13 @@ def to_document(run: RunInfo, records: Sequence[Record], meaning: Definitions) -
     }
 
 
-def read_results(path: Path) -> Results:
+def read_results(path: str | Path) -> Results:
     """Reads a results file, or the folder of a run.
 
     Raises:
         UnirenderError: it cannot be read or is not valid; the message lists the problems.
     """
-    return from_document(read_document(path), str(path))
+    return from_document(read_document(Path(path)), str(path))
 
 
 def read_document(path: Path) -> Any:

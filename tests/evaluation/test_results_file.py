@@ -30,6 +30,7 @@ def test_what_is_written_comes_back(tmp_path: Path) -> None:
     found = read_results(path)
     assert (found.run, list(found.records)) == (RUN, records)
     assert found.label == "run"
+    assert read_results(str(path)) == found
     assert read_results(path.parent) == replace(found, source=str(path.parent))
     assert found.definitions.metrics["psnr"]["higher_is_better"] is True
     assert found.definitions.protocols["single-image"] == "one image and its mask"
