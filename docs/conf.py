@@ -29,6 +29,7 @@ templates_path = ["_templates"]
 html_theme = "furo"
 html_title = f"unirender {version}"
 html_static_path = ["_static"]
+html_css_files = ["narrow.css"]
 html_math_renderer = "mathml"
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
@@ -37,6 +38,7 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_output_stderr = "remove"
+nb_render_markdown_format = "myst"  # tables
 
 autosummary_generate = True
 autodoc_member_order = "bysource"
