@@ -39,6 +39,7 @@ from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource
+from unirender.training.stopping import stopping_gently
 from unirender.training.validation import Validate, Validation
 
 
@@ -148,11 +149,16 @@ class Trainer:
     ) -> None:
         """Trains to the end of the run, resuming where the folder's state stands.
 
+        Asked to stop (`unirender.training.stopping`), it saves after the step that it is in.
+
         Args:
             source: of this process's rows of the batches.
             report: is told every line of the log.
             validate: scores a pipeline of the averaged weights, at the start, with every picture and at the end.
             say: is told where a run stands that is not new.
+
+        Raises:
+            KeyboardInterrupt: it was asked to stop.
         """
         self.source = source
         resumed = self.resume(source, report)
@@ -181,26 +187,28 @@ class Trainer:
         look()
         clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
         logged = self.step
-        while self.progress < 1:
-            clock["step"] = time.monotonic()  # pictures, validation and saves are no training
-            batch = source.next()
-            fixed = batch if fixed is None else fixed
-            self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-            now = time.monotonic()
-            self.seconds, refreshing = self.processes.share(
-                (self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes))
-            )
-            if self.step % self.run.log_every == 0 or self.progress >= 1:
-                speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
-                clock["log"], logged = now, self.step
-                rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
-                self.log.tell(rates | self.log.means(), report)
-            if main and due("save", self.run.save_minutes):
-                self.save(source)
-            if main and due("picture", self.run.picture_minutes):
-                look()
-            if refreshing:
-                self._refresh(source, report)
+        with stopping_gently() as request:
+            while self.progress < 1:
+                clock["step"] = time.monotonic()  # pictures, validation and saves are no training
+                batch = source.next()
+                fixed = batch if fixed is None else fixed
+                self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
+                now = time.monotonic()
+                seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)
+                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.asked))
+                if self.step % self.run.log_every == 0 or self.progress >= 1:
+                    speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
+                    clock["log"], logged = now, self.step
+                    rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
+                    self.log.tell(rates | self.log.means(), report)
+                if main and (stopping or due("save", self.run.save_minutes)):
+                    self.save(source)
+                if stopping:
+                    raise KeyboardInterrupt
+                if main and due("picture", self.run.picture_minutes):
+                    look()
+                if refreshing:
+                    self._refresh(source, report)
         if main:
             self.save(source)
         look()

@@ -1,0 +1,86 @@
+"""Asked to stop, a training ends its step and saves; asked twice, it leaves at once."""
+
+import os
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tiny_models import TRAIN, make_batch
+from torch import Tensor
+
+from unirender.training.checkpoint import load_state
+from unirender.training.stopping import SIGNALS, stopping_gently
+from unirender.training.trainer import RunConfig, Trainer
+
+STEPS = 4
+
+
+class Source:
+    """Batch k is a function of k; while `stop_at` is made, this process is sent `signals`."""
+
+    def __init__(self, stop_at: int = 0, signals: tuple[int, ...] = ()) -> None:
+        self.place, self.stop_at, self.signals = 0, stop_at, signals
+
+    def next(self) -> dict[str, Tensor]:
+        self.place += 1
+        for number in self.signals if self.place == self.stop_at else ():
+            os.kill(os.getpid(), number)
+        return make_batch(TRAIN.batch_size, seed=self.place)
+
+    def read_ahead(self) -> None:
+        """Nothing: each batch is made when it is asked for."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"place": self.place}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.place = state["place"]
+
+    def refresh(self) -> str | None:
+        return None
+
+
+def fit(folder: Path, source: Source) -> list[dict[str, Any]]:
+    """The lines of losses of a run in this folder, or of what is left of it."""
+    lines: list[dict[str, Any]] = []
+    trainer = Trainer(TRAIN, RunConfig(folder, steps=STEPS, log_every=1), torch.device("cpu"), torch.float32)
+    trainer.fit(source, lines.append)
+    return [{k: v for k, v in line.items() if k not in ("minutes", "samples_per_s")} for line in lines if "lr" in line]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_step_is_ended_and_saved_and_nothing_is_lost(number: int, tmp_path: Path) -> None:
+    before = [signal.getsignal(n) for n in SIGNALS]
+    with pytest.raises(KeyboardInterrupt):
+        fit(tmp_path / "stopped", Source(2, (number,)))
+    assert [signal.getsignal(n) for n in SIGNALS] == before
+    state = load_state(tmp_path / "stopped")
+    assert state is not None
+    assert (state["step"], state["source"]["place"]) == (2, 2)
+    rest, whole = fit(tmp_path / "stopped", Source()), fit(tmp_path / "whole", Source())
+    assert rest == whole[2:]  # bit for bit
+    assert len(whole) == STEPS
+
+
+def test_who_asks_twice_is_not_made_to_wait(tmp_path: Path) -> None:
+    source = Source(2, (signal.SIGINT, signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        fit(tmp_path, source)
+    assert source.place == 2
+    assert load_state(tmp_path) is None  # not even the first step was saved: that takes minutes
+
+
+def test_in_another_thread_nothing_changes() -> None:
+    before, seen = [signal.getsignal(n) for n in SIGNALS], []
+
+    def look() -> None:
+        with stopping_gently() as request:
+            seen.extend([request.asked, [signal.getsignal(n) for n in SIGNALS] == before])
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    thread.join()
+    assert seen == [False, True]
