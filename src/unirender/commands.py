@@ -164,7 +164,8 @@ class Render:
             if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
                 notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
             pipeline = self.model.load()
-            image = pipeline.render(intrinsics, **self.model.sampling())
+            derived = () if self.environment is None else ("specular", "diffuse")
+            image = pipeline.render(intrinsics, derived=derived, **self.model.sampling())
             meta |= {**self.model.provenance(pipeline), **overflow(pipeline, intrinsics)}
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")

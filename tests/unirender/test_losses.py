@@ -1,6 +1,7 @@
 """The loss: what is compared with what, how it is weighted, and where gradients go."""
 
 import dataclasses
+import math
 from typing import Any, Literal
 
 import pytest
@@ -19,7 +20,7 @@ from unirender.models.conditioning import TRIPLETS
 from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.priors import PRIORS
 from unirender.training.consistency import Consistency
-from unirender.training.loss_terms import Errors, timestep_weights
+from unirender.training.loss_terms import Errors, compressed, timestep_weights
 from unirender.training.losses import DROPPABLE, LossFunction
 from unirender.training.presets import LossConfig
 
@@ -99,6 +100,30 @@ def test_background_counts_little() -> None:
     outside, inside = float((1 - mask).sum()), float(mask.sum())
     assert float(terms["albedo"]) == pytest.approx(0.1 * outside / (0.1 * outside + inside), rel=1e-5)
     assert float(terms["environment"]) == pytest.approx(outside / (outside + inside), rel=1e-5)
+
+
+def test_an_image_error_is_compressed_row_by_row() -> None:
+    """E log(1 + e / E): a far larger error of one picture does not decide the gradient of all."""
+    error = torch.tensor([1e-8, 1e-3, 10.0], dtype=torch.float64, requires_grad=True)
+    floor = 1e-3
+    value = compressed(error, floor)
+    torch.testing.assert_close(value[0], error[0], rtol=1e-4, atol=0)
+    torch.testing.assert_close(value[1], torch.tensor(floor * math.log(2), dtype=torch.float64))
+    (gradient,) = torch.autograd.grad(value.sum(), error)
+    torch.testing.assert_close(
+        gradient * error, floor * error / (floor + error)
+    )  # at most the floor, whatever the error
+    loss, plain = loss_function(image_floor=0.02), loss_function()
+    batch, t = make_batch(), rendering()
+    weights = plain.conditioning.codec.weights(Errors(plain.conditioning, 0.02).pixel_weights(batch["mask"]))
+    with torch.no_grad():
+        clean = plain.conditioning.encode_image(batch["image"])
+        predicted = clean + torch.linspace(0.01, 0.5, 4)[:, None, None, None]
+    errors = Errors(plain.conditioning, 0.02)
+    rows = (((predicted - clean).square() * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3))).tolist()
+    expected = sum(0.02 * math.log1p(row / 0.02) for row in rows) / 4
+    assert float(errors.image(predicted, clean, batch["mask"], floor=0.02)) == pytest.approx(expected, rel=1e-4)
+    assert values(loss, t)["image"] < values(plain, t)["image"]
 
 
 def test_total_is_the_weighted_sum() -> None:

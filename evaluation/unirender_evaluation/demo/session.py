@@ -9,7 +9,7 @@ Notation: I the picture, R_0 and R_1 the renders of the maps before and after th
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -146,7 +146,7 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
         UnirenderError: a number is outside its range, or the light is not usable.
     """
     before = subject.maps
-    edited, remarks = before, []
+    edited, remarks, derived = before, [], ()
     if controls.metallic is not None:
         edited = edited.replace(metallic=constant_map(unit_value("metallic", controls.metallic), subject.mask))
     if controls.roughness is not None:
@@ -155,6 +155,7 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
         predicted = before.require("environment")["environment"]
         light = turned(predicted if controls.light is None else as_environment(controls.light), controls.turn_deg)
         edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
+        derived = ("specular", "diffuse")
         remarks.append("Under a light that was changed, nothing casts a shadow.")
     elif controls.roughness is not None:
         target = edited.require("roughness")["roughness"]
@@ -165,14 +166,16 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
                 f"The predicted light is too coarse to show what roughness {controls.roughness:g} reflects on "
                 f"{coarse:.0%} of the object: its highlights stay as wide as they were."
             )
-    rendered = subject.rendered if edited is before else render(pipeline, edited)
+    rendered = subject.rendered if edited is before else render(pipeline, edited, derived)
     image = anchor(subject.image_linear, subject.rendered, rendered) if controls.anchored else rendered
     return View(image, rendered, edited, tuple(remarks))
 
 
-def render(pipeline: UniRenderPipeline, intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
+def render(
+    pipeline: UniRenderPipeline, intrinsics: Intrinsics, derived: Collection[str] = ()
+) -> Float[np.ndarray, "h w 3"]:
     """The mean rendering, with the noise of `UniRenderPipeline.edit` and `relight`: what is seen here is theirs."""
-    return pipeline.render(intrinsics, generator=same_noise(Sampling.of().draw_seed(), 1)[0])
+    return pipeline.render(intrinsics, generator=same_noise(Sampling.of().draw_seed(), 1)[0], derived=derived)
 
 
 def turned(environment: Environment, turn_deg: float) -> Environment:

@@ -192,6 +192,7 @@ def infer_image(
     generator: Generators = None,
     camera: Cameras = None,
     progress: Progress = iter,
+    derived: Bool[Tensor, "b 6"] | None = None,
 ) -> Float[Tensor, "b 3 H W"]:
     """Rendering: p(image | attributes).
 
@@ -202,6 +203,7 @@ def infer_image(
         generator: of the noise; see `draw_noise`.
         camera: of all rows, or one for each.
         progress: wraps the iteration over timesteps.
+        derived: which of them were derived from a light, without shadows; None: none.
 
     Returns:
         Premultiplied linear image in [0, 1].
@@ -213,7 +215,7 @@ def infer_image(
     unknown, x_T = noise.split(channels, dim=1)
     shown = conditioning.by_triplet(conditioning.in_latents(given))
     attributes = torch.where(shown, latents, unknown).to(model.dtype)
-    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera).to(attributes)
+    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera, derived).to(attributes)
     clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
     condition: Tensor | Encoded = attributes
 
@@ -242,20 +244,22 @@ def extras_by_camera(
     given: Bool[Tensor, "b 6"],
     maps: Maps | None,
     camera: Cameras,
+    derived: Bool[Tensor, "b 6"] | None = None,
 ) -> Extras:
     """The extra inputs of rows that are seen through one camera, or each through its own."""
     if camera is None or isinstance(camera, Camera):
-        return conditioning.extras(mask, given, maps, camera)
+        return conditioning.extras(mask, given, maps, camera, derived)
     if len(camera) != len(mask):
         raise ValueError(f"{len(camera)} cameras for {len(mask)} rows, expected one each")
     if len(set(camera)) == 1:
-        return conditioning.extras(mask, given, maps, camera[0])
+        return conditioning.extras(mask, given, maps, camera[0], derived)
     rows = [
         conditioning.extras(
             mask[i : i + 1],
             given[i : i + 1],
             None if maps is None else {name: value[i : i + 1] for name, value in maps.items()},
             own,
+            None if derived is None else derived[i : i + 1],
         )
         for i, own in enumerate(camera)
     ]

@@ -20,6 +20,7 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         "environment_size": ENVIRONMENT_SIZE,
         "physics_prior": config.physics_prior,
         "light": config.light,
+        "derived_light": config.derived_light,
     }
     conditioning = Conditioning.of(recorded, codec)
     extra_attributes, extra_image = conditioning.extra_channels

@@ -36,6 +36,7 @@ HDR_CURVES: dict[str, tuple[float, float]] = {
     "diffuse": (10.0, 2.0),
     "environment": (20.0, 200.0),
 }
+DERIVED_FLAG = 0.5  # between given and not given
 RAY_SCALE = 3.0  # brings the default camera's ray slopes to about [-1, 1]
 
 
@@ -170,12 +171,14 @@ class Conditioning:
         packing: maps <-> pictures.
         physics_prior: the closed-form image that the image stream corrects.
         light_encoder: whether a given light enters by an encoder of its own, not as the sixth picture.
+        derived_light: whether the network is told which of s and d were derived from a light, without shadows.
     """
 
     codec: Codec
     packing: Packing
     physics_prior: Prior | None
     light_encoder: bool
+    derived_light: bool = False
 
     @classmethod
     def of(cls, config: dict, codec: Codec) -> "Conditioning":
@@ -191,7 +194,7 @@ class Conditioning:
             raise UnirenderError(f"physics_prior: got {name!r}, expected 'none' or one of: {', '.join(PRIORS)}")
         if config["light"] not in LIGHTS:
             raise UnirenderError(f"light: got {config['light']!r}, expected one of: {', '.join(LIGHTS)}")
-        return cls(codec, packing, PRIORS.get(name), config["light"] == "encoder")
+        return cls(codec, packing, PRIORS.get(name), config["light"] == "encoder", config["derived_light"])
 
     @property
     def attribute_channels(self) -> int:
@@ -250,6 +253,7 @@ class Conditioning:
         given: Bool[Tensor, "b 6"],
         maps: Maps | None = None,
         camera: Camera | None = None,
+        derived: Bool[Tensor, "b 6"] | None = None,
     ) -> Extras:
         """Builds the extra inputs.
 
@@ -259,13 +263,18 @@ class Conditioning:
             maps: the given maps, from which the physics prior is made where `given` has all that it needs, and the
                 input of the light's encoder where the light is given.
             camera: gives the rays; the contract's default if None.
+            derived: which of the given pictures were derived from a light, without shadows: their flag is 1/2, if the
+                network is told. None: none was.
         """
         light = self._light(given, maps, mask) if self.light_encoder else None
         spatial = F.pixel_unshuffle(mask, self.codec.factor)
         b, _, h, w = spatial.shape
         camera = camera or Camera()
         rays = torch.from_numpy(camera.rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
-        flags = self.in_latents(given).to(mask)[..., None, None].expand(-1, -1, h, w)
+        flags = self.in_latents(given).to(mask)
+        if derived is not None and self.derived_light:
+            flags = torch.where(derived, DERIVED_FLAG * flags, flags)
+        flags = flags[..., None, None].expand(-1, -1, h, w)
         common = torch.cat([flags, spatial, rays.permute(2, 0, 1).expand(b, -1, -1, -1)], dim=1)
         if not self.physics_prior:
             return Extras(common, common, None, light)

@@ -114,6 +114,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
         light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
+        derived_light: bool = False,  # s and d that were derived from a light, without shadows, have their own flag
     ):
         super().__init__()
         if not set(attention_levels) <= set(range(len(block_out_channels))):

@@ -76,6 +76,12 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     return light
 
 
+def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
+    """Which of specular and diffuse follow from the light, without shadows, where intrinsics are rendered."""
+    names = ("specular", "diffuse") if intrinsics.environment is not None else ()
+    return frozenset(name for name in names if getattr(intrinsics, name) is None)
+
+
 def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
     """Intrinsics that the renderer can use: with a mask, and with s and d derived where a light is given.
 
@@ -92,11 +98,8 @@ def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
     if intrinsics.environment is None:
         return intrinsics
     light = as_environment(intrinsics.environment)
-    if intrinsics.diffuse is None:
-        intrinsics = intrinsics.replace(diffuse=derived_diffuse(intrinsics, light))
-    if intrinsics.specular is None:
-        intrinsics = intrinsics.replace(specular=derived_specular(intrinsics, light))
-    return intrinsics
+    derive = {"specular": derived_specular, "diffuse": derived_diffuse}
+    return intrinsics.replace(**{name: derive[name](intrinsics, light) for name in to_derive(intrinsics)})
 
 
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:

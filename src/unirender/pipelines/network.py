@@ -1,6 +1,6 @@
 """The network as a function of numpy arrays: `[s s c]` at one size s, in both directions, several at once."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,13 +81,17 @@ class Network:
         rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(images) * how.count)]
         return [rows[i * how.count : (i + 1) * how.count] for i in range(len(images))]
 
-    def images(self, scenes: Sequence[Intrinsics], how: Sampling) -> list[Float[np.ndarray, "s s 3"]]:
+    def images(
+        self, scenes: Sequence[Intrinsics], how: Sampling, derived: Sequence[Collection[str]] | None = None
+    ) -> list[Float[np.ndarray, "s s 3"]]:
         """Rendering, all scenes in one batch: premultiplied linear images in [0, 1], samples averaged in linear light.
 
         Args:
             scenes: at the network's size.
             how: steps, samples and noise.
+            derived: for each scene, which of its maps were derived from its light, without shadows; None: none.
         """
+        flags = [[name in own for name in TRIPLETS] for own in derived or [()] * len(scenes)]
         image = infer_image(
             self.model,
             self.conditioning,
@@ -98,6 +102,7 @@ class Network:
             generator=how.generators(len(scenes)),
             camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
+            derived=torch.tensor(_repeat(flags, how.count), device=self.model.device),
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
         return list(means.permute(0, 2, 3, 1).float().cpu().numpy())

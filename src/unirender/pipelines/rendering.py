@@ -1,6 +1,6 @@
 """Rendering intrinsics of any size with a network that knows one size."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
 from unirender.models.priors import PRIORS
 from unirender.pipelines.framing import Frame, divide
-from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.inputs import ready_to_render, to_derive
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.settings import Sampling
 
@@ -26,6 +26,7 @@ def render_any_size(
     scenes: Sequence[Intrinsics],
     how: Sampling,
     watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
+    derived: Collection[str] = (),
 ) -> list[Float[np.ndarray, "h w 3"]]:
     """The premultiplied linear images in [0, 1] at the sizes of the intrinsics; one batch of the network.
 
@@ -34,12 +35,15 @@ def render_any_size(
         scenes: normal, roughness and metallic are needed; see `UniRenderPipeline.render`.
         how: steps, samples and noise.
         watch: is told which HDR maps exceed the network's range.
+        derived: which of specular and diffuse were derived from the light, without shadows, besides those that are
+            derived here since the intrinsics lack them.
     """
+    without_shadows = [to_derive(scene).union(derived) for scene in scenes]
     ready = [ready_to_render(scene) for scene in scenes]
     entered = [enter(network, scene) for scene in ready]
     for _, small in entered:
         watch(network.overflow(small))
-    rendered = network.images([small for _, small in entered], how)
+    rendered = network.images([small for _, small in entered], how, without_shadows)
     return [
         _leave(network, scene, frame, small, image)
         for scene, (frame, small), image in zip(ready, entered, rendered, strict=True)

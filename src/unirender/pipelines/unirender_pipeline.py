@@ -9,7 +9,7 @@ of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` componen
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -227,6 +227,7 @@ class UniRenderPipeline(DiffusionPipeline):
         generator: torch.Generator | None = None,
         sampler: str | None = None,
         size: int | None = None,
+        derived: Collection[str] = (),
     ) -> Float[np.ndarray, "h w 3"]:
         """Rendering; several samples are averaged in linear light.
 
@@ -240,6 +241,8 @@ class UniRenderPipeline(DiffusionPipeline):
             generator: of the noise.
             sampler: of `sample`.
             size: side of the network's square.
+            derived: which of the intrinsics' specular and diffuse have no shadows, since they were derived from a light
+                (as by `unirender.pipelines.editing.under_light`); those that are missing are known to be.
 
         Returns:
             Premultiplied linear image at the intrinsics' size, in [0, 1].
@@ -248,7 +251,8 @@ class UniRenderPipeline(DiffusionPipeline):
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
-        return render_any_size(self._network(mode, sampler, size), [intrinsics], how, self._report_overflow)[0]
+        network = self._network(mode, sampler, size)
+        return render_any_size(network, [intrinsics], how, self._report_overflow, derived)[0]
 
     def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
@@ -346,7 +350,8 @@ class UniRenderPipeline(DiffusionPipeline):
             edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False)
         else:
             edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
-        image = self._rerender(picture, cover, before, edited, anchored, sampling)
+        derived = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)
 
     def _rerender(
@@ -357,6 +362,7 @@ class UniRenderPipeline(DiffusionPipeline):
         edited: Intrinsics,
         anchored: bool,
         sampling: dict[str, Any],
+        derived: Collection[str] = (),
     ) -> Float[np.ndarray, "h w 3"]:
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
@@ -364,7 +370,7 @@ class UniRenderPipeline(DiffusionPipeline):
         # Both renders see the same noise, so that it cancels in what changes.
         seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
         first, second = (Sampling.of(**settings, generator=own) for own in same_noise(seed, 2))
-        (after,) = render_any_size(network, [edited], first, self._report_overflow)
+        (after,) = render_any_size(network, [edited], first, self._report_overflow, derived)
         if not anchored:
             return after
         return anchor(srgb_decode(picture) * cover, render_any_size(network, [before], second)[0], after)

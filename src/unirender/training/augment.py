@@ -101,6 +101,7 @@ class Draw:
     turns: int = 0
     mirror: bool = False
     exposure_target: float | None = None  # None: the stored exposure
+    derived: bool = False  # whether s and d come without shadows, too
 
 
 def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesses: int) -> Draw:
@@ -119,15 +120,18 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
     turns = int(rng.integers(1, 4)) if rng.random() < config.turn else 0
     flip = bool(rng.random() < config.mirror)
     target = draw_target(rng) if config.expose else None
+    level = int(rng.integers(roughnesses))
+    derived = bool(config.derived) and bool(rng.random() < config.derived)  # last: without it nothing else changes
     return Draw(
         lights=chosen,
         weights=(share * tint).astype(np.float32),
-        roughness_index=int(rng.integers(roughnesses)),
+        roughness_index=level,
         metallic=metallic,
         order=order,
         turns=turns,
         mirror=flip,
         exposure_target=target,
+        derived=derived,
     )
 
 

@@ -39,13 +39,16 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("batch_size", "group_size", "steps", "loss.cycle_steps", "augmentation.max_lights"), _COUNT),
     **dict.fromkeys(("p_render", "p_t", "map_dropout", "loss.cycle_share", "loss.cycle_warmup"), _SHARE),
     **{f"loss.{name}": _NOT_NEGATIVE for name in ("material", "albedo", "normal", "specular", "diffuse")},
-    **{f"loss.{name}": _NOT_NEGATIVE for name in ("environment", "image", "background", "cycle", "composite")},
+    **{
+        f"loss.{name}": _NOT_NEGATIVE
+        for name in ("environment", "image", "image_floor", "background", "cycle", "composite")
+    },
     "loss.snr_bound": Range(1),  # the weight's floor
     **dict.fromkeys(("optimizer.learning_rate", "optimizer.clip_norm"), _POSITIVE),
     **dict.fromkeys(("optimizer.beta1", "optimizer.beta2", "optimizer.ema_decay"), _DECAY),
     **dict.fromkeys(("seed", "optimizer.weight_decay", "optimizer.warmup_steps", "augmentation.tint"), _NOT_NEGATIVE),
     "optimizer.final_lr": _SHARE,
-    **{f"augmentation.{name}": _SHARE for name in ("mix", "permute", "mirror", "turn")},
+    **{f"augmentation.{name}": _SHARE for name in ("mix", "permute", "mirror", "turn", "derived")},
 }
 
 

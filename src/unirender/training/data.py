@@ -8,7 +8,7 @@ time, or one pair of any other group.
 
 import functools
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,14 +32,17 @@ from unirender.training.augment import (
     mix_lights,
     permute_channels,
 )
+from unirender.training.derived import DerivedLight, open_derived
 from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed
 from unirender.training.presets import Augmentation
 
+DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d without shadows, where `derived` is 1
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
 
 ALL_ROWS = slice(None)
 
 Batch = dict[str, Float[Tensor, "b c h w"]]
+Rows = Sequence[int] | Int[np.ndarray, " l"]  # of a shard's pixels
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ class GroupDataset:
         folder: str | Path,
         shards: tuple[str, ...] | None = None,
         progress: Callable[[int, int], None] | None = None,
+        derived: bool = False,
     ) -> None:
         """Opens a folder; shards not used before are decoded once.
 
@@ -74,7 +78,9 @@ class GroupDataset:
             folder: as written by `unirender dataset`, with or without a recipe; it may still be growing.
             shards: names of the shards to use; None: all that are complete. A resumed training passes `shard_names` of
                 the interrupted one, so that a folder that grew in between gives the same stream.
-            progress: called with (shards opened, shards in all).
+            progress: called with (shards opened, shards in all); then with those whose light is derived, if any is.
+            derived: whether samples may have s and d derived from their light besides; takes a second for each group
+                that was not derived before (`unirender.training.derived`).
         """
         self.folder = Path(folder)
         available = list_shards(self.folder)
@@ -91,6 +97,8 @@ class GroupDataset:
             self.shards.append(open_packed(path, sha256, names[path]))
             if progress is not None:
                 progress(len(self.shards), len(available))
+        pairs = list(zip(available, self.shards, strict=True))
+        self._derived: list[DerivedLight] | None = open_derived(pairs, progress) if derived else None
         sizes = {shard.shared.shape[-2:] for shard in self.shards}
         if len(sizes) != 1:
             raise UnirenderError(
@@ -98,6 +106,7 @@ class GroupDataset:
             )
         self.resolution: tuple[int, int] = sizes.pop()
         self._groups = [(shard, group) for shard in self.shards for group in shard.groups]
+        self._shard_of = [number for number, shard in enumerate(self.shards) for _ in shard.groups]
         self.keys = tuple(group.key for _, group in self._groups)
         if len(set(self.keys)) != len(self.keys):
             twice = sorted({key for key in self.keys if self.keys.count(key) > 1})
@@ -136,7 +145,7 @@ class GroupDataset:
         return from_maps(maps | {"environment": _trailing(shard.environment[pair.light, 0])})
 
     def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
-        """Sample number `index` of the stream: `[h w c]` float32 maps by the names of `BATCH_MAPS`."""
+        """Sample number `index` of the stream: `[h w c]` float32 maps by the names of a batch."""
         epoch, place = divmod(index, len(self))
         group, pair = self._items[self._order(seed, epoch)[place]]
         rng = np.random.default_rng([seed, 1, index])
@@ -168,9 +177,32 @@ class GroupDataset:
         maps = quarter_turn(maps, drawn.turns)
         maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)  # stored under each quarter turn
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
+        factor = 1.0
         if drawn.exposure_target is not None:
-            maps = scale_light(maps, exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target))
-        return maps
+            factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
+        light = self._derived_light(group, rows, drawn) if drawn.derived else None
+        return scale_light(maps, factor) | self._named_derived(light, factor, maps["diffuse"])
+
+    def _derived_light(self, group: int, rows: Mapping[str, Rows], drawn: Draw) -> Maps:
+        """s and d without shadows of what stands in `rows`, under the same augmentation but for the exposure.
+
+        Raises:
+            UnirenderError: the folder was opened without them.
+        """
+        if self._derived is None:
+            raise UnirenderError("derived light was drawn, but the data was opened without it; pass derived=True")
+        stored = self._derived[self._shard_of[group]]
+        maps = mix_lights({name: _trailing(stored.of(own)) for name, own in rows.items()}, drawn.weights)
+        maps = quarter_turn({name: maps[name] for name in ("specular", "diffuse")}, drawn.turns)
+        return permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
+
+    def _named_derived(self, light: Maps | None, factor: float, like: np.ndarray) -> Maps:
+        """As a batch has it: zeros for a sample without it; nothing where the folder was opened without."""
+        if self._derived is None:
+            return {}
+        scaled = {} if light is None else scale_light(light, factor)
+        maps = {f"derived_{name}": scaled.get(name, np.zeros_like(like)) for name in ("specular", "diffuse")}
+        return maps | {"derived": np.full((1, 1, 1), light is not None, dtype=np.float32)}
 
     @functools.lru_cache(maxsize=4)  # noqa: B019 - a dataset lives as long as the training that reads it
     def _order(self, seed: int, epoch: int) -> Int[np.ndarray, " items"]:
@@ -183,7 +215,8 @@ def make_batch(
     """Samples `first` to `first + size` of the stream as float32 tensors; `rows`: these of them only."""
     samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)[rows]]
     batch: Batch = {}
-    for name in BATCH_MAPS:
+    derived = (*DERIVED_MAPS, "derived") if "derived" in samples[0] else ()
+    for name in (*BATCH_MAPS, *derived):
         height, width, channels = samples[0][name].shape
         stacked = np.empty((len(samples), channels, height, width), dtype=np.float32)
         for i, sample in enumerate(samples):

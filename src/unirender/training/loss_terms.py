@@ -86,10 +86,23 @@ class Errors:
         clean: Float[Tensor, "b c h w"],
         mask: Float[Tensor, "b 1 H W"],
         rows: Float[Tensor, " b"] | None = None,
+        floor: float = 0.0,
     ) -> Float[Tensor, ""]:
-        """Of the image; `rows` multiplies the error of each sample."""
+        """Of the image; `rows` multiplies the error of each sample.
+
+        Args:
+            predicted: by the network.
+            clean: the truth.
+            mask: coverage.
+            rows: weights of the samples.
+            floor: E of `compressed`; 0: the squared error itself.
+        """
         weights = self.conditioning.codec.weights(self.pixel_weights(mask))
-        return weighted_mean(_by_row((predicted.float() - clean).square(), rows), weights)
+        error = (predicted.float() - clean).square()
+        if not floor:
+            return weighted_mean(_by_row(error, rows), weights)
+        own = compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor)
+        return (own if rows is None else own * rows).mean()
 
     def attributes(
         self,
@@ -104,6 +117,16 @@ class Errors:
         terms = dict(zip(TRIPLETS, error, strict=True))
         lit = terms.pop("environment").mean()
         return {name: weighted_mean(e, weights) for name, e in terms.items()} | {"environment": lit}
+
+
+def compressed(error: Float[Tensor, " b"], floor: float) -> Float[Tensor, " b"]:
+    """E log(1 + e / E) of each sample's squared error e: e where it is far below E, and where it is far above, the
+    decibels of a PSNR.
+
+    A mean of squared errors is decided by the worst pictures, a mean PSNR is not: a correction that saves a bad picture
+    may spoil, for it, what was nearly right in all others.
+    """
+    return floor * torch.log1p(error / floor)
 
 
 def weighted_mean(error: Float[Tensor, "b c h w"], weights: Float[Tensor, "b c h w"]) -> Float[Tensor, ""]:

@@ -55,14 +55,16 @@ class LossFunction:
             generator: CPU generator of noise and dropped maps.
         """
         clean_a, clean_i = self._encode(batch)
+        seen, derived = self._seen(batch, timesteps.attributes == 0)
+        shown_a = clean_a if seen is batch else self._encode_attributes(seen)
         noisy_a, noisy_i = (t.cpu() > 0 for t in (timesteps.attributes, timesteps.image))  # a GPU is waited for once
         given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
         known = self.conditioning.by_triplet(self.conditioning.in_latents(given) | noisy_a[:, None]).to(clean_a.device)
         given = given.to(clean_a.device)
         noise_a = noise_like(clean_a, generator)
-        attributes = torch.where(known, add_noise(self.scheduler, clean_a, noise_a, timesteps.attributes), noise_a)
+        attributes = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
         image = add_noise(self.scheduler, clean_i, noise_like(clean_i, generator), timesteps.image)
-        extras = self.conditioning.extras(batch["mask"], given, batch)
+        extras = self.conditioning.extras(batch["mask"], given, seen, derived=derived)
         span_a, span_i = _span(noisy_a), _span(noisy_i)
         output = predict(self.model, attributes, image, timesteps, extras, span_a, span_i)
         errors = Errors(self.conditioning, self.config.background)
@@ -72,7 +74,11 @@ class LossFunction:
             rows = _Rows(span_i, noisy_i)
             weights = self._timestep_weights(rows.of(timesteps.image))
             terms["image"] = errors.image(
-                rows.of_decoded(output.image), rows.of(clean_i), rows.of(batch["mask"]), weights
+                rows.of_decoded(output.image),
+                rows.of(clean_i),
+                rows.of(batch["mask"]),
+                weights,
+                self.config.image_floor,
             )
         if span_a is not None:
             assert output.attributes is not None
@@ -95,6 +101,20 @@ class LossFunction:
     @torch.no_grad()  # an autoencoder is not trained here, and its activations would be kept
     def _encode(self, batch: Maps) -> tuple[Tensor, Tensor]:
         return self.conditioning.encode_attributes(batch), self.conditioning.encode_image(batch["image"])
+
+    @torch.no_grad()
+    def _encode_attributes(self, batch: Maps) -> Tensor:
+        return self.conditioning.encode_attributes(batch)
+
+    def _seen(self, batch: Maps, clean: Bool[Tensor, " b"]) -> tuple[Maps, Bool[Tensor, "b 6"] | None]:
+        """The maps that a renderer sees, in which s and d may have been derived from the light; and which were."""
+        rows = clean & (batch["derived"].flatten() > 0) if "derived" in batch else None
+        if rows is None or not rows.any():
+            return batch, None
+        names = ("specular", "diffuse")
+        swapped = {n: torch.where(rows[:, None, None, None], batch[f"derived_{n}"], batch[n]) for n in names}
+        of_light = torch.tensor([name in names for name in TRIPLETS], device=rows.device)
+        return batch | swapped, rows[:, None] & of_light
 
     def _consistency(
         self, predicted: Tensor, clean_i: Tensor, batch: Maps, errors: Errors, generator: torch.Generator

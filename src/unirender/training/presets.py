@@ -31,6 +31,7 @@ class ModelConfig:
     physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
     # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
     light: Literal["latent", "encoder"] = "latent"
+    derived_light: bool = False  # the network is told which of s and d were derived from a light, without shadows
     unified: bool = True  # False: a network for each direction, and the widths are those of each
 
 
@@ -46,6 +47,7 @@ class LossConfig:
     diffuse: float = 2.0
     environment: float = 0.5
     image: float = 4.0
+    image_floor: float = 0.0  # squared error of an image above which its logarithm counts; 0: the squared error itself
     background: float = 0.02  # weight of a pixel outside the mask, beside 1 inside
     cycle: float = 1.0  # weight of the re-rendered image; 0: no cycle pass
     cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
@@ -85,6 +87,7 @@ class Augmentation:
     mirror: float = 0.5  # probability of a mirror flip
     turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
     expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
+    derived: float = 0.0  # probability that a renderer sees s and d derived from the light, without shadows
 
 
 @dataclass(frozen=True)
@@ -157,6 +160,14 @@ PRESETS: dict[str, TrainConfig] = {
         loss=dataclasses.replace(_TINY.loss, composite=1.0),
         optimizer=OptimizerConfig(kind="muon"),
         p_render=0.25,
+    ),
+    "tiny_renderer": dataclasses.replace(
+        _TINY,
+        model=dataclasses.replace(_TINY.model, derived_light=True),
+        augmentation=dataclasses.replace(_TINY.augmentation, derived=0.3),
+        loss=dataclasses.replace(_TINY.loss, composite=1.0, image=20.0, image_floor=1e-3),
+        optimizer=OptimizerConfig(kind="muon"),
+        p_render=0.4,
     ),
     "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),

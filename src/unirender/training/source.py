@@ -101,10 +101,11 @@ class ShardSource:
         return self.dataset
 
     def _open(self, shards: tuple[str, ...] | None = None) -> GroupDataset:
+        derived = self.augmentation.derived > 0
         if self.group_size == 1:
-            dataset = GroupDataset(self.folder, shards)
+            dataset = GroupDataset(self.folder, shards, derived=derived)
         else:
-            dataset = ContrastDataset(self.folder, shards, run_length=self.group_size)
+            dataset = ContrastDataset(self.folder, shards, run_length=self.group_size, derived=derived)
         height, width = dataset.resolution
         if self.size is not None and (height, width) != (self.size, self.size):
             raise UnirenderError(

@@ -1,0 +1,133 @@
+"""s and d of stored groups as a renderer derives them that is given the light alone: in closed form, no shadows.
+
+A renderer that has only ever seen s and d with shadows takes those without for such, and leaves the shadows out. So
+some of its training pictures come with both (`Augmentation.derived`). A lobe takes long to integrate, about a second
+for a group of 52 pictures of 64 pixels. The lights of a shard are derived once, from its own tar, where they have
+their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v1` holds
+
+    pixels.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
+    rows.npy     int32 [n]              for each row of the packed shard's `pixels` the row here; -1: not s or d
+"""
+
+import logging
+import multiprocessing
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float16, Int
+
+from unirender.errors import UnirenderError
+from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
+from unirender.paths import cache_dir
+from unirender.surface_light import diffuse_light, specular_light
+from unirender.training.groups import Group, Shard, read_groups
+
+logger = logging.getLogger(__name__)
+
+DERIVED_VERSION = 1  # part of the cache's path: raise it when what is derived changes
+
+
+@dataclass(frozen=True)
+class DerivedLight:
+    """Of a shard: arrays are read-only memory maps."""
+
+    pixels: Float16[np.ndarray, "m 3 h w"]
+    rows: Int[np.ndarray, " n"]
+
+    def of(self, rows: Sequence[int] | Int[np.ndarray, " l"]) -> Float16[np.ndarray, "l 3 h w"]:
+        """What stands in the packed shard's `rows`, all of s or d, without shadows."""
+        return self.pixels[self.rows[np.asarray(rows)]]
+
+
+def open_derived(
+    shards: Sequence[tuple[Path, Shard]], progress: Callable[[int, int], None] | None = None
+) -> list[DerivedLight]:
+    """Opens the derived light of shards, a `DerivedLight` each; what has not been derived yet is, on all cores.
+
+    Args:
+        shards: with the tars that they were packed from.
+        progress: called with (shards derived, shards to derive).
+
+    Raises:
+        UnirenderError: the cache cannot be written, or a tar is not what was packed.
+    """
+    missing = [(path, shard) for path, shard in shards if not _folder(shard).exists()]
+    if missing:
+        groups = sum(len(shard.groups) for _, shard in missing)
+        logger.warning("deriving the light of %d groups of %d shards once, about a second each", groups, len(missing))
+        workers = min(len(missing), os.cpu_count() or 1)
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+            for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
+                if progress is not None:
+                    progress(done, len(missing))
+    return [_open(_folder(shard)) for _, shard in shards]
+
+
+def _folder(shard: Shard) -> Path:
+    return cache_dir() / "derived" / f"{shard.sha256}-v{DERIVED_VERSION}"
+
+
+def _open(folder: Path) -> DerivedLight:
+    pixels = np.asarray(np.load(folder / "pixels.npy", mmap_mode="r"))  # a plain view of the memory map
+    return DerivedLight(pixels, np.load(folder / "rows.npy"))
+
+
+def _derive(path: Path, shard: Shard) -> None:
+    """Derives the light of a shard into its folder, which appears when it is complete."""
+    folder = _folder(shard)
+    groups = {group.key: group for group in shard.groups}
+    pixels: list[Float16[np.ndarray, "3 h w"]] = []
+    rows = np.full(len(shard.pixels), -1, dtype=np.int32)
+    for key, members in read_groups(path):
+        if key not in groups:
+            raise UnirenderError(f"{path}: group {key} is not in the packed shard; delete it from the cache")
+        for row, light in _of_group(shard, groups[key], _environments(members, f"{path}: group {key}")):
+            rows[row] = len(pixels)
+            pixels.append(light)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=".deriving-", dir=folder.parent))
+    except OSError as error:
+        raise UnirenderError(f"{folder.parent}: cannot be made ({error.strerror}); set UNIRENDER_CACHE") from error
+    try:
+        np.save(temporary / "pixels.npy", np.stack(pixels))
+        np.save(temporary / "rows.npy", rows)
+        try:
+            os.rename(temporary, folder)
+        except OSError:
+            if not folder.exists():  # else another process derived the same
+                raise
+    except OSError as error:
+        raise UnirenderError(f"{folder}: cannot be written ({error.strerror}); free some space") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarray, "eh ew 3"]]:
+    """A group's lights at their stored resolution, by number."""
+    named = sorted((int(name[1 : name.index(".")]), name) for name in members if name.endswith(".environment.exr"))
+    return [channels_rgb(read_exr_bytes(members[name], name=f"{where}.{name}")[0]) for _, name in named]
+
+
+def _of_group(
+    shard: Shard, group: Group, lights: list[Float[np.ndarray, "eh ew 3"]]
+) -> list[tuple[int, Float16[np.ndarray, "3 h w"]]]:
+    """(row of the packed shard, derived light) of every s and d of a group, once each."""
+    shared = np.moveaxis(shard.shared[group.shared].astype(np.float32), 0, -1)
+    normal, inside = shared[..., 3:6], shared[..., 6:7] > 0
+    found: dict[int, Float[np.ndarray, "h w 3"]] = {}
+    numbers = {row: number for number, row in enumerate(sorted({pair.light for pair in group.pairs}))}
+    for pair in group.pairs:
+        light = lights[numbers[pair.light]]
+        rough = shared[..., 7:8] if pair.roughness is None else np.float32(pair.roughness) * inside
+        if pair.diffuse not in found:
+            found[pair.diffuse] = diffuse_light(normal, light)
+        if pair.specular not in found:
+            found[pair.specular] = specular_light(normal, rough, light)
+    return [(row, np.moveaxis(np.minimum(v, HALF_MAX), -1, 0).astype(np.float16)) for row, v in found.items()]

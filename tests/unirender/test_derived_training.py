@@ -1,0 +1,235 @@
+"""s and d without shadows, in training and in use: what is stored, what the network is told and what it sees."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from synthetic_shards import maps_members, write_dataset, write_shard
+from tiny_models import SIZE, make_batch, make_model, make_pipeline
+from torch import Tensor
+
+from unirender.diffusion.schedule import make_scheduler
+from unirender.diffusion.timesteps import Timesteps
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, read_exr_bytes
+from unirender.intrinsics import Intrinsics
+from unirender.models.conditioning import DERIVED_FLAG, TRIPLETS
+from unirender.pipelines.editing import under_light
+from unirender.surface_light import diffuse_light, specular_light
+from unirender.training.augment import NO_AUGMENTATION
+from unirender.training.data import BATCH_MAPS, DERIVED_MAPS, GroupDataset
+from unirender.training.derived import DerivedLight
+from unirender.training.groups import list_shards, read_groups
+from unirender.training.losses import LossFunction
+from unirender.training.presets import Augmentation, LossConfig
+from unirender.training.reader import BatchReader
+
+ALWAYS = Augmentation(mix=0.7, tint=0.3, permute=0.6, turn=0.6, derived=1.0)
+LIGHT = ("specular", "diffuse")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_dataset(tmp_path_factory.mktemp("derived"))
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path) -> GroupDataset:
+    return GroupDataset(folder, derived=True)
+
+
+def derived_light(dataset: GroupDataset) -> list[DerivedLight]:
+    assert dataset._derived is not None
+    return dataset._derived
+
+
+# --- what is stored
+
+
+def test_what_is_stored_is_the_light_without_shadows_of_each_group(folder: Path, dataset: GroupDataset) -> None:
+    members = dict(pair for path in list_shards(folder) for pair in read_groups(path))
+    for group, key in enumerate(dataset.keys):
+        shard, entry = dataset._groups[group]
+        normal = np.moveaxis(shard.shared[entry.shared][3:6].astype(np.float32), 0, -1)
+        inside = np.moveaxis(shard.shared[entry.shared][6:7], 0, -1) > 0
+        stored = derived_light(dataset)[dataset._shard_of[group]]
+        lights = sorted({pair.light for pair in entry.pairs})
+        for pair in entry.pairs[::5]:
+            name = f"l{lights.index(pair.light)}.environment.exr"
+            light = channels_rgb(read_exr_bytes(members[key][name], name=name)[0])
+            d = diffuse_light(normal, light)
+            s = specular_light(normal, pair.roughness * inside.astype(np.float32), light)
+            for row, expected in ((pair.diffuse, d), (pair.specular, s)):
+                found = np.moveaxis(stored.of([row])[0], 0, -1)
+                np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+                assert expected.max() > 0.01
+        assert (stored.rows[[pair.image for pair in entry.pairs]] == -1).all()
+
+
+def test_it_is_derived_once(folder: Path, dataset: GroupDataset) -> None:
+    told: list[tuple[int, int]] = []
+    again = GroupDataset(folder, derived=True, progress=lambda done, of: told.append((done, of)))
+    assert told == [(i + 1, len(again.shards)) for i in range(len(again.shards))]  # opened; nothing was derived
+    np.testing.assert_array_equal(derived_light(again)[0].pixels, derived_light(dataset)[0].pixels)
+
+
+def test_roughness_maps_have_their_own_lobes(tmp_path: Path) -> None:
+    write_shard(tmp_path / "shard-000000.tar", {"a": maps_members(16, lights=2, seed=0)})
+    data = GroupDataset(tmp_path, derived=True)
+    sample = data.sample(0, 0, Augmentation(**{**vars(NO_AUGMENTATION), "derived": 1.0}))
+    _, entry = data._groups[0]
+    members = dict(read_groups(tmp_path / "shard-000000.tar"))["a"]
+    pair = data._items[data._order(0, 0)[0]][1]
+    assert pair is not None
+    name = f"l{pair.light - entry.pairs[0].light}.environment.exr"
+    environment = channels_rgb(read_exr_bytes(members[name], name=name)[0])
+    expected = specular_light(sample["normal"], sample["roughness"], environment)
+    np.testing.assert_allclose(sample["derived_specular"], expected, rtol=1e-3, atol=1e-3)
+    assert np.ptp(sample["roughness"][sample["mask"] > 0]) > 0.1
+
+
+# --- what a batch has
+
+
+def test_augmentations_do_to_it_what_they_do_to_rendered_light(folder: Path) -> None:
+    dataset = GroupDataset(folder, derived=True)
+    same = [DerivedLight(shard.pixels, np.arange(len(shard.pixels), dtype=np.int32)) for shard in dataset.shards]
+    dataset._derived = same  # as if nothing cast a shadow
+    for index in range(24):
+        sample = dataset.sample(index, 3, ALWAYS)
+        for name in LIGHT:
+            np.testing.assert_array_equal(sample[f"derived_{name}"], sample[name])
+        assert sample["derived"] == 1
+
+
+def test_the_rest_of_a_sample_does_not_depend_on_it(folder: Path, dataset: GroupDataset) -> None:
+    plain = GroupDataset(folder)
+    never = Augmentation(**{**vars(ALWAYS), "derived": 0.0})
+    for index in range(6):
+        one, other = plain.sample(index, 3, never), dataset.sample(index, 3, ALWAYS)
+        assert set(other) - set(one) == {*DERIVED_MAPS, "derived"}
+        for name in BATCH_MAPS:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_a_share_of_a_batch_has_it(dataset: GroupDataset) -> None:
+    half = Augmentation(derived=0.5)
+    batch = next(BatchReader(dataset, 16, seed=0, workers=0, augmentation=half))
+    assert tuple(batch) == (*BATCH_MAPS, *DERIVED_MAPS, "derived")
+    there = batch["derived"].flatten() > 0
+    assert 0 < int(there.sum()) < 16
+    for name in DERIVED_MAPS:
+        assert batch[name].shape == batch["specular"].shape
+        assert batch[name][there].flatten(1).any(dim=1).all()
+        assert not batch[name][~there].any()
+
+
+def test_data_that_was_opened_without_it_says_so(folder: Path) -> None:
+    with pytest.raises(UnirenderError, match="derived=True"):
+        GroupDataset(folder).sample(0, 0, ALWAYS)
+
+
+# --- what a renderer in training sees
+
+
+ZERO, NOISE = torch.zeros(4, dtype=torch.long), torch.full((4,), 999)
+RENDERING, INVERSE = Timesteps(ZERO, NOISE), Timesteps(NOISE, ZERO)
+
+
+def loss_function() -> LossFunction:
+    model, conditioning = make_model(derived_light=True)
+    return LossFunction(model, conditioning, make_scheduler(), LossConfig())
+
+
+def total(loss: LossFunction, batch: dict[str, Tensor], timesteps: Timesteps) -> float:
+    return float(loss.total(loss.terms(batch, timesteps, torch.Generator().manual_seed(0))).detach())
+
+
+def derived_batch(seed: int = 5) -> dict[str, Tensor]:
+    other = make_batch(seed=seed)
+    return make_batch() | {f"derived_{n}": other[n] for n in LIGHT} | {"derived": torch.ones(4, 1, 1, 1)}
+
+
+def test_a_renderer_sees_it_instead_and_a_decomposer_does_not() -> None:
+    loss = loss_function()
+    batch = derived_batch()
+    names = [f"derived_{name}" for name in LIGHT]
+    changed = {
+        "derived": batch | {name: 0.5 * batch[name] for name in names},
+        "rendered": batch | {name: 0.5 * batch[name] for name in LIGHT},
+    }
+    for direction, seen in ((RENDERING, "derived"), (INVERSE, "rendered")):
+        errors = {kind: total(loss, b, direction) for kind, b in ({"": batch} | changed).items()}
+        unseen = ({"derived", "rendered"} - {seen}).pop()
+        assert errors[unseen] == errors[""]
+        assert errors[seen] != errors[""]
+
+
+def test_rows_without_it_are_what_they_were() -> None:
+    loss, plain = loss_function(), make_batch()
+    without = derived_batch() | {"derived": torch.zeros(4, 1, 1, 1)}
+    assert total(loss, without, RENDERING) == total(loss, plain, RENDERING)
+    some = derived_batch() | {"derived": torch.tensor([0.0, 1, 0, 1]).reshape(4, 1, 1, 1)}
+    seen, derived = loss._seen(some, torch.ones(4, dtype=torch.bool))
+    assert derived is not None
+    for row, has in enumerate((False, True, False, True)):
+        for name in LIGHT:
+            assert torch.equal(seen[name][row], some[f"derived_{name}" if has else name][row])
+        assert [t for t, flag in zip(TRIPLETS, derived[row], strict=True) if flag] == (list(LIGHT) if has else [])
+
+
+# --- what the network is told
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_its_flag_is_between_given_and_not_given(told: bool) -> None:
+    conditioning = make_pipeline(derived_light=told).conditioning
+    batch = make_batch()
+    given = torch.ones(4, 6, dtype=torch.bool)
+    given[0, TRIPLETS.index("diffuse")] = False
+    derived = torch.tensor([name in LIGHT for name in TRIPLETS]).expand(4, 6)
+    flags = conditioning.extras(batch["mask"], given, batch, derived=derived).attributes[:, : len(TRIPLETS), 0, 0]
+    expected = given.float()
+    expected[:, [TRIPLETS.index(name) for name in LIGHT]] *= DERIVED_FLAG if told else 1.0
+    assert torch.equal(flags, expected)
+    plain = conditioning.extras(batch["mask"], given, batch)
+    assert torch.equal(plain.attributes[:, : len(TRIPLETS), 0, 0], given.float())
+    derived_too = conditioning.extras(batch["mask"], given, batch, derived=derived)
+    assert plain.prior is not None
+    assert derived_too.prior is not None
+    assert torch.equal(plain.prior, derived_too.prior)  # made of what is there
+
+
+def scene() -> Intrinsics:
+    maps = {name: value[0].permute(1, 2, 0).numpy() for name, value in make_batch(1).items() if name != "image"}
+    return Intrinsics().replace(**maps)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_pipeline_tells_what_it_derived(told: bool) -> None:
+    pipeline = make_pipeline(derived_light=told)
+    bare = scene().replace(specular=None, diffuse=None)
+    lit = under_light(bare, bare.require("environment")["environment"], "keep")
+    by_itself = pipeline.render(bare)
+    np.testing.assert_allclose(by_itself, pipeline.render(lit, derived=LIGHT), atol=1e-6)
+    assert np.allclose(by_itself, pipeline.render(lit), atol=1e-6) != told
+    half = pipeline.render(lit.replace(specular=None))
+    np.testing.assert_allclose(half, pipeline.render(lit, derived=["specular"]), atol=1e-6)
+
+
+def test_a_relit_picture_is_rendered_with_light_that_was_derived() -> None:
+    pipeline = make_pipeline(derived_light=True)
+    mask = np.zeros((SIZE, SIZE, 1), np.float32)
+    mask[4:-4, 4:-4] = 1
+    picture = np.random.default_rng(0).uniform(0.2, 0.8, (SIZE, SIZE, 3)).astype(np.float32)
+    found = pipeline.decompose(picture, mask)
+    light = np.random.default_rng(1).uniform(0, 2, (16, 32, 3)).astype(np.float32)
+
+    def relit(**given: np.ndarray) -> np.ndarray:
+        result = pipeline.relight(picture, light, mask, exposure="keep", anchored=False, decomposition=found, **given)
+        return result.image_linear
+
+    derived = under_light(found.intrinsics, light, "keep", mirrors=False)
+    maps = derived.require(*LIGHT)
+    assert not np.allclose(relit(), relit(**maps), atol=1e-6)  # the same numbers, but as if they had shadows
