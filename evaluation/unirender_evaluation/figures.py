@@ -1,9 +1,11 @@
 """Draws the paper's kinds of figure: a grid of labelled pictures, in rows that belong to one scene.
 
 A grid says what stands where; `figures_panels` fills it. Pictures are display values in [0, 1] over white, `[h, w, 3]`,
-enlarged by a whole factor without interpolation, so that every pixel of the suite can be counted.
+enlarged by a whole factor without interpolation, so that every pixel of the suite can be counted. A grid of many
+columns is folded: a page would shrink it until nobody can read its labels.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -16,6 +18,7 @@ from unirender.errors import UnirenderError
 from unirender.files import replace_file
 
 SIDE = 128  # of a cell, pixels, about: the nearest whole multiple of the pictures' own size, and never less than it
+WIDEST = 6  # columns beside one another; the others follow below, all rows again
 GAP, GROUP_GAP, HEADER, MARGIN = 6, 16, 24, 12
 INK, SOFT = "#222222", "#666666"
 FONT, SMALL = 13, 12
@@ -76,29 +79,41 @@ def cell_side(grid: Grid) -> int:
     return widest * max(1, round(SIDE / widest))
 
 
+def folded(columns: int) -> list[range]:
+    """The columns that stand beside one another: as few parts as `WIDEST` allows, as even as they can be."""
+    most = -(-columns // -(-columns // WIDEST))
+    return [range(first, min(first + most, columns)) for first in range(0, columns, most)]
+
+
 def draw(grid: Grid) -> Image.Image:
     """The picture of a grid: headings above, labels at the left, the caption below."""
     side, font = cell_side(grid), ImageFont.load_default(FONT)
     small = ImageFont.load_default(SMALL)
     left = MARGIN + max(_width(line.label, font) for line in grid.lines) + MARGIN
-    width = left + len(grid.columns) * (side + GAP) + MARGIN - GAP
+    parts = folded(len(grid.columns))
+    width = left + len(parts[0]) * (side + GAP) + MARGIN - GAP
     caption = _wrapped(grid.caption, small, width - 2 * MARGIN)
-    tops, heights, y = [], [_height(line, side) for line in grid.lines], MARGIN + HEADER
-    for number, line in enumerate(grid.lines):
-        y += GROUP_GAP if line.starts and number else 0
-        tops.append(y)
-        y += heights[number] + GAP
-    height = y + len(caption) * (SMALL + 6) + MARGIN
-    sheet = Image.new("RGB", (width, height), "white")
+    headings, places, y = [], [], MARGIN
+    for part in parts:
+        y += GROUP_GAP if headings else 0
+        headings.append(y)
+        y += HEADER
+        for number, line in enumerate(grid.lines):
+            y += GROUP_GAP if line.starts and number else 0
+            high = _height([line.tiles[column] for column in part], side)
+            places.append((part, line, y, high))
+            y += high + GAP
+    sheet = Image.new("RGB", (width, y + len(caption) * (SMALL + 6) + MARGIN), "white")
     pen = ImageDraw.Draw(sheet)
-    for column, text in enumerate(grid.columns):
-        x = left + column * (side + GAP) + side // 2
-        pen.text((x, MARGIN + HEADER // 2), _fitting(text, font, side + GAP), fill=INK, font=font, anchor="mm")
-    for line, top, high in zip(grid.lines, tops, heights, strict=True):
+    for part, top in zip(parts, headings, strict=True):
+        for place, column in enumerate(part):
+            x, text = left + place * (side + GAP) + side // 2, _fitting(grid.columns[column], font, side + GAP)
+            pen.text((x, top + HEADER // 2), text, fill=INK, font=font, anchor="mm")
+    for part, line, top, high in places:
         pen.text((left - MARGIN, top + high // 2), line.label, fill=INK, font=font, anchor="rm")
-        for column, tile in enumerate(line.tiles):
-            if tile is not None:
-                _paste(sheet, pen, tile, (left + column * (side + GAP), top), (side, high))
+        for place, column in enumerate(part):
+            if (tile := line.tiles[column]) is not None:
+                _paste(sheet, pen, tile, (left + place * (side + GAP), top), (side, high))
     for number, text in enumerate(caption):
         pen.text((MARGIN, y + 4 + number * (SMALL + 6)), text, fill=SOFT, font=small)
     return sheet
@@ -134,9 +149,9 @@ def _factor(tile: Tile, side: int) -> int:
     return max(1, side // max(tile.picture.shape[:2]))
 
 
-def _height(line: Line, side: int) -> int:
-    """Of a row: its highest picture's; lights are wider than high."""
-    return max(tile.picture.shape[0] * _factor(tile, side) for tile in line.tiles if tile is not None)
+def _height(tiles: Sequence[Tile | None], side: int) -> int:
+    """Of a row: its highest picture's (lights are wider than high); of holes alone, that of a label."""
+    return max((tile.picture.shape[0] * _factor(tile, side) for tile in tiles if tile is not None), default=HEADER)
 
 
 def _width(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont") -> int:

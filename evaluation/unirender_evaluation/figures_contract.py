@@ -38,7 +38,7 @@ DPI = 120
 
 def maps_figure(suite: Suite, scene: Scene) -> "Figure":
     """The picture of a scene's base material and all maps that explain it, each as `map_picture` shows it."""
-    figure, maps = _figure(10, 4.6), suite.intrinsics(scene, suite.spec.base)
+    figure, maps = _figure(5, 5.9), suite.intrinsics(scene, suite.spec.base)
     mask = maps.require("mask")["mask"]
     image = image_srgb(suite.image(scene, suite.spec.base) + (1 - mask))  # premultiplied, so over white by a sum
     shown = {"image": (image, "3, linear, premultiplied")}
@@ -47,7 +47,7 @@ def maps_figure(suite: Suite, scene: Scene) -> "Figure":
         alone = name in ("environment", "mask")  # not aligned with the picture, or about where it is
         shown[name] = (value if alone else over_white(value, mask), said)
     for place, (name, (value, said)) in enumerate(shown.items(), start=1):
-        axes = figure.add_subplot(2, 5, place)
+        axes = figure.add_subplot(3, 3, place)
         axes.imshow(np.clip(value, 0, 1), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
         axes.set_title(f"{name}\n", fontsize=11, color=INK)
         axes.text(0.5, 1.03, said, transform=axes.transAxes, ha="center", va="bottom", fontsize=8, color=SOFT)
@@ -59,8 +59,8 @@ def maps_figure(suite: Suite, scene: Scene) -> "Figure":
 
 def camera_figure(camera: Camera) -> "Figure":
     """The scene from above, the picture as the camera takes it, and the directions of an environment's texels."""
-    figure = _figure(11, 3.9)
-    grid = figure.add_gridspec(1, 3, width_ratios=(1.15, 1, 1.5))
+    figure = _figure(5, 9.2)
+    grid = figure.add_gridspec(3, 1, height_ratios=(1.1, 1.05, 1))
     _from_above(figure.add_subplot(grid[0]), camera)
     _picture(figure.add_subplot(grid[1]), camera)
     _environment(figure.add_subplot(grid[2]))
@@ -102,12 +102,12 @@ def _from_above(axes: "Axes", camera: Camera) -> None:
     for name, (x, z) in {"+x": (1, 0), "-x": (-1, 0), "+z": (0, 1), "-z": (0, -1)}.items():
         places = " and ".join(f"{u:g}" for u, _ in texel_of(name))
         axes.plot([1.47 * x, 1.63 * x], [1.47 * z, 1.63 * z], color=SOFT, linewidth=1)
-        axes.text(2.1 * x, 1.85 * z, f"u = {places}", fontsize=8, color=SOFT, ha="center", va="center")
+        axes.text(2.25 * x, 1.85 * z, f"u = {places}", fontsize=8, color=SOFT, ha="center", va="center")
     _axis(axes, "+x", (1, 0))
     _axis(axes, "+z", (0, 1))
     axes.text(0, -0.3, "+y: towards you", fontsize=8, color=AXIS_COLOURS["+y"], ha="center")
-    axes.set(xlim=(-2.6, 2.6), ylim=(far + 0.4, -2.1), aspect="equal")
-    axes.set_title("from above; u: columns of the light", fontsize=10, loc="left")
+    axes.set(xlim=(-2.8, 2.8), ylim=(far + 0.4, -2.1), aspect="equal")
+    axes.set_title("from above; u: columns of the light", fontsize=10)
     axes.axis("off")
 
 
@@ -116,10 +116,10 @@ def _picture(axes: "Axes", camera: Camera) -> None:
     side = 192
     normal = ball(camera, side)
     axes.imshow(over_white(map_picture("normal", normal), np.any(normal != 0, axis=-1, keepdims=True) * np.float32(1)))
-    middle, reach = camera.principal[0] * side, 0.42 * side
+    middle, reach = camera.principal[0] * side, 0.38 * side
     _axis(axes, "+x", (middle + reach, middle), (middle, middle))
     _axis(axes, "+y", (middle, middle - reach), (middle, middle))
-    axes.text(middle + 4, middle + 12, "+z: towards you", fontsize=8, color=AXIS_COLOURS["+z"])
+    axes.text(middle + 4, middle + 12, "+z: towards you", fontsize=8, color=INK)
     axes.set_xticks([0, side - 1], ["column 0", "w - 1"], fontsize=8)
     axes.set_yticks([0, side - 1], ["row 0", "h - 1"], fontsize=8)
     axes.set_title(

@@ -12,7 +12,7 @@ from PIL import Image
 from tiny_suites import SIZE, make_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.figures import GAP, Grid, Line, Tile, cell_side, draw, save
+from unirender_evaluation.figures import GAP, WIDEST, Grid, Line, Tile, cell_side, draw, folded, save
 from unirender_evaluation.figures_command import Figures, default_scenes, labels
 from unirender_evaluation.figures_overview import MAPS, overview
 from unirender_evaluation.figures_panels import (
@@ -88,6 +88,26 @@ def test_a_row_is_as_high_as_its_pictures_and_a_corner_has_its_text() -> None:
     assert draw(square).height - draw(flat).height == 64
     said = replace(square, lines=(Line("a", (Tile(colour(0.5), "12.3 dB"),)),))
     assert np.asarray(draw(said)).tolist() != np.asarray(draw(square)).tolist()
+
+
+@pytest.mark.parametrize(("columns", "parts"), [(1, [1]), (6, [6]), (7, [4, 3]), (12, [6, 6]), (15, [5, 5, 5])])
+def test_many_columns_are_folded_into_even_parts(columns: int, parts: list[int]) -> None:
+    assert [len(part) for part in folded(columns)] == parts
+    assert [column for part in folded(columns) for column in part] == list(range(columns))
+
+
+def test_a_folded_grid_shows_every_tile_below_the_first_ones_in_the_same_columns() -> None:
+    count = 2 * WIDEST
+    levels = [(10 * number, 255 - 10 * number, 7) for number in range(count)]  # no text has one of these colours
+    tiles = tuple(Tile(np.broadcast_to(np.array(level, np.float32) / 255, (8, 8, 3))) for level in levels)
+    sheet = np.asarray(draw(Grid(tuple("abcdefghijkl"), (Line("row", tiles),))))
+    corners = [np.argwhere((sheet == level).all(axis=-1)).min(axis=0) for level in levels]
+    tops, lefts = np.array(corners).reshape(2, WIDEST, 2).transpose(2, 0, 1)
+    assert (np.diff(tops[0]) == 0).all()
+    assert (np.diff(tops[1]) == 0).all()
+    assert tops[1, 0] >= tops[0, 0] + 128
+    assert lefts[0].tolist() == lefts[1].tolist()
+    assert (np.diff(lefts[0]) == 128 + GAP).all()
 
 
 def test_a_grid_with_a_row_of_another_length_or_nothing_in_it_is_refused() -> None:
