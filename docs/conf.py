@@ -53,6 +53,7 @@ suppress_warnings = ["ref.python"]
 RESULTS = Path(__file__).parents[1] / "evaluation" / "results"
 
 _CODE = re.compile(r"(``.+?``|`[^`]+`)")
+_OVERLINE = re.compile(r'<mover accent="false">((?:(?!<mover).)*?)<mo accent="true">_</mo>\s*</mover>', re.DOTALL)
 _EMPHASIS = re.compile(r"(?<![\w*])\*(?=[^\s*])([^*]*[^\s*])\*(?![\w*])")
 
 
@@ -107,6 +108,13 @@ def _tables(folder: Path) -> str:
     return "\n\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md")))
 
 
+def _intervals(app: Sphinx, doctree: nodes.document) -> None:
+    """Half an interval stays on one line with its sign: a column of a table may be narrower than both."""
+    for text in list(doctree.findall(nodes.Text)):
+        if "± " in text and not isinstance(text.parent, (nodes.literal, nodes.literal_block)):
+            text.parent.replace(text, nodes.Text(text.replace("± ", "±\N{NO-BREAK SPACE}")))
+
+
 def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
     """A formula as MathML, which browsers draw by themselves: MathJax would be fetched from another host."""
     block = isinstance(node, nodes.math_block)
@@ -115,6 +123,7 @@ def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> Non
     except MathError as error:
         logging.getLogger(__name__).warning("formula %r: %s", node.astext(), error, location=node)
         raise nodes.SkipNode from error
+    markup = _OVERLINE.sub(r'<mrow class="overline">\1</mrow>', markup)  # no browser stretches docutils' bar
     writer.body.append(f'<div class="math">{markup}</div>' if block else markup)
     raise nodes.SkipNode
 
@@ -122,4 +131,5 @@ def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> Non
 def setup(app: Sphinx) -> None:
     app.add_html_math_renderer("mathml", inline_renderers=(_mathml, None), block_renderers=(_mathml, None))
     app.connect("source-read", _results)
+    app.connect("doctree-read", _intervals)
     app.connect("autodoc-process-docstring", _docstring, priority=100)

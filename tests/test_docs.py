@@ -2,6 +2,7 @@
 and so do the files and headings that it links to. What blocks hold besides commands is run by `test_docs_code.py`.
 """
 
+import ast
 import contextlib
 import importlib.util
 import io
@@ -13,9 +14,13 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from doc_blocks import anchors, blocks, pages
+from docutils import nodes
+from docutils.utils.math import MathError
+from docutils.utils.math.latex2mathml import tex2mathml
 
 from unirender import cli
 from unirender.command_line import parse
@@ -29,6 +34,8 @@ PAGES = [
 ]
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 HEADING = re.compile(r"\]\((?!https?:)([^)#\s]*)#([^)\s]+)\)")
+CODE = re.compile(r"^(`{3,}).*?^\1|`[^`\n]*`", re.MULTILINE | re.DOTALL)
+FORMULA = re.compile(r"\$\$(.+?)\$\$|\$([^$]+)\$", re.DOTALL)
 EXTRA = re.compile(r"unirender\[([\w,]+)\]")
 
 
@@ -160,6 +167,103 @@ def test_anchors_are_those_of_github_and_myst(tmp_path: Path) -> None:
 def test_linked_files_exist(page: Path) -> None:
     links = LINK.findall(page_text(page))
     assert not [link for link in links if not (page.parent / link).exists()]
+
+
+def misread(text: str) -> list[str]:
+    """Formulas that docutils, which makes the site's MathML, refuses or silently takes for others."""
+    found = []
+    for block, inline in FORMULA.findall(CODE.sub("", text)):
+        formula = (block or inline).strip()
+        try:
+            shown = tex2mathml(formula)
+        except MathError as error:
+            found.append(f"{formula}: {error}")
+            continue
+        if re.search(r"frac\s*\d", formula):  # 12 is one number to it, and the denominator is what comes next
+            found.append(f"{formula}: braces are missing")
+        if "\\" in shown:
+            found.append(f"{formula}: backslash is shown")
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_formulas_are_shown_as_they_were_meant(page: Path) -> None:
+    assert not misread(page_text(page))
+
+
+def test_a_formula_that_is_misread_is_found() -> None:
+    right = r"$\frac{1}{2}$, as code `$\frac12$`" + "\n```\n$ \\frac12 $\n```\n"
+    wrong = r"$a = \frac12 (b)$, $$\text{down\_up}$$ and $\nosuch$"
+    assert misread(right) == []
+    problems = [problem.split(": ", 1)[1].split()[0] for problem in misread(right + wrong)]
+    assert problems == ["braces", "backslash", "Unknown"]
+
+
+@cache
+def site_settings() -> ModuleType:
+    """The module docs/conf.py."""
+    spec = importlib.util.spec_from_file_location("site_settings", ROOT / "docs" / "conf.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_bar_over_a_formula_is_left_to_the_style_sheet() -> None:
+    writer = SimpleNamespace(body=[])
+    with pytest.raises(nodes.SkipNode):
+        site_settings()._mathml(writer, nodes.math("", r"\overline{w^2} + \overline{w}"))
+    (markup,) = writer.body
+    assert markup.count('<mrow class="overline">') == markup.count("</mrow>") == 2
+    assert "mover" not in markup
+    assert "math .overline {" in (ROOT / "docs" / "_static" / "narrow.css").read_text(encoding="utf-8")
+
+
+def test_an_interval_is_not_broken_behind_its_sign_but_in_code() -> None:
+    page = nodes.section()
+    page += [nodes.paragraph("", "1.5 ± 0.2"), nodes.literal_block("", "1.5 ± 0.2")]
+    site_settings()._intervals(None, page)
+    assert [each.astext() for each in page.children] == ["1.5 ±\N{NO-BREAK SPACE}0.2", "1.5 ± 0.2"]
+
+
+def executed(page: Path) -> Iterator[tuple[str, str]]:
+    """The code of every cell that the build runs, and what it says of its picture to those who do not see it."""
+    if page.suffix == ".ipynb":
+        for cell in json.loads(page.read_text(encoding="utf-8"))["cells"]:
+            if cell["cell_type"] == "code":
+                yield "".join(cell["source"]), cell["metadata"].get("mystnb", {}).get("image", {}).get("alt", "")
+        return
+    for block in blocks(page):
+        if block.language.startswith("{code-cell}"):
+            _, options, source = (
+                block.text.split("---\n", 2) if block.text.startswith("---\n") else ("", "", block.text)
+            )
+            yield source, "".join(re.findall(r"^ +alt: (.+)", options, re.MULTILINE))
+
+
+def draws(source: str) -> bool:
+    """Whether the code calls a function `show` or `imshow`; defining one that does is not yet a picture."""
+    magic = source.startswith("%%")  # a cell that IPython writes to a file, say, and does not run
+    code = "" if magic else re.sub(r"^[%:].*", "", source, flags=re.MULTILINE)
+    top = [node for node in ast.parse(code).body if not isinstance(node, ast.FunctionDef)]
+    calls = [ast.unparse(node.func) for each in top for node in ast.walk(each) if isinstance(node, ast.Call)]
+    return any(call.rsplit(".", 1)[-1] in ("show", "imshow") for call in calls)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_computed_pictures_have_words(page: Path) -> None:
+    """Without any a screen reader reads out the name of a file, which is a hash."""
+    assert not [source[:60] for source, alt in executed(page) if draws(source) and len(alt.split()) < 4]
+
+
+def test_cells_that_draw_are_known() -> None:
+    assert draws(":tags: [hide-input]\nimport numpy\nshow(a=1)")
+    assert draws("for axis in axes:\n    axis.imshow(picture)")
+    assert not draws("def show():\n    plt.show()")
+    assert not draws("%%writefile a.py\nshow(1)")
+    counts = {page.stem: sum(draws(source) for source, _ in executed(page)) for page in PAGES}
+    assert (counts["decompose_edit_relight"], counts["worked_example"]) == (7, 3)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
