@@ -6,6 +6,7 @@ from pathlib import Path
 from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from jupyter_client.manager import KernelManager
 from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.writers.html5 import HTML5Translator
@@ -39,6 +40,8 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 240
 nb_output_stderr = "remove"
 nb_render_markdown_format = "myst"  # tables
+# Encrypted sockets: over plain ones ipykernel warns, once for every page that is executed.
+KernelManager.transport_encryption.default_value = "auto"
 
 autosummary_generate = True
 autodoc_member_order = "bysource"
