@@ -29,6 +29,7 @@ all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
 $(VENV)/.runtime: $(REQUIREMENTS)
+	@echo "setting up $(VENV): 2 or 3 minutes, once"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable .
 	touch $@

@@ -148,6 +148,17 @@ def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:
     assert all(np.abs(a.astype(int) - b).mean() > 1 for a, b in itertools.pairwise(pictures))
 
 
+def test_an_alpha_channel_that_hides_nothing_is_no_mask(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a screenshot has it."""
+    colours = np.random.default_rng(0).integers(0, 255, (20, 30, 4), dtype=np.uint8)
+    for alpha, told in ((255, True), (254, False)):
+        colours[..., 3] = 255
+        colours[0, 0, 3] = alpha
+        Image.fromarray(colours).save(tmp_path / f"{alpha}.png")
+        assert run("decompose", tmp_path / f"{alpha}.png", "--output", tmp_path / f"out{alpha}") == 0
+        assert ("covers the whole frame" in capsys.readouterr().err) == told
+
+
 def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     small = Image.fromarray(rng.integers(0, 255, (20, 30, 3), dtype=np.uint8))

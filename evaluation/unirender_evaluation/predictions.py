@@ -52,7 +52,9 @@ class PredictionFolder:
     """
 
     def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
-        if not folder.is_dir() or not any(p.is_dir() for p in folder.iterdir()):
+        if not folder.is_dir():
+            raise UnirenderError(f"predictions: {folder}: no such folder, expected one with a subfolder per picture")
+        if not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
                 f"predictions: {folder} has no subfolders, expected one per picture, each named as in the inputs "
                 "that `unirender bench export` writes"

@@ -129,7 +129,9 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
         channels = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in file.channels().items()}
         header = file.header()
     except Exception as error:  # the binding raises several types for broken data
-        raise UnirenderError(f"{name}: not a readable OpenEXR file ({str(error).splitlines()[0]})") from error
+        raise UnirenderError(
+            f"{name}: not a readable OpenEXR file, but another or a damaged one ({str(error).splitlines()[0]})"
+        ) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}

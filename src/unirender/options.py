@@ -221,6 +221,8 @@ def read_input(path: Path, mask: Path | None) -> tuple["Picture", dict[str, str]
     elif picture.mask is None:
         remarks["mask"] = "no mask and no alpha channel: the whole frame is taken as the object (--mask)"
         picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
+    elif picture.mask.min() == 1:
+        remarks["mask"] = "the alpha channel covers the whole frame, which is taken as the object (--mask)"
     if picture.negative:
         remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"
     if picture.clipped > MANY_CLIPPED:

@@ -12,6 +12,7 @@ from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
 
+FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 MAX_PIXELS = 100_000_000
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 DISPLAY_MAX_16_BIT = 65535  # display white of 16-bit grey
@@ -50,9 +51,9 @@ def read_picture(path: str | Path) -> Picture:
     """
     path = Path(path)
     if not path.exists():
-        raise UnirenderError(f"{path}: no such file, expected a PNG, JPG or EXR picture")
+        raise UnirenderError(f"{path}: no such file, expected a picture: {FORMATS}")
     if path.is_dir():
-        raise UnirenderError(f"{path}: is a folder, expected a PNG, JPG or EXR picture")
+        raise UnirenderError(f"{path}: is a folder, expected a picture: {FORMATS}")
     return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path)
 
 
@@ -107,7 +108,7 @@ def open_picture(path: str | Path) -> Image.Image:
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"{path}: not a readable picture ({error}), expected PNG, JPG or EXR") from error
+        raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
 
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:

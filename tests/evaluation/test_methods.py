@@ -168,3 +168,5 @@ def test_predictions_folder_is_needed(tmp_path: Path) -> None:
 
     with pytest.raises(UnirenderError, match="has no subfolders, expected one per picture"):
         PredictionFolder(tmp_path)
+    with pytest.raises(UnirenderError, match="nowhere: no such folder"):
+        PredictionFolder(tmp_path / "nowhere")

@@ -219,7 +219,7 @@ def printed_as_said(names: Names) -> None:
 
 
 EXAMPLES = {
-    "README.md": Example(photograph),
+    "README.md": Example(mug),
     "dataset.md": Example(data_set),
     "figures.md": Example(),
     "lights.md": Example(own_lights),
