@@ -35,6 +35,7 @@ $(VENV)/.runtime: $(REQUIREMENTS)
 	touch $@
 
 $(VENV)/.dev: $(REQUIREMENTS)
+	@echo "setting up $(VENV) with the development tools: 2 or 3 minutes, once"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[dev,docs,cluster,denoise,sd,demo]'
 	touch $(VENV)/.runtime $@
