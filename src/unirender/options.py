@@ -73,14 +73,11 @@ class ModelOptions:
         Raises:
             UsageError: one is outside its range.
         """
-        if self.samples < 1 or (self.steps is not None and not 1 <= self.steps <= MOST_STEPS):
-            raise UsageError(
-                f"--samples {self.samples}, --steps {self.steps}: expected at least 1 of each, and at "
-                f"most {MOST_STEPS} steps"
-            )
+        at_least(1, samples=self.samples, size=self.size)
+        if self.steps is not None and not 1 <= self.steps <= MOST_STEPS:
+            raise UsageError(f"--steps {self.steps}: expected 1 to {MOST_STEPS}")
         if self.sampler is not None and (self.mode == "mean" or self.steps == 1):
             raise UsageError(f"--sampler {self.sampler}: one step needs none, expected more --steps (or --samples)")
-        at_least(1, size=self.size)
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         if self.fov is not None:
