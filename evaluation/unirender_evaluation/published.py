@@ -23,6 +23,11 @@ class PublishedRow:
     group: str  # "data-driven", "optimisation", "ours": the paper's separators
     values: Mapping[str, float]
 
+    @property
+    def label(self) -> str:
+        """The name as our tables print it: the paper's "Ours" is not ours."""
+        return self.name.replace("Ours", "Uni-Renderer", 1)
+
     def is_called(self, name: str | None) -> bool:
         """Whether `name` is this system, under either of its names."""
         return name is not None and ALIASES.get(name, name) == ALIASES.get(self.name, self.name)

@@ -135,7 +135,7 @@ def published_against_constant(results: Results) -> str:
     records = Selection("inverse", "single-image").of(results.records)
     keys = [metric_key(quantity, METRICS["mse"], MASKED) for quantity in ("metallic", "roughness")]
     lines = [
-        [f"{row.name} (*published*)", f"{row.values['metallic.mse']:.4f}", f"{row.values['roughness.mse']:.4f}"]
+        [f"{row.label} (*published*)", f"{row.values['metallic.mse']:.4f}", f"{row.values['roughness.mse']:.4f}"]
         for row in published_tables()["inverse"]
         if {"metallic.mse", "roughness.mse"} <= row.values.keys()
     ]

@@ -211,11 +211,11 @@ def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping
         section = SECTIONS[entry.group]
         if not namesakes:
             cells = tuple(Cell(published=value) for value in values)
-            rows.append(Row(f"published:{entry.name}", entry.name, "paper", section, cells))
+            rows.append(Row(f"published:{entry.name}", entry.label, "paper", section, cells))
         for position, row in enumerate(namesakes):
             pairs = zip(row.cells, values, strict=True)
             cells = tuple(dataclasses.replace(c, published=v) if position == 0 else c for c, v in pairs)
-            label = f"{row.label} [{entry.name}]" if position == 0 and row.label != entry.name else row.label
+            label = f"{row.label} [{entry.label}]" if position == 0 and row.label != entry.label else row.label
             rows.append(dataclasses.replace(row, cells=cells, label=label, section=section))
             del left[row.key]
     return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))

@@ -107,7 +107,7 @@ def test_alignments_stand_side_by_side() -> None:
 def test_published_errors_stand_beside_measured_ones() -> None:
     found = lines(published_against_constant(small_results()))
     paper = next(row for row in published_tables()["inverse"] if row.name == "Ours").values
-    assert ["Ours (*published*)", f"{paper['metallic.mse']:.4f}", f"{paper['roughness.mse']:.4f}"] in found
+    assert ["Uni-Renderer (*published*)", f"{paper['metallic.mse']:.4f}", f"{paper['roughness.mse']:.4f}"] in found
     assert found[-1] == ["Ours (mean) (measured here)", NOT_RUN, "0.0482"]
     assert found[-2][1:] == [NOT_RUN, NOT_RUN]
 

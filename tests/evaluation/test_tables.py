@@ -90,7 +90,7 @@ def test_measured_stands_beside_published_in_the_papers_order() -> None:
     found = table()
     labels = [r.label for r in found.rows]
     assert labels[:2] == ["Yi et al.", "IntrinsicAnything"]
-    assert labels.index("Ours (mean) [Ours]") == labels.index("GaussianShader") + 1
+    assert labels.index("Ours (mean) [Uni-Renderer]") == labels.index("GaussianShader") + 1
     assert labels[-4:] == ["Ours (sample)", "Constant 0.5", "Input as albedo", "Noise ceiling"]
     cell = row(found, "Ours (mean)").cells[0]
     assert cell.published == 23.20

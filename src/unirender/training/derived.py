@@ -12,8 +12,6 @@ their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/de
 import logging
 import multiprocessing
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -24,6 +22,7 @@ from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
+from unirender.files import cached_folder
 from unirender.paths import cache_dir
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.groups import Group, Shard, read_groups
@@ -90,23 +89,9 @@ def _derive(path: Path, shard: Shard) -> None:
         for row, light in _of_group(shard, groups[key], _environments(members, f"{path}: group {key}")):
             rows[row] = len(pixels)
             pixels.append(light)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=".deriving-", dir=folder.parent))
-    except OSError as error:
-        raise UnirenderError(f"{folder.parent}: cannot be made ({error.strerror}); set UNIRENDER_CACHE") from error
-    try:
-        np.save(temporary / "pixels.npy", np.stack(pixels))
-        np.save(temporary / "rows.npy", rows)
-        try:
-            os.rename(temporary, folder)
-        except OSError:
-            if not folder.exists():  # else another process derived the same
-                raise
-    except OSError as error:
-        raise UnirenderError(f"{folder}: cannot be written ({error.strerror}); free some space") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with cached_folder(folder) as made:
+        np.save(made / "pixels.npy", np.stack(pixels))
+        np.save(made / "rows.npy", rows)
 
 
 def _environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarray, "eh ew 3"]]:

@@ -17,11 +17,8 @@ memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
 
 import contextlib
 import json
-import os
 import re
-import shutil
 import tarfile
-import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,7 +29,7 @@ from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
-from unirender.files import file_sha256
+from unirender.files import cached_folder, file_sha256
 from unirender.paths import cache_dir
 from unirender.training.environments import turned_environments
 
@@ -204,27 +201,11 @@ def _pack(path: Path, folder: Path) -> None:
     groups = [packer.add(key, members) for key, members in read_groups(path)]
     if not groups:
         raise UnirenderError(f"{path}: the shard has no groups; delete it and remake the dataset")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=".packing-", dir=folder.parent))
-    except OSError as error:
-        raise UnirenderError(f"{folder.parent}: cannot be made ({error.strerror}); set UNIRENDER_CACHE") from error
-    try:
-        np.save(temporary / "pixels.npy", packer.stack(packer.pixels))
-        np.save(temporary / "shared.npy", packer.stack(packer.shared))
-        np.save(temporary / "environment.npy", np.stack(packer.environment))
-        (temporary / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
-        try:
-            os.rename(temporary, folder)
-        except OSError:
-            if not folder.exists():  # else another process packed the same bytes
-                raise
-    except OSError as error:
-        raise UnirenderError(
-            f"{folder}: cannot be written ({error.strerror}); free some space or set UNIRENDER_CACHE"
-        ) from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with cached_folder(folder) as made:
+        np.save(made / "pixels.npy", packer.stack(packer.pixels))
+        np.save(made / "shared.npy", packer.stack(packer.shared))
+        np.save(made / "environment.npy", np.stack(packer.environment))
+        (made / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
 
 
 class _Packer:
