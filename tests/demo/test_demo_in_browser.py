@@ -324,6 +324,7 @@ def test_a_port_that_is_taken_is_named(server: Server) -> None:
     assert done.returncode == 1
     assert f"cannot listen on 127.0.0.1:{port}" in done.stderr
     assert len(done.stderr.splitlines()) == 1
+    assert "loading" in done.stdout
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])

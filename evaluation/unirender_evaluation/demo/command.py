@@ -62,6 +62,7 @@ class Demo:
         from unirender_evaluation.demo.uploads import Limits
         from unirender_evaluation.demo.worker import Worker
 
+        print("unirender demo: loading the model; the address follows", flush=True)
         limits = Limits(self.max_megabytes, self.max_pixels, self.max_seconds)
         with Worker(partial(start, self.checkpoint, self.device, limits), self.max_seconds) as worker:
             serve(worker, limits, self.host, self.port)
