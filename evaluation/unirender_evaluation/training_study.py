@@ -1,13 +1,13 @@
 """What the choices of training are worth: one small network, the same data and steps, one thing changed at a time.
 
-Every row begins with the paper's plain model (Sec. 3.2's timesteps, no physics prior, a cycle whose gradient does not
-reach the renderer) and differs from it in what its label says. Rows are trained from the same seed on the same samples,
-so that differences are paired by scene; the row `seed` differs in nothing but its seed, and shows what chance is worth.
+Every row begins with one preset and differs from it in what its label says: by default with the paper's plain model
+(Sec. 3.2's timesteps, no physics prior, a cycle whose gradient does not reach the renderer). Rows are trained from the
+same seed on the same samples, so that differences are paired by scene; the row `seed` differs in nothing but its seed,
+and shows what chance is worth.
 """
 
-import dataclasses
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from unirender.training.presets import TrainConfig, get_preset
@@ -43,14 +43,18 @@ class Choice:
     config: TrainConfig
 
 
-def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choice, ...]:
-    """All rows, the plain model first.
+def training_choices(seed: int = 0, batch_size: int | None = None, preset: str = BASE_PRESET) -> tuple[Choice, ...]:
+    """All rows, the one that the others are changes of first; without those that would change nothing.
 
     Args:
         seed: of weights, data order and noise.
         batch_size: instead of the preset's.
+        preset: what every row begins with.
+
+    Raises:
+        UnirenderError: no such preset.
     """
-    base = replace(get_preset(BASE_PRESET), seed=seed)
+    base = replace(get_preset(preset), seed=seed)
     base = base if batch_size is None else replace(base, batch_size=batch_size)
 
     def run(name: str, group: str, label: str, **changes: Any) -> Choice:
@@ -65,10 +69,10 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
     def optimizer(name: str, label: str, **changes: Any) -> Choice:
         return run(name, "optimizer", label, optimizer=replace(base.optimizer, **changes))
 
-    halves = get_preset("tiny_without_unified").model
+    whole, halves = (asdict(get_preset(name).model) for name in ("tiny", "tiny_without_unified"))
     side_by_side = math.gcd(get_preset("tiny_one_at_a_time").group_size, base.batch_size)
-    return (
-        Choice(PLAIN, "", "Plain model", base),
+    rows = (
+        Choice(PLAIN, "", "Plain model" if preset == BASE_PRESET else f"`{preset}`", base),
         run("seed", "chance", "another seed", seed=seed + 1),
         run("algorithm1", "timesteps", "Algorithm 1 of the supplement", timestep_rule="algorithm1"),
         run("only-pure-noise", "timesteps", "always pure noise (p_t = 0)", p_t=0.0),
@@ -102,7 +106,7 @@ def training_choices(seed: int = 0, batch_size: int | None = None) -> tuple[Choi
             "without-unified",
             "network",
             "two networks of half the size, one per direction",
-            **{field.name: getattr(halves, field.name) for field in dataclasses.fields(halves)}
-            | {"physics_prior": base.model.physics_prior},
+            **{name: value for name, value in halves.items() if value != whole[name]},
         ),
     )
+    return tuple(row for row in rows if row.name == PLAIN or row.config != base)

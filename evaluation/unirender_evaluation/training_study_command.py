@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class BenchTraining:
     """Train a small network several times, one choice changed each time, and score them all. A second run continues.
 
-    The same data, steps and seed for every row, and every row against the plain model, paired by scene.
+    The same data, steps and seed for every row, and every row against the first, paired by scene.
     """
 
     data: Path
@@ -29,6 +29,8 @@ class BenchTraining:
     """Scenes of the suite, evenly spaced, that every network is scored on."""
     steps: int = 1000
     """Of every training."""
+    preset: str = "tiny_plain"
+    """What every row is a change of. `tiny_plain`: the paper's plain model."""
     choices: tuple[str, ...] = ()
     """Rows by name, or by the question that they answer. None: all that can be trained on the data (one-at-a-time needs
     data of that kind)."""
@@ -56,7 +58,7 @@ class BenchTraining:
         from unirender_evaluation.study_rows import chosen
         from unirender_evaluation.training_study import training_choices
 
-        rows = chosen(training_choices(self.seed, self.batch_size), self.choices, "--choices")
+        rows = chosen(training_choices(self.seed, self.batch_size, self.preset), self.choices, "--choices")
         if not self.data.is_dir():
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
@@ -69,7 +71,7 @@ class BenchTraining:
         from unirender_evaluation.training_study_run import TrainingStudy, run
 
         suite = load_suite(self.suite)
-        study = TrainingStudy(suite, self.data, self.out, self.steps, self.device, self.parallel)
+        study = TrainingStudy(suite, self.data, self.out, self.steps, self.device, self.parallel, self.preset)
         run(study, rows, evenly(suite.scenes, self.scenes), Console())
         return 0
 

@@ -25,7 +25,7 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture
-from unirender_evaluation.training_study import Choice
+from unirender_evaluation.training_study import BASE_PRESET, Choice
 from unirender_evaluation.validation import score_scene
 from unirender_evaluation.versions import (
     MODEL,
@@ -55,6 +55,7 @@ class TrainingStudy:
         steps: of every training.
         device: where the training runs.
         parallel: passes side by side; None: as many as PyTorch has threads.
+        preset: what every row is a change of, for the description.
     """
 
     suite: Suite
@@ -63,6 +64,7 @@ class TrainingStudy:
     steps: int
     device: Device = "auto"
     parallel: int | None = None
+    preset: str = BASE_PRESET
 
     @cached_property
     def trained_on(self) -> dict[str, Any]:
@@ -179,6 +181,7 @@ def description(study: TrainingStudy, rows: Sequence[Choice]) -> dict[str, str]:
         "suite": f"{study.suite.spec.name} {study.suite.sha256[:12]}",
         "resolution": f"{study.suite.spec.resolution}",
         "data": f"{trained_on['data'][:12]} ({trained_on['groups']} groups)",
+        "preset": study.preset,
         "steps": f"{study.steps}",
         "batch": f"{rows[0].config.batch_size}",
         "torch": str(installed_version("torch")),

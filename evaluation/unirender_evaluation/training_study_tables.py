@@ -1,4 +1,4 @@
-"""The table of training choices: means over scenes, and paired differences from the plain model."""
+"""The table of training choices: means over scenes, and paired differences from the first row."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ COLUMNS = (
     _column("own maps, Mitsuba", "again_mitsuba", "psnr"),
 )
 NOTE = (
-    f"Mean over scenes; in brackets the paired difference from the plain model, ± half of its {CONFIDENCE:.0%} "
+    f"Mean over scenes; in brackets the paired difference from the first row, ± half of its {CONFIDENCE:.0%} "
     "bootstrap interval over objects; **bold** where the interval excludes 0. Masked, sRGB. Own maps: the network's "
     "decomposition (not closed), rendered by the network and shaded by Mitsuba, against the picture. The networks are "
     "far from fully trained: the table says what helps early, at this size."

@@ -59,6 +59,19 @@ def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
     assert isinstance(plain.config.model, ModelConfig)
 
 
+def test_rows_may_be_changes_of_another_preset() -> None:
+    """And those that would change nothing of it are left out."""
+    first, *others = training_choices(preset="tiny_muon")
+    assert (first.name, first.label) == (PLAIN, "`tiny_muon`")
+    names = {row.name for row in others}
+    assert not names & {"muon", "split-sum-prior", "composite-loss"}
+    assert {"seed", "no-cycle", "without-unified", "muon-fast"} <= names
+    split = next(row.config.model for row in others if row.name == "without-unified")
+    assert (split.unified, split.physics_prior) == (False, first.config.model.physics_prior)
+    with pytest.raises(UnirenderError, match="no-such"):
+        training_choices(preset="no-such")
+
+
 def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
         BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
