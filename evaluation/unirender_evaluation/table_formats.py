@@ -24,6 +24,7 @@ from unirender_evaluation.statistics import Estimate
 from unirender_evaluation.tables import Cell, Row, Table
 
 MISSING, NOT_AVAILABLE = "-", "n/a"
+NO_CELL = Cell()
 TEX_COLUMN = 13  # letters of a column's heading in LaTeX: longer ones are broken, so that the column stays narrow
 
 
@@ -128,7 +129,9 @@ def to_json(tables: Iterable[Table]) -> str:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Prints a table to a terminal, split by column groups where it is too narrow."""
+    """Prints a table to a terminal, split by column groups where it is too narrow; a part has the rows that say
+    something in it.
+    """
     if table.watermark:
         console.print(f"[bold red]{escape(table.watermark)}[/]")
     groups = [[i for i, _ in items] for _, items in groupby(enumerate(table.columns), key=lambda item: item[1].group)]
@@ -154,6 +157,8 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
         rich_table.add_column(name, justify="right", no_wrap=True)
     section = None
     for row in table.rows:
+        if all(row.cells[i] == NO_CELL for i in indices):
+            continue
         if section is not None and row.section != section:
             rich_table.add_section()
         section = row.section
