@@ -44,7 +44,7 @@ class Choice:
 
 
 def training_choices(seed: int = 0, batch_size: int | None = None, preset: str = BASE_PRESET) -> tuple[Choice, ...]:
-    """All rows, the one that the others are changes of first; without those that would change nothing.
+    """All rows, the one that the others are changes of first; without those that another row is already.
 
     Args:
         seed: of weights, data order and noise.
@@ -109,4 +109,4 @@ def training_choices(seed: int = 0, batch_size: int | None = None, preset: str =
             **{name: value for name, value in halves.items() if value != whole[name]},
         ),
     )
-    return tuple(row for row in rows if row.name == PLAIN or row.config != base)
+    return tuple(row for i, row in enumerate(rows) if row.config not in [earlier.config for earlier in rows[:i]])

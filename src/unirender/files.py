@@ -113,33 +113,6 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
     yield folder
 
 
-@contextlib.contextmanager
-def cached_folder(folder: Path) -> Iterator[Path]:
-    """A new folder of the cache, to be filled; it appears when it is complete. Where another process that makes the
-    same was faster, its own stays.
-
-    Raises:
-        UnirenderError: the cache cannot be written.
-    """
-    temporary = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:16]}.", dir=folder.parent))
-        yield temporary
-        try:
-            os.rename(temporary, folder)
-        except OSError:
-            if not folder.exists():
-                raise
-    except OSError as error:
-        raise UnirenderError(
-            f"{folder}: cannot be written ({error.strerror}); free some space or set UNIRENDER_CACHE"
-        ) from error
-    finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
 def _move_into_place(temporary: Path, path: Path) -> None:
     """Renames a folder to `path`, in place of the folder that may be there; where that fails, all is as before."""
     if not path.is_dir():

@@ -11,7 +11,7 @@ import pytest
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import intrinsics_channels, read_exr, write_exr
-from unirender.files import cached_folder, checkpoint_sha256, new_folder, read_result, replace_file, write_result
+from unirender.files import checkpoint_sha256, new_folder, read_result, replace_file, write_result
 from unirender.intrinsics import Intrinsics
 
 RNG = np.random.default_rng(0)
@@ -180,27 +180,6 @@ def test_damaged_results_are_named(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "none", "no folder and no EXR"), (tmp_path, r"has no intrinsics\.exr")):
         with pytest.raises(UnirenderError, match=words):
             read_result(path)
-
-
-def test_a_folder_of_the_cache_is_whole_or_not_there(tmp_path: Path) -> None:
-    folder = tmp_path / "cache" / "key"
-
-    def fails_halfway() -> None:
-        with cached_folder(folder) as made:
-            (made / "half").touch()
-            raise RuntimeError
-
-    with pytest.raises(RuntimeError):
-        fails_halfway()
-    assert list(folder.parent.iterdir()) == []
-    with cached_folder(folder) as slower, cached_folder(folder) as faster:
-        (slower / "slower").touch()
-        (faster / "faster").touch()
-    assert [path.name for path in folder.parent.rglob("*")] == ["key", "faster"]
-    (tmp_path / "file").touch()
-    message = r"cannot be written \(.*\); free some space or set UNIRENDER_CACHE"
-    with pytest.raises(UnirenderError, match=message), cached_folder(tmp_path / "file" / "key"):
-        pass
 
 
 def test_several_write_a_file_at_once(tmp_path: Path) -> None:

@@ -22,8 +22,7 @@ from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
-from unirender.files import cached_folder
-from unirender.paths import cache_dir
+from unirender.paths import cache_dir, cached_folder
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.groups import Group, Shard, read_groups
 

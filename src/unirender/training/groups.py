@@ -29,8 +29,8 @@ from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
-from unirender.files import cached_folder, file_sha256
-from unirender.paths import cache_dir
+from unirender.files import file_sha256
+from unirender.paths import cache_dir, cached_folder
 from unirender.training.environments import turned_environments
 
 PACK_VERSION = 1  # part of the cache's path: raise it when the packed layout changes
