@@ -17,7 +17,7 @@ from unirender.cli import main, read_light
 from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
+from unirender.shipped import checkpoint_folder
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
     f"{name}.png"
@@ -65,7 +65,7 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
         _, header = read_exr(tmp_path / "out" / name)
         expected = {"input": "ball.png", "mode": "mean", "seed": "0", "camera": "fov_deg=36 principal=0.5,0.5"}
         assert expected.items() <= header.items()
-        assert header["checkpoint_sha256"] == meta["checkpoint_sha256"] == checkpoint_sha256(SHIPPED_CHECKPOINT)
+        assert header["checkpoint_sha256"] == meta["checkpoint_sha256"] == checkpoint_sha256(checkpoint_folder())
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -381,7 +381,8 @@ def test_doctor_finds_a_working_backend(capsys: pytest.CaptureFixture[str]) -> N
     assert run("doctor") == 0
     text = capsys.readouterr().out
     assert "LLVM" in text
-    assert "shipped" in text
+    assert "checkpoints" in text
+    assert "tiny" in text
 
 
 def test_help_loads_nothing_heavy() -> None:

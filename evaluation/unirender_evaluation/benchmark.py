@@ -16,7 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.files import checkpoint_sha256, replace_file
+from unirender.shipped import checkpoint_folder
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.engine import Job, Store
@@ -73,7 +73,7 @@ class BenchConfig:
     Attributes:
         suite: name of a bundled suite, or path of a TOML file.
         out: folder of the run; an earlier run in it is continued.
-        checkpoint: folder of our model; None = the shipped one.
+        checkpoint: folder of our model, or the name of a shipped one; None = `tiny`.
         methods: groups of rows: ours; optimisation (each picture, and the multi-view table); trivial; plugins
             (installed). A stranger's row always brings the trivial ones.
         method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
@@ -121,11 +121,6 @@ class BenchResult:
     computed: int
 
 
-def shipped_checkpoint() -> Path:
-    """Folder of the checkpoint in the package."""
-    return Path(str(resources.files("unirender"))) / "checkpoints" / "tiny"
-
-
 def build_rows(config: BenchConfig) -> list[Row]:
     """The rows that a configuration asks for.
 
@@ -140,7 +135,7 @@ def build_rows(config: BenchConfig) -> list[Row]:
     if "ours" in config.methods:
         from unirender.models.precision import resolve_device
 
-        folder, device = config.checkpoint or shipped_checkpoint(), str(resolve_device(config.device))
+        folder, device = checkpoint_folder(config.checkpoint), str(resolve_device(config.device))
         pipeline = LazyPipeline(lambda: _load_pipeline(folder, device))
         rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
     if "optimisation" in config.methods and config.subsets.optimise != 0:
@@ -249,7 +244,7 @@ def anywhere(config: BenchConfig) -> BenchConfig:
     return replace(
         config,
         suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
-        checkpoint=None if config.checkpoint is None else config.checkpoint.resolve(),
+        checkpoint=None if config.checkpoint is None else checkpoint_folder(config.checkpoint).resolve(),
         predictions={name: folder.resolve() for name, folder in config.predictions.items()},
     )
 

@@ -20,7 +20,7 @@ class BenchPhysics:
     spp: int = 1024
     """Samples per pixel of Mitsuba's path tracer: its noise is the floor of the tests' values."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     device: Device = "cpu"
     """Where our model runs."""
 

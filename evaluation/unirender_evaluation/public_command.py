@@ -30,7 +30,7 @@ class BenchPublic:
     out: Path | None = None
     """Folder of the run; None: results/public-SET."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     methods: tuple[str, ...] = ("ours", "trivial", "plugins")
     """Groups of rows; plugins: what is installed. The trivial rows also run whenever there is a row of yours."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

@@ -7,7 +7,7 @@ from typing import Any
 from unirender.errors import UsageError
 from unirender.files import checkpoint_sha256
 from unirender.options import Device, ModelOptions
-from unirender_evaluation.benchmark import shipped_checkpoint
+from unirender.shipped import checkpoint_folder
 from unirender_evaluation.methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.pipeline_method import LazyPipeline, PipelineMethod
 from unirender_evaluation.plugins import installed_plugins, named_plugin
@@ -33,7 +33,7 @@ def public_rows(
         groups: ours, trivial, plugins (installed ones). A stranger's row always brings the trivial ones.
         methods: further methods, each `module:Class` or `path/to/file.py:Class`.
         predictions: name -> folder of somebody's predictions.
-        checkpoint: folder of our model; None = the shipped one.
+        checkpoint: folder of our model, or the name of a shipped one; None = `tiny`.
         device: where our model runs.
 
     Raises:
@@ -58,7 +58,7 @@ def our_rows(public: PublicSet, checkpoint: Path | None, device: Device) -> list
     from unirender.models.precision import resolve_device
 
     pipeline = LazyPipeline(ModelOptions(checkpoint, device, "float32", progress=False).load)
-    weights, place = checkpoint_sha256(checkpoint or shipped_checkpoint()), str(resolve_device(device))
+    weights, place = checkpoint_sha256(checkpoint_folder(checkpoint)), str(resolve_device(device))
     shared: dict[str, Any] = {}
     rows = []
     for name, anchored in (("Ours (mean)", False), ("Ours (mean, anchored)", True)):

@@ -15,12 +15,12 @@ import math
 import re
 import sys
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
+from unirender.shipped import checkpoint_folder
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
@@ -28,7 +28,6 @@ from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
 
 SHIPPED_SUITE = "tiny"
-SHIPPED = Path(str(resources.files("unirender"))) / "checkpoints" / "tiny"
 SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
     ("inverse", "single-image", "main"),
@@ -116,7 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--readme", type=Path, help="rewritten in place, between its comments `results` and `checkpoint`"
     )
-    parser.add_argument("--checkpoint", type=Path, default=SHIPPED, help="pipeline folder of the model that was scored")
+    parser.add_argument(
+        "--checkpoint", type=checkpoint_folder, default=checkpoint_folder(), help="of the model that was scored"
+    )
     parser.add_argument("--stored", type=Path, help="gets a folder by the suite's name: values, and a file per table")
     arguments = parser.parse_args(argv)
     try:

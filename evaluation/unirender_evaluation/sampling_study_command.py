@@ -21,7 +21,7 @@ class BenchSampling:
     out: Path = Path("results/sampling")
     """Folder of tables, plots and records."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     scenes: int = 16
     """Scenes, evenly spaced over the suite, a picture each."""
     steps: tuple[int, ...] = (1, 2, 4, 10, 20)
@@ -60,7 +60,7 @@ class BenchSampling:
         from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
-        from unirender_evaluation.benchmark import shipped_checkpoint
+        from unirender.shipped import checkpoint_folder
         from unirender_evaluation.pipeline_method import LazyPipeline
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.sampling_study import SamplingStudy
@@ -74,7 +74,7 @@ class BenchSampling:
             suite=suite,
             out=self.out,
             pipeline=LazyPipeline(options.load),
-            weights=checkpoint_sha256(self.checkpoint or shipped_checkpoint()),
+            weights=checkpoint_sha256(checkpoint_folder(self.checkpoint)),
             device=str(resolve_device(self.device)),
             steps=tuple(sorted(self.steps)),
             samples=tuple(sorted(self.samples)),

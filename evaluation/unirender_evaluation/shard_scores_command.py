@@ -18,7 +18,7 @@ class BenchShards:
     data: tuple[Path, ...] = field()
     """Folders that `unirender dataset` wrote: a row each."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     objects: int = 60
     """Drawn from each folder."""
     pairs: int = 2
@@ -49,11 +49,11 @@ class BenchShards:
         from rich.progress import track
 
         from unirender.files import checkpoint_sha256, replace_file
-        from unirender_evaluation.benchmark import shipped_checkpoint
+        from unirender.shipped import checkpoint_folder
         from unirender_evaluation.shard_scores import scored, shard_table
 
         console, errors = Console(), Console(stderr=True)
-        checkpoint = self.checkpoint or shipped_checkpoint()
+        checkpoint = checkpoint_folder(self.checkpoint)
         pipeline = ModelOptions(checkpoint, self.device, "float32", progress=False).load()
         found = []
         for folder in self.data:

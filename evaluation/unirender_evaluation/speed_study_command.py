@@ -36,7 +36,7 @@ class BenchSpeed:
     scenes: int = 3
     """Scenes of the part mitsuba, evenly spaced; the other parts take the first of them."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     preset: str = "tiny"
     """Of the part training: a row of `unirender.training.presets.PRESETS`."""
     device: Device = "cpu"
@@ -132,7 +132,7 @@ class BenchSpeed:
 
         from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device, resolve_dtype
-        from unirender_evaluation.benchmark import shipped_checkpoint
+        from unirender.shipped import checkpoint_folder
         from unirender_evaluation.versions import installed_version, versions
 
         device = resolve_device(self.device)
@@ -141,7 +141,7 @@ class BenchSpeed:
             ("threads of torch", str(torch.get_num_threads())),
             ("device", str(device)),
             ("dtype", str(resolve_dtype(self.dtype, device)).removeprefix("torch.")),
-            ("weights", checkpoint_sha256(self.checkpoint or shipped_checkpoint())[:12]),
+            ("weights", checkpoint_sha256(checkpoint_folder(self.checkpoint))[:12]),
             ("torch", installed_version("torch")),
             ("mitsuba", installed_version("mitsuba")),
             ("code", versions().code[:12]),

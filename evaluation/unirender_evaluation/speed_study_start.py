@@ -87,6 +87,7 @@ def cold_starts(
         turns: that count.
     """
     from unirender.files import write_png
+    from unirender.shipped import checkpoint_folder
 
     found = []
     with tempfile.TemporaryDirectory(prefix="unirender-start-") as name:
@@ -96,7 +97,7 @@ def cold_starts(
         (folder / "timer.py").write_text(TIMER)
         fov = f"{suite.spec.camera.fov_deg:g}"
         command = ["decompose", str(folder / "picture.png"), "--fov", fov, *options]
-        command += [] if checkpoint is None else ["--checkpoint", str(checkpoint.resolve())]
+        command += ["--checkpoint", str(checkpoint_folder(checkpoint).resolve())]
         for turn in range(turns + 1):
             bare = run_process(["-c", BARE], folder)
             outs = [str(folder / f"{kind}-{turn}") for kind in ("command", "split")]

@@ -32,7 +32,7 @@ class BenchWarmStart:
     )
     """What is known of the shape."""
     checkpoint: Path | None = None
-    """Folder of our model; None: the shipped tiny."""
+    """Folder of our model, or a shipped one by its name. None: tiny."""
     single: tyro.conf.AvoidSubcommands[SingleConfig] = field(default_factory=SingleConfig)
     """Of the optimisation, cold and warm."""
 

@@ -66,15 +66,15 @@ class Doctor:
         import unirender
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.paths import cache_dir
-        from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
+        from unirender.shipped import shipped_names
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 
         device = resolve_device("auto")
         rows = [("unirender", unirender.__version__, "ok"), *doctor()]
         rows.append(("torch device", f"{device}, {str(resolve_dtype('auto', device)).removeprefix('torch.')}", "ok"))
-        shipped = SHIPPED_CHECKPOINT.is_dir()
-        rows.append(("checkpoint tiny", "shipped" if shipped else "missing", "ok" if shipped else "error"))
+        shipped = shipped_names()
+        rows.append(("checkpoints", ", ".join(shipped) or "missing", "ok" if shipped else "error"))
         rows.append(("LPIPS backbones", ", ".join(available()), "ok"))
         rows.append(("cache", str(cache_dir()), "ok"))
         table = Table("what", "found", "status")

@@ -46,7 +46,7 @@ class ModelOptions:
     """Which model runs, and how."""
 
     checkpoint: Path | None = None
-    """Folder of a checkpoint (`unirender train` writes them); None: the shipped `tiny`."""
+    """Folder of a checkpoint (`unirender train` writes them), or a shipped one by its name. None: `tiny`."""
     device: Device = "auto"
     """auto: cuda, then mps, then cpu, whichever is there."""
     dtype: DType = "auto"
@@ -145,13 +145,13 @@ class ModelOptions:
         import unirender
         from unirender.diffusion.sampling import sampler_name, steps_of
         from unirender.files import checkpoint_sha256
-        from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT
+        from unirender.shipped import checkpoint_folder, checkpoint_label
 
         steps = steps_of(self.mode, self.steps)
         return {
             "unirender": unirender.__version__,
-            "checkpoint": self.checkpoint or "tiny (shipped)",
-            "checkpoint_sha256": checkpoint_sha256(self.checkpoint or SHIPPED_CHECKPOINT),
+            "checkpoint": checkpoint_label(self.checkpoint),
+            "checkpoint_sha256": checkpoint_sha256(checkpoint_folder(self.checkpoint)),
             "mode": self.mode,
             "seed": self.seed,
             "steps": steps,

@@ -12,8 +12,9 @@ from synthetic_shards import write_dataset
 from tiny_models import TRAIN
 
 from unirender.files import checkpoint_sha256
-from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT, UniRenderPipeline
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
+from unirender.shipped import checkpoint_folder
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.export import export_pipeline
 from unirender.training.source import ShardSource
@@ -94,7 +95,7 @@ def test_the_front_matter_is_that_of_a_model_card() -> None:
 
 
 def test_a_record_of_an_older_version_gives_a_shorter_card() -> None:
-    newer = json.loads((SHIPPED_CHECKPOINT / "training.json").read_text())
+    newer = json.loads((checkpoint_folder() / "training.json").read_text())
     older = {"steps", "samples", "minutes", "device", "autocast", "train", "continues"}
     facts = {name: value for name, value in newer.items() if name in older}
     facts["continues"] = [{name: run[name] for name in older & run.keys()} for run in newer["continues"]]

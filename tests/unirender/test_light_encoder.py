@@ -24,7 +24,8 @@ from unirender.models.conditioning import LIGHT, TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.light_encoder import LightEncoder, pad_sphere
 from unirender.models.split_streams import SplitDualStreamModel
-from unirender.pipelines.unirender_pipeline import SHIPPED_CHECKPOINT, UniRenderPipeline
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.shipped import checkpoint_folder
 from unirender.training.export import export_pipeline
 from unirender.training.losses import LossFunction
 from unirender.training.presets import PRESETS, LossConfig
@@ -328,7 +329,7 @@ def test_one_training_step_of_the_preset(tmp_path: Path) -> None:
 
 def test_a_checkpoint_without_the_entry_has_the_light_as_latents(tmp_path: Path) -> None:
     """Checkpoints may be older than the option."""
-    shutil.copytree(SHIPPED_CHECKPOINT, tmp_path / "older")
+    shutil.copytree(checkpoint_folder(), tmp_path / "older")
     path = tmp_path / "older" / "dual_stream" / "config.json"
     config = json.loads(path.read_text())
     del config["light"]

@@ -24,7 +24,7 @@ class Demo:
     port: int = 7860
     """Port to listen on."""
     checkpoint: Path | None = None
-    """Folder of a checkpoint (`unirender train` writes them); None: the shipped `tiny`."""
+    """Folder of a checkpoint (`unirender train` writes them), or a shipped one by its name. None: `tiny`."""
     device: Device = "auto"
     """Where the model runs. auto: cuda, then mps, then cpu, whichever is there."""
     max_megabytes: float = 32.0

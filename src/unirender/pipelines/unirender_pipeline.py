@@ -36,8 +36,7 @@ from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
 from unirender.pipelines.settings import Sampling, same_noise
-
-SHIPPED_CHECKPOINT = Path(__file__).parent.parent / "checkpoints" / "tiny"
+from unirender.shipped import checkpoint_folder, shipped_names
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
@@ -78,18 +77,20 @@ class UniRenderPipeline(DiffusionPipeline):
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
         cls, pretrained_model_name_or_path: str | Path | None = None, **kwargs: Any
     ) -> "UniRenderPipeline":
-        """Loads a pipeline folder; the shipped `tiny` without one. Weights become float32 without `torch_dtype`.
+        """Loads a pipeline folder, or a shipped checkpoint by its name (`tiny` without one). Weights become float32
+        without `torch_dtype`.
 
         Raises:
             UnirenderError: no such folder, or no pipeline in it.
         """
-        path = Path(pretrained_model_name_or_path or SHIPPED_CHECKPOINT)
+        path = checkpoint_folder(pretrained_model_name_or_path)
         if not (path / "model_index.json").is_file():
             inside = path / "pipeline"
             if (inside / "model_index.json").is_file():
                 raise UnirenderError(f"{path}: is the folder of a training run; its pipeline is {inside}")
             raise UnirenderError(
-                f"{path}: no pipeline folder (model_index.json is missing), expected one written by `unirender train`"
+                f"{path}: no pipeline folder (model_index.json is missing), expected one written by `unirender train`, "
+                f"or one of the names {', '.join(shipped_names())}"
             )
         old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs

@@ -17,6 +17,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.shipped import checkpoint_folder
 from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
@@ -61,7 +62,7 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
 
     Args:
         config: the network.
-        init: folder of a trained pipeline.
+        init: folder of a trained pipeline, or the name of a shipped one.
         init_from: Stable Diffusion folder.
 
     Raises:
@@ -73,6 +74,7 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
         return Start(diffusion=diffusion)
     if init is None:
         return Start()
+    init = checkpoint_folder(init)
     pipeline = UniRenderPipeline.from_pretrained(init)
     codec = pipeline.dual_stream.config["codec"]
     if codec != config.codec:
