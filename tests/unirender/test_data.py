@@ -1,5 +1,6 @@
 """The reader: order and resume, nothing merged or lost, shapes and ranges, packing and its errors."""
 
+import dataclasses
 import itertools
 import json
 import shutil
@@ -363,6 +364,24 @@ def test_draws_cover_what_the_config_allows() -> None:
     assert len(plain.lights) == 1
     assert (plain.weights == 1).all()
     assert (plain.order, plain.turns, plain.mirror, plain.exposure_target) == ((0, 1, 2), 0, False, None)
+    assert plain.paint is None
+    painting = dataclasses.replace(NO_AUGMENTATION, repaint=0.5)
+    paints = [draw(rng, painting, lights=4, roughnesses=3, groups=3).paint for _ in range(100)]
+    assert set(paints) == {None, 0, 1, 2}
+
+
+def test_repainted_samples_differ_in_picture_and_albedo_only(dataset: GroupDataset) -> None:
+    painting = dataclasses.replace(DEFAULT_AUGMENTATION, repaint=1.0)
+    changed = []
+    for index in range(12):
+        plain, painted = (dataset.sample(index, 5, config) for config in (DEFAULT_AUGMENTATION, painting))
+        same = {name: np.array_equal(value, painted[name]) for name, value in plain.items()}
+        assert all(equal for name, equal in same.items() if name not in ("image", "albedo")), same
+        assert np.isfinite(painted["image"]).all()
+        assert painted["image"].min() >= 0
+        assert ((painted["albedo"] >= 0) & (painted["albedo"] <= 1)).all()
+        changed.append(not same["image"] and not same["albedo"])
+    assert sum(changed) >= 6  # the others took their own colour on
 
 
 def test_turned_environments_agree_with_the_rotation() -> None:

@@ -102,10 +102,11 @@ class Draw:
     mirror: bool = False
     exposure_target: float | None = None  # None: the stored exposure
     derived: bool = False  # whether s and d come without shadows, too
+    paint: int | None = None  # number of the group whose mean colour the object takes on; None: it keeps its own
 
 
-def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesses: int) -> Draw:
-    """Draws an augmentation for a group of `lights` lights and `roughnesses` stored roughness values."""
+def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesses: int, groups: int = 1) -> Draw:
+    """Draws an augmentation for one of `groups` groups, which has so many lights and stored roughness values."""
     on = 1
     if rng.random() < config.mix and min(lights, config.max_lights) > 1:
         on = int(rng.integers(2, min(lights, config.max_lights) + 1))
@@ -121,7 +122,10 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
     flip = bool(rng.random() < config.mirror)
     target = draw_target(rng) if config.expose else None
     level = int(rng.integers(roughnesses))
-    derived = bool(config.derived) and bool(rng.random() < config.derived)  # last: without it nothing else changes
+    # last, and only where asked for: without them nothing else changes
+    derived = bool(config.derived) and bool(rng.random() < config.derived)
+    painted = bool(config.repaint) and bool(rng.random() < config.repaint)
+    paint = int(rng.integers(groups)) if painted else None
     return Draw(
         lights=chosen,
         weights=(share * tint).astype(np.float32),
@@ -132,6 +136,7 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
         mirror=flip,
         exposure_target=target,
         derived=derived,
+        paint=paint,
     )
 
 

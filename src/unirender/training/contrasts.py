@@ -72,7 +72,7 @@ class ContrastDataset(GroupDataset):
         epoch, place = divmod(index, len(self))
         group, pair = self._items[self._order(seed, epoch)[place]]
         rng = np.random.default_rng([seed, 1, index // self.run_length])
-        return self.augmented(group, pair, draw(rng, augmentation, 1, 1))
+        return self.augmented(group, pair, draw(rng, augmentation, 1, 1, len(self._groups)))
 
     @functools.lru_cache(maxsize=4)  # noqa: B019 - a dataset lives as long as the training that reads it
     def _order(self, seed: int, epoch: int) -> Int[np.ndarray, " items"]:

@@ -35,6 +35,7 @@ from unirender.training.augment import (
 from unirender.training.derived import DerivedLight, open_derived
 from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed
 from unirender.training.presets import Augmentation
+from unirender.training.repaint import mean_colour, recoloured, repaint
 
 DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d without shadows, where `derived` is 1
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
@@ -149,10 +150,9 @@ class GroupDataset:
         epoch, place = divmod(index, len(self))
         group, pair = self._items[self._order(seed, epoch)[place]]
         rng = np.random.default_rng([seed, 1, index])
-        if pair is None:
-            basis = self._basis[group]
-            return self.augmented(group, None, draw(rng, augmentation, len(basis.diffuse), len(basis.roughness)))
-        return self.augmented(group, pair, draw(rng, augmentation, 1, 1))
+        basis = None if pair is not None else self._basis[group]
+        lights, roughnesses = (len(basis.diffuse), len(basis.roughness)) if basis else (1, 1)
+        return self.augmented(group, pair, draw(rng, augmentation, lights, roughnesses, len(self._groups)))
 
     def augmented(self, group: int, pair: Pair | None, drawn: Draw) -> Maps:
         """A basis group (`pair` None) or a pair of another group under the augmentation `drawn`.
@@ -174,6 +174,8 @@ class GroupDataset:
             environment = shard.environment[pair.light, drawn.turns][None]
         maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
         maps = mix_lights(_with_material(maps, metallic, roughness), drawn.weights)
+        if drawn.paint is not None:
+            maps = repaint(maps, recoloured(maps["albedo"], maps["mask"], self._mean_colour(drawn.paint)))
         maps = quarter_turn(maps, drawn.turns)
         maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)  # stored under each quarter turn
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
@@ -182,6 +184,11 @@ class GroupDataset:
             factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
         light = self._derived_light(group, rows, drawn) if drawn.derived else None
         return scale_light(maps, factor) | self._named_derived(light, factor, maps["diffuse"])
+
+    @functools.cache  # noqa: B019 - a dataset lives as long as the training that reads it
+    def _mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
+        maps = _shared_maps(*self._groups[group])
+        return mean_colour(maps["albedo"], maps["mask"])
 
     def _derived_light(self, group: int, rows: Mapping[str, Rows], drawn: Draw) -> Maps:
         """s and d without shadows of what stands in `rows`, under the same augmentation but for the exposure.

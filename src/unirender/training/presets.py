@@ -77,7 +77,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How often each exact augmentation is drawn, and how strongly; see `unirender.training.augment`."""
+    """How often each augmentation is drawn, and how strongly; see `unirender.training.augment` and `.repaint`."""
 
     mix: float = 0.5  # probability that more than one light of a basis group is on
     max_lights: int = 3  # most lights in a mixture
@@ -88,6 +88,7 @@ class Augmentation:
     turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
     expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
     derived: float = 0.0  # probability that a renderer sees s and d derived from the light, without shadows
+    repaint: float = 0.0  # probability that an object takes on another's mean colour; close, not exact
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,14 @@ _TINY = TrainConfig(
 # Two of these have as many weights as `tiny`: each has two encoders and the decoder of its own direction.
 _HALF_TINY = dataclasses.replace(
     _TINY.model, unified=False, block_out_channels=(56, 64, 80, 104), attention_head_dim=(4, 4, 4, 4), norm_num_groups=8
+)
+_TINY_RENDERER = dataclasses.replace(
+    _TINY,
+    model=dataclasses.replace(_TINY.model, derived_light=True),
+    augmentation=dataclasses.replace(_TINY.augmentation, derived=0.3),
+    loss=dataclasses.replace(_TINY.loss, composite=1.0, image=20.0, image_floor=1e-3),
+    optimizer=OptimizerConfig(kind="muon"),
+    p_render=0.4,
 )
 _SD_MODEL = ModelConfig(
     resolution=512,
@@ -161,19 +170,18 @@ PRESETS: dict[str, TrainConfig] = {
         optimizer=OptimizerConfig(kind="muon"),
         p_render=0.25,
     ),
-    "tiny_renderer": dataclasses.replace(
-        _TINY,
-        model=dataclasses.replace(_TINY.model, derived_light=True),
-        augmentation=dataclasses.replace(_TINY.augmentation, derived=0.3),
-        loss=dataclasses.replace(_TINY.loss, composite=1.0, image=20.0, image_floor=1e-3),
-        optimizer=OptimizerConfig(kind="muon"),
-        p_render=0.4,
-    ),
+    "tiny_renderer": _TINY_RENDERER,
     "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
-    "small": dataclasses.replace(
+    "small": dataclasses.replace(  # the network of `tiny_renderer`, whose weights it can begin with
+        _TINY_RENDERER,
+        model=dataclasses.replace(_TINY_RENDERER.model, resolution=128),
+        augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
+        p_render=0.25,
+    ),
+    "medium": dataclasses.replace(
         _TINY,
         model=ModelConfig(resolution=128, block_out_channels=(96, 128, 192, 256), layers_per_block=2),
         optimizer=OptimizerConfig(learning_rate=5e-4, ema_decay=0.9995),

@@ -29,9 +29,11 @@ class Train:
     data: Path
     """Folder that `unirender dataset` wrote."""
     preset: str = "tiny"
-    """Row of `unirender.training.presets.PRESETS`: tiny, small, sd15, sd21, paper, and ablations of tiny by name."""
+    """Row of `unirender.training.presets.PRESETS`: tiny, small, medium, sd15, sd21, paper, and
+    ablations of tiny by name."""
     init: Path | None = None
-    """Begin with the weights of this pipeline folder instead of random ones; its network must be the preset's."""
+    """Begin with the weights of this pipeline folder, or of a shipped one by its name, instead of random ones; its
+    network must be the preset's."""
     init_from: Path | None = None
     """Begin with the weights of this Stable Diffusion folder (version 1 or 2, diffusers format) and work on the latents
     of its autoencoder; for the presets sd15, sd21 and paper."""
