@@ -11,15 +11,16 @@ a study, say on other data, a file of its own.
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.optimiser_study_ingredients import ingredients
 from unirender_evaluation.speed_study_parts import PARTS
-from unirender_evaluation.training_study import training_choices
+from unirender_evaluation.training_study import BASE_PRESET, training_choices
 
 PLOT_FOLDER = "_static"
 HEADING = "### "  # of a table: pages include it below a heading of the second level
@@ -52,25 +53,26 @@ class Study:
         tables: file of its tables, in the folder that it writes; no two studies have the same.
         piece: file of the documentation that a page includes.
         plots: below the tables.
-        rows: gives the names of all rows, or parts, that options can choose from; None: there are no such options.
+        rows: gives the names of all rows, or parts, that options can choose from, of what the study's JSON says of its
+            run; None: there are no such options.
     """
 
     tables: str
     piece: str
     plots: tuple[Plot, ...] = ()
-    rows: Callable[[], Sequence[str]] | None = None
+    rows: Callable[[Mapping[str, Any]], Sequence[str]] | None = None
 
 
-def _choices() -> list[str]:
-    return [choice.name for choice in training_choices()]
+def _choices(run: Mapping[str, Any]) -> list[str]:
+    return [choice.name for choice in training_choices(preset=run.get("preset", BASE_PRESET))]
 
 
-def _ingredients() -> list[str]:
+def _ingredients(run: Mapping[str, Any]) -> list[str]:
     return [ingredient.name for ingredient in ingredients()]
 
 
 STUDIES = (
-    Study("speed.md", "_speed.md", rows=lambda: PARTS),
+    Study("speed.md", "_speed.md", rows=lambda run: PARTS),
     Study(
         "sampling.md",
         "_sampling.md",
@@ -125,9 +127,10 @@ def missing(folder: Path, study: Study) -> list[str]:
         content = json.loads(path.read_text(encoding="utf-8"))
         rows = content.get("rows", content)
         found = {row["name"] for row in rows} if isinstance(rows, list) else set(rows)
+        possible = study.rows(content.get("run", {}))
     except (OSError, ValueError, AttributeError, TypeError, KeyError) as error:
         raise UnirenderError(f"{path}: cannot be read as what the study wrote ({error}); run it again") from error
-    return [name for name in study.rows() if name not in found]
+    return [name for name in possible if name not in found]
 
 
 def pieces(folder: Path, partial: bool = False, piece: str | None = None) -> dict[str, str | bytes]:

@@ -147,6 +147,16 @@ def test_the_rows_of_a_study_are_those_of_its_json(name: str, all_rows: Sequence
         missing(tmp_path, study_of(tmp_path))
 
 
+def test_a_row_that_another_preset_does_not_have_is_not_missing(tmp_path: Path) -> None:
+    """`tiny_muon` steps by Muon as it is: the row `muon` would be its first."""
+    (tmp_path / "training.md").write_text(TABLE.markdown())
+    content = {"rows": {"plain": 0, "no-cycle": 0}, "run": {"preset": "tiny_muon"}}
+    (tmp_path / "training.json").write_text(json.dumps(content))
+    absent = missing(tmp_path, study_of(tmp_path))
+    assert {"seed", "patch-1"} <= set(absent)
+    assert not {"muon", "plain", "no-cycle"} & set(absent)
+
+
 def test_the_names_are_those_that_the_studies_write() -> None:
     """Of those that keep their name in one place."""
     named = (derived_light_study_run, sampling_study_run, speed_study_run, training_study_run, unknown_mesh_run)
