@@ -14,7 +14,7 @@ from tiny_models import TRAIN
 from unirender.files import checkpoint_sha256
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, shipped_names
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.export import export_pipeline
 from unirender.training.source import ShardSource
@@ -35,7 +35,15 @@ FACTS: dict[str, Any] = {
     "scores": {"albedo.psnr": 19.25},
     "scored_on": "4 scenes of the suite tiny",
     "train": {"model": {"resolution": 64, "codec": "pixel"}, "batch_size": 24},
-    "continues": [{"preset": "tiny_plain", "steps": 10, "samples": 240, "minutes": 0.5}],
+    "continues": [
+        {
+            "preset": "tiny_plain",
+            "steps": 10,
+            "samples": 240,
+            "minutes": 0.5,
+            "train": {"model": {"resolution": 32}},
+        }
+    ],
     "stored_as": "float16",
 }
 CHOSEN: dict[str, Any] = {
@@ -56,7 +64,7 @@ SAID = {
     "scores": "| albedo.psnr | 19.25 |",
     "scored_on": "Measured on 4 scenes of the suite tiny",
     "train": "| model | resolution 64, codec pixel |",
-    "continues": "| 1 | `tiny_plain`, 10 steps, 240 samples, 0.5 minutes |",
+    "continues": "| 1 | `tiny_plain`, 10 steps, 240 samples, 0.5 minutes, 32 x 32 pixels |",
     "stored_as": "| weights stored as | float16 |",
 }
 
@@ -106,6 +114,12 @@ def test_a_record_of_an_older_version_gives_a_shorter_card() -> None:
     assert "averaged" not in card
     averaged = newer | {"averaged": {"this run": 0.75, "the run before": 0.25}}
     assert "0.75 of this run, 0.25 of the run before" in card_text("tiny", averaged)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_every_shipped_checkpoint_has_the_card_of_its_facts(name: str) -> None:
+    folder = checkpoint_folder(name)
+    assert (folder / CARD_FILE).read_text() == card_text(name, json.loads((folder / "training.json").read_text()))
 
 
 def test_every_exported_pipeline_has_its_card(tmp_path: Path) -> None:

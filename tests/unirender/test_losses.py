@@ -126,6 +126,21 @@ def test_an_image_error_is_compressed_row_by_row() -> None:
     assert values(loss, t)["image"] < values(plain, t)["image"]
 
 
+def test_albedo_and_light_are_compressed_picture_by_picture_and_nothing_else_is() -> None:
+    errors = Errors(loss_function().conditioning, background=0.02)
+    mask, clean = make_batch()["mask"], torch.zeros(4, 72, 16, 16)
+    predicted = clean + torch.linspace(0.01, 0.5, 4)[:, None, None, None]
+    terms = errors.attributes(predicted, clean, mask, floor=0.02)
+    squares = [float(value) ** 2 for value in predicted[:, 0, 0, 0]]
+    for name in ("albedo", "specular", "diffuse"):
+        assert float(terms[name]) == pytest.approx(sum(0.02 * math.log1p(e / 0.02) for e in squares) / 4, rel=1e-4)
+    plain = errors.attributes(predicted, clean, mask)
+    for name in ("normal", "material", "environment"):
+        assert float(terms[name]) == float(plain[name]) > 0.05
+    floored, squared = (values(loss_function(colour_floor=floor), inverse()) for floor in (0.02, 0.0))
+    assert floored["albedo"] < squared["albedo"]
+
+
 def test_total_is_the_weighted_sum() -> None:
     loss = loss_function(albedo=3.0, cycle=2.0)
     loss.cycle_scale = 0.5

@@ -127,6 +127,8 @@ def _history(runs: Iterable[Facts]) -> list[str]:
         facts = [f"`{run['preset']}`"] if "preset" in run else []
         facts += [f"Stable Diffusion's weights, `{run['stable_diffusion']}`"] if "stable_diffusion" in run else []
         facts += [f"{run[name]:,} {name}" for name in ("steps", "samples", "minutes") if name in run]
+        pixels = run.get("train", {}).get("model", {}).get("resolution")
+        facts += [f"{pixels} x {pixels} pixels"] if pixels else []
         facts += [f"data {_data(run['data'])}"] if "data" in run else []
         rows[str(number)] = ", ".join(facts)
     return _table(rows, ("run", "facts"))

@@ -41,7 +41,7 @@ RANGES: dict[str, Range] = {
     **{f"loss.{name}": _NOT_NEGATIVE for name in ("material", "albedo", "normal", "specular", "diffuse")},
     **{
         f"loss.{name}": _NOT_NEGATIVE
-        for name in ("environment", "image", "image_floor", "background", "cycle", "composite")
+        for name in ("environment", "image", "image_floor", "colour_floor", "background", "cycle", "composite")
     },
     "loss.snr_bound": Range(1),  # the weight's floor
     **dict.fromkeys(("optimizer.learning_rate", "optimizer.clip_norm"), _POSITIVE),

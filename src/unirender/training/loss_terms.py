@@ -16,6 +16,7 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 
+COLOURS = ("albedo", "specular", "diffuse")  # the attribute pictures that are scored by PSNR
 LossTerms = dict[str, Float[Tensor, ""]]
 
 
@@ -99,10 +100,7 @@ class Errors:
         """
         weights = self.conditioning.codec.weights(self.pixel_weights(mask))
         error = (predicted.float() - clean).square()
-        if not floor:
-            return weighted_mean(_by_row(error, rows), weights)
-        own = compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor)
-        return (own if rows is None else own * rows).mean()
+        return _decibels(error, weights, rows, floor) if floor else weighted_mean(_by_row(error, rows), weights)
 
     def attributes(
         self,
@@ -110,13 +108,20 @@ class Errors:
         clean: Float[Tensor, "b nc h w"],
         mask: Float[Tensor, "b 1 H W"],
         rows: Float[Tensor, " b"] | None = None,
+        floor: float = 0.0,
     ) -> LossTerms:
-        """Of each of the six pictures; the light's pixels all count alike."""
+        """Of each of the six pictures; the light's pixels all count alike.
+
+        `rows` is as in `image`, and so is `floor`, for the pictures in `COLOURS` only.
+        """
         weights = self.conditioning.codec.weights(self.pixel_weights(mask))
-        error = _by_row((predicted.float() - clean).square(), rows).chunk(len(TRIPLETS), dim=1)
-        terms = dict(zip(TRIPLETS, error, strict=True))
-        lit = terms.pop("environment").mean()
-        return {name: weighted_mean(e, weights) for name, e in terms.items()} | {"environment": lit}
+        error = (predicted.float() - clean).square()
+        squares = _by_picture(_by_row(error, rows))
+        lit = squares.pop("environment").mean()
+        terms = {name: weighted_mean(e, weights) for name, e in squares.items()}
+        if floor:
+            terms |= {name: _decibels(_by_picture(error)[name], weights, rows, floor) for name in COLOURS}
+        return terms | {"environment": lit}
 
 
 def compressed(error: Float[Tensor, " b"], floor: float) -> Float[Tensor, " b"]:
@@ -133,6 +138,17 @@ def weighted_mean(error: Float[Tensor, "b c h w"], weights: Float[Tensor, "b c h
     return (error * weights).sum() / weights.sum()
 
 
+def _decibels(
+    error: Float[Tensor, "b c h w"],
+    weights: Float[Tensor, "b c h w"],
+    rows: Float[Tensor, " b"] | None,
+    floor: float,
+) -> Float[Tensor, ""]:
+    """The mean of the samples' errors, each of them `compressed`."""
+    own = compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor)
+    return (own if rows is None else own * rows).mean()
+
+
 def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
     """Gaussian noise drawn on the CPU, so that a seed means the same on every device."""
     return torch.randn(x.shape, generator=generator).to(x)
@@ -140,3 +156,7 @@ def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
 
 def _by_row(error: Float[Tensor, "b c h w"], rows: Float[Tensor, " b"] | None) -> Float[Tensor, "b c h w"]:
     return error if rows is None else error * rows[:, None, None, None]
+
+
+def _by_picture(x: Float[Tensor, "b nc h w"]) -> dict[str, Float[Tensor, "b c h w"]]:
+    return dict(zip(TRIPLETS, x.chunk(len(TRIPLETS), dim=1), strict=True))

@@ -85,7 +85,9 @@ class LossFunction:
             rows = _Rows(span_a, noisy_a)
             weights = self._timestep_weights(rows.of(timesteps.attributes))
             predicted = rows.of_decoded(output.attributes)
-            terms |= errors.attributes(predicted, rows.of(clean_a), rows.of(batch["mask"]), weights)
+            terms |= errors.attributes(
+                predicted, rows.of(clean_a), rows.of(batch["mask"]), weights, self.config.colour_floor
+            )
             inverse = _Rows(span_a, noisy_a & ~noisy_i)
             part = {name: inverse.of(batch[name]) for name in ("image", "mask")}
             predicted = inverse.of_decoded(output.attributes).float()

@@ -48,6 +48,7 @@ class LossConfig:
     environment: float = 0.5
     image: float = 4.0
     image_floor: float = 0.0  # squared error of an image above which its logarithm counts; 0: the squared error itself
+    colour_floor: float = 0.0  # the same of albedo, s and d, each
     background: float = 0.02  # weight of a pixel outside the mask, beside 1 inside
     cycle: float = 1.0  # weight of the re-rendered image; 0: no cycle pass
     cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
@@ -178,6 +179,7 @@ PRESETS: dict[str, TrainConfig] = {
     "small": dataclasses.replace(  # the network of `tiny_renderer`, whose weights it can begin with
         _TINY_RENDERER,
         model=dataclasses.replace(_TINY_RENDERER.model, resolution=128),
+        loss=dataclasses.replace(_TINY_RENDERER.loss, colour_floor=1e-2, albedo=8.0, specular=6.0, diffuse=8.0),
         augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
         p_render=0.25,
     ),
