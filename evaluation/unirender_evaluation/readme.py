@@ -20,7 +20,7 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, shipped_names
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
@@ -66,20 +66,29 @@ def fill(readme: str, name: str, text: str) -> str:
 
 
 def checkpoint_text(folder: Path) -> str:
-    """What the shipped checkpoint was trained on, from the files that the training wrote beside its weights."""
+    """What a shipped checkpoint was trained on, from the files that the training wrote beside its weights."""
     facts = json.loads((folder / "training.json").read_text())
     runs = [*facts.get("continues", []), facts]
     minutes, steps, samples = (sum(run[name] for run in runs) for name in ("minutes", "steps", "samples"))
+    pixels = [run.get("train", facts["train"])["model"]["resolution"] for run in runs]
     parts = f" in {len(runs)} runs, each from the weights of the one before" if len(runs) > 1 else ""
+    if len(set(pixels)) > 1:
+        own = [run["minutes"] for run, size in zip(runs, pixels, strict=True) if size == pixels[-1]]
+        parts += f", {sum(own):.0f} minutes of them at {pixels[-1]} pixels, those before at {pixels[0]}"
     parameters = 0
     for path in folder.rglob("*.safetensors"):
         with safe_open(path, framework="numpy") as weights:
             parameters += sum(math.prod(weights.get_slice(name).get_shape()) for name in weights.keys())  # noqa: SIM118 - no dict
     return (
-        f"The shipped checkpoint has {parameters / 1e6:.1f} million parameters. It was trained for "
+        f"- `{folder.name}`, {pixels[-1]} pixels: {parameters / 1e6:.1f} million parameters. It was trained for "
         f"{minutes:.0f} minutes on {facts['device']} ({facts['autocast']}): {steps:,} steps, {samples:,} samples"
-        f"{parts}, at {facts['train']['model']['resolution']} pixels."
+        f"{parts}."
     )
+
+
+def pixels_of(folder: Path) -> int:
+    """The size that a checkpoint was trained at."""
+    return json.loads((folder / "training.json").read_text())["train"]["model"]["resolution"]
 
 
 def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = SHOWN) -> str:
@@ -116,7 +125,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--readme", type=Path, help="rewritten in place, between its comments `results` and `checkpoint`"
     )
     parser.add_argument(
-        "--checkpoint", type=checkpoint_folder, default=checkpoint_folder(), help="of the model that was scored"
+        "--checkpoint",
+        type=checkpoint_folder,
+        nargs="+",
+        default=[checkpoint_folder(name) for name in shipped_names()],
+        help="checkpoints to list in the README; those that ship if none is named",
     )
     parser.add_argument("--stored", type=Path, help="gets a folder by the suite's name: values, and a file per table")
     arguments = parser.parse_args(argv)
@@ -129,7 +142,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
             slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
             text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")
-            arguments.readme.write_text(fill(text, "checkpoint", checkpoint_text(arguments.checkpoint)))
+            facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=pixels_of)))
+            arguments.readme.write_text(fill(text, "checkpoint", facts))
         if arguments.stored:
             store(arguments.stored / suite, results, tables)
     except (UnirenderError, OSError) as error:

@@ -127,10 +127,13 @@ def test_a_readme_without_one_place_for_a_text_is_refused(text: str) -> None:
         readme.fill(text, "a", "table")
 
 
-def test_the_projects_own_readme_has_its_places() -> None:
-    text = (Path(__file__).resolve().parents[2] / "README.md").read_text()
-    for name in ("results", "checkpoint"):
-        assert "filled" in readme.fill(text, name, "filled")
+def test_the_projects_own_readme_shows_the_stored_results_and_the_shipped_checkpoints(tmp_path: Path) -> None:
+    own = (Path(__file__).resolve().parents[2] / "README.md").read_text()
+    target = tmp_path / "README.md"
+    target.write_text(own)
+    for folder in STORED.iterdir():
+        assert readme.main([str(folder), "--readme", str(target)]) == 0
+    assert target.read_text() == own
 
 
 def test_the_figures_of_a_continued_checkpoint_are_those_of_all_its_runs(tmp_path: Path) -> None:
@@ -140,3 +143,13 @@ def test_the_figures_of_a_continued_checkpoint_are_those_of_all_its_runs(tmp_pat
     (folder / "training.json").write_text(json.dumps(facts | {"continues": [earlier, earlier]}))
     text = readme.checkpoint_text(folder)
     assert "101 minutes on cpu (bfloat16): 6,000 steps, 60,000 samples in 3 runs" in text
+    assert text.startswith("- `checkpoint`, 64 pixels: 2.5 million parameters")
+    assert text.count("pixels") == 1
+    larger = {"train": {"model": {"resolution": 128}}, "continues": [earlier | {"train": facts["train"]}]}
+    (folder / "training.json").write_text(json.dumps(facts | larger))
+    text = readme.checkpoint_text(folder)
+    assert "- `checkpoint`, 128 pixels" in text
+    assert (
+        "in 2 runs, each from the weights of the one before, 61 minutes of them at 128 pixels, those before at 64"
+        in text
+    )
