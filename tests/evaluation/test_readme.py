@@ -90,15 +90,21 @@ def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("suite", sorted(path.name for path in STORED.iterdir()))
-def test_the_projects_tables_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
+def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
+    own = (STORED.parents[1] / "README.md").read_text()
+    target = tmp_path / "README.md"
+    target.write_text(own)
     # In a process of its own: the checks of every call that tests run under take ten times as long as the work.
-    command = [sys.executable, "-m", "unirender_evaluation.readme", str(STORED / suite), "--stored", str(tmp_path)]
-    subprocess.run(command, check=True)
+    options = ["--readme", str(target), "--stored", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", "unirender_evaluation.readme", str(STORED / suite), *options], check=True)
     folders = STORED / suite, tmp_path / suite
     committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
-    assert committed == made, (
-        "make them again: python -m unirender_evaluation.readme evaluation/results/SUITE --stored evaluation/results"
+    again = (
+        "make them again: python -m unirender_evaluation.readme evaluation/results/SUITE --readme README.md "
+        "--stored evaluation/results"
     )
+    assert committed == made, again
+    assert target.read_text() == own, again
 
 
 def test_a_method_without_values_gets_no_row(tmp_path: Path) -> None:
@@ -125,15 +131,6 @@ def test_a_partial_run_is_refused_and_the_readme_untouched(tmp_path: Path, capsy
 def test_a_readme_without_one_place_for_a_text_is_refused(text: str) -> None:
     with pytest.raises(UnirenderError, match="README"):
         readme.fill(text, "a", "table")
-
-
-def test_the_projects_own_readme_shows_the_stored_results_and_the_shipped_checkpoints(tmp_path: Path) -> None:
-    own = (Path(__file__).resolve().parents[2] / "README.md").read_text()
-    target = tmp_path / "README.md"
-    target.write_text(own)
-    for folder in STORED.iterdir():
-        assert readme.main([str(folder), "--readme", str(target)]) == 0
-    assert target.read_text() == own
 
 
 def test_the_figures_of_a_continued_checkpoint_are_those_of_all_its_runs(tmp_path: Path) -> None:
