@@ -41,6 +41,7 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         linear_projection=config.linear_projection,
         codec=config.codec,
         patch=config.patch,
+        picture_features=config.picture_features,
         **recorded,
     )
     if config.physics_prior != "none":

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.models.modeling_utils import ModelMixin
 from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
@@ -21,8 +22,10 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from unirender.models.light_encoder import LightEncoder
+from unirender.models.picture_features import Added, PictureFeatures
 
 ALL_ROWS = slice(None)
+FEATURES = ("none", "vgg16")  # what a clean image enters through besides the image stream's own encoder
 
 
 @dataclass
@@ -33,17 +36,20 @@ class Encoded:
         features: its feature pyramid: skips, then mid.
         time: its time embedding.
         context: what its cross-attention saw: the prompt and, of a light with an encoder of its own, the tokens.
+        summary: of a clean image's features, which comes to the time embedding of the other stream's decoder.
     """
 
     features: tuple[Tensor, ...]
     time: Tensor
     context: Tensor
+    summary: Tensor | None = None
 
     def __getitem__(self, rows: slice) -> "Encoded":
         """The same for some samples of the batch."""
         if rows == ALL_ROWS:
             return self
-        return Encoded(tuple(f[rows] for f in self.features), self.time[rows], self.context[rows])
+        summary = None if self.summary is None else self.summary[rows]
+        return Encoded(tuple(f[rows] for f in self.features), self.time[rows], self.context[rows], summary)
 
 
 @dataclass
@@ -115,6 +121,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
         light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
         derived_light: bool = False,  # s and d that were derived from a light, without shadows, have their own flag
+        picture_features: str = "none",  # "vgg16": a clean image also enters through frozen features of ImageNet
     ):
         super().__init__()
         if not set(attention_levels) <= set(range(len(block_out_channels))):
@@ -139,6 +146,15 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         self.image_extra = zero_conv(image_extra_channels, width, 3) if image_extra_channels else None
         rows, columns = environment_size
         self.light_encoder = LightEncoder((rows, columns), cross_attention_dim) if light == "encoder" else None
+        if picture_features not in FEATURES or (picture_features != "none" and codec != "pixel"):
+            raise ValueError(
+                f"picture_features {picture_features!r} with codec {codec!r}: expected one of {', '.join(FEATURES)}, "
+                "and 'none' where the streams see an autoencoder's latents"
+            )
+        self.patch, vgg = patch, picture_features == "vgg16"
+        entering = (width, *block_out_channels[:-1])  # channels that come into each level of the encoder
+        time_width = self.attribute_unet.time_embedding.linear_2.out_features
+        self.vgg = PictureFeatures(entering, patch, time_width) if vgg else None
         self.register_buffer("prompt_embedding", torch.ones(1, prompt_tokens, cross_attention_dim))
         self.prompt_embedding: Tensor
 
@@ -176,7 +192,8 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         if isinstance(a, Tensor):
             a = self.encode(self.attribute_unet, a, attributes_timestep, context, attribute_extra, self.attribute_extra)
         if isinstance(i, Tensor):
-            i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra)
+            added = self.features_of(i, image_timestep)
+            i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra, added)
         output = DualStreamOutput()
         if attribute_rows is not None:
             seen = output.encoded_image = i[attribute_rows]
@@ -201,6 +218,13 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         prompt = self.prompt_embedding.to(image.dtype).expand(len(image), -1, -1)
         return prompt if self.light_encoder is None else torch.cat([prompt, self.light_encoder(light)], dim=1)
 
+    def features_of(self, image: Float[Tensor, "b ci h w"], timestep: Int[Tensor, " b"]) -> Added | None:
+        """What the features of clean images add; None without any."""
+        clean = timestep == 0
+        if self.vgg is None or not clean.any():
+            return None
+        return self.vgg(F.pixel_shuffle(image, self.patch), clean)
+
     def encode(
         self,
         unet: UNet2DConditionModel,
@@ -209,6 +233,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         context: Float[Tensor, "b tokens width"],
         extra: Tensor | None,
         adapter: nn.Module | None,
+        added: Added | None = None,
     ) -> Encoded:
         """Runs one encoder and the mid block: (b, c, h, w) -> feature pyramid."""
         if (extra is None) != (adapter is None):
@@ -219,19 +244,23 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         hidden = unet.conv_in(sample)
         if adapter is not None:
             hidden = hidden + adapter(extra)
+        entering = dict(enumerate(added.levels)) if added else {}
+        hidden = hidden + entering.get(0, 0)
         features = (hidden,)
-        for block in unet.down_blocks:
+        for level, block in enumerate(unet.down_blocks):
+            hidden = hidden + entering.get(level, 0) if level else hidden
             seen = {"encoder_hidden_states": context} if getattr(block, "has_cross_attention", False) else {}
             hidden, skips = block(hidden_states=hidden, temb=time, **seen)
             features += tuple(skips)
         assert unet.mid_block is not None
         hidden = unet.mid_block(hidden, time, encoder_hidden_states=context)
-        return Encoded((*features, hidden), time, context)
+        return Encoded((*features, hidden), time, context, added.summary if added else None)
 
     def decode(self, unet: UNet2DConditionModel, own: Encoded, other: Encoded, bridge: nn.ModuleList) -> Tensor:
         """Runs one decoder on its own features plus the other stream's, brought over by zero convolutions."""
         fused = [mine + conv(theirs) for mine, theirs, conv in zip(own.features, other.features, bridge, strict=True)]
         hidden, skips = fused[-1], fused[:-1]
+        time = own.time if other.summary is None else own.time + other.summary
         for block in unet.up_blocks:
             resnets = block.resnets
             assert isinstance(resnets, nn.ModuleList)
@@ -239,9 +268,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
             skips, taken = skips[:-count], tuple(skips[-count:])
             seen = {"encoder_hidden_states": own.context} if getattr(block, "has_cross_attention", False) else {}
             size = skips[-1].shape[-2:] if skips else None
-            hidden = block(
-                hidden_states=hidden, temb=own.time, res_hidden_states_tuple=taken, upsample_size=size, **seen
-            )
+            hidden = block(hidden_states=hidden, temb=time, res_hidden_states_tuple=taken, upsample_size=size, **seen)
         if unet.conv_norm_out is not None and unet.conv_act is not None:
             hidden = unet.conv_act(unet.conv_norm_out(hidden))
         return unet.conv_out(hidden)

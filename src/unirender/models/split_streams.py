@@ -32,6 +32,7 @@ class SplitDualStreamModel(DualStreamModel):
         self.inverse.attributes_to_image = nn.ModuleList()
         remove_decoder(self.inverse.image_unet)
         self.inverse.light_encoder = None  # no light is given where it is asked for
+        self.vgg = None  # and where an image is asked for, none is clean
 
     def forward(
         self,

@@ -32,6 +32,7 @@ class ModelConfig:
     # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
     light: Literal["latent", "encoder"] = "latent"
     derived_light: bool = False  # the network is told which of s and d were derived from a light, without shadows
+    picture_features: Literal["none", "vgg16"] = "none"  # a clean image also enters through frozen features of ImageNet
     unified: bool = True  # False: a network for each direction, and the widths are those of each
 
 
@@ -178,8 +179,10 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": dataclasses.replace(  # the network of `tiny_renderer`, whose weights it can begin with
         _TINY_RENDERER,
-        model=dataclasses.replace(_TINY_RENDERER.model, resolution=128),
-        loss=dataclasses.replace(_TINY_RENDERER.loss, colour_floor=1e-2, albedo=8.0, specular=6.0, diffuse=8.0),
+        model=dataclasses.replace(_TINY_RENDERER.model, resolution=128, picture_features="vgg16"),
+        loss=dataclasses.replace(
+            _TINY_RENDERER.loss, colour_floor=1e-2, material=4.0, albedo=8.0, specular=6.0, diffuse=8.0
+        ),
         augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
         p_render=0.25,
     ),

@@ -14,6 +14,7 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.picture_features import PictureFeatures, read_vgg
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -22,6 +23,7 @@ from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
 
+FEATURES_PREFIXES = ("vgg.", "inverse.vgg.")  # of the entries of `PictureFeatures` in a network
 _KINDS = {True: "one network for both directions (unified)", False: "a network for each direction (unified=False)"}
 
 
@@ -55,6 +57,8 @@ class Start:
             begin_with_diffusion(trainer, self.diffusion)
         elif self.pipeline is not None and self.folder is not None:
             begin_with_network(trainer, self.pipeline.dual_stream, read_history(self.folder))
+        else:
+            load_features(trainer.model)
 
 
 def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | None = None) -> Start:
@@ -94,7 +98,8 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
 def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:
     """Gives a trainer, and its average, the weights of another network.
 
-    With another physics prior than the network's the image stream's last convolution starts at zero again.
+    With another physics prior than the network's the image stream's last convolution starts at zero again. Features of
+    ImageNet that the network has not are added.
 
     Args:
         trainer: that has not begun.
@@ -106,6 +111,8 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     """
     model = trainer.model
     own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
+    if network.config["picture_features"] == "none":  # what they add begins at zero
+        own = {k: v for k, v in own.items() if not k.startswith(FEATURES_PREFIXES)}
     curves = [m.config["hdr_curves"] for m in (model, network)]
     if own != other or {k: tuple(v) for k, v in curves[0].items()} != {k: tuple(v) for k, v in curves[1].items()}:
         differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
@@ -113,10 +120,24 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
             f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
             "expected the same network; choose the preset that the weights were trained with"
         )
-    model.load_state_dict(network.state_dict())
+    model.load_state_dict(model.state_dict() | network.state_dict())
+    if network.config["picture_features"] == "none":
+        load_features(model)
     if network.config["physics_prior"] != model.config["physics_prior"]:
         restart_from_prior(model)  # what it added to the other closed form is no correction of this one
     trainer.begin_anew(history)
+
+
+def load_features(model: DualStreamModel) -> None:
+    """Gives a network with features of ImageNet their weights, from the user's cache; one without nothing.
+
+    Raises:
+        UnirenderError: they are not there.
+    """
+    features = [part for part in model.modules() if isinstance(part, PictureFeatures)]
+    weights = read_vgg() if features else {}
+    for part in features:
+        part.load_vgg(weights)
 
 
 def begin_with_diffusion(trainer: Trainer, weights: StableDiffusion) -> None:
