@@ -133,6 +133,13 @@ _TINY_RENDERER = dataclasses.replace(
     optimizer=OptimizerConfig(kind="muon"),
     p_render=0.4,
 )
+_SMALL = dataclasses.replace(  # the network of `tiny_renderer`, whose weights it can begin with
+    _TINY_RENDERER,
+    model=dataclasses.replace(_TINY_RENDERER.model, resolution=128),
+    loss=dataclasses.replace(_TINY_RENDERER.loss, colour_floor=1e-2, albedo=8.0, specular=6.0, diffuse=8.0),
+    augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
+    p_render=0.25,
+)
 _SD_MODEL = ModelConfig(
     resolution=512,
     codec="kl",
@@ -177,14 +184,11 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
-    "small": dataclasses.replace(  # the network of `tiny_renderer`, whose weights it can begin with
-        _TINY_RENDERER,
-        model=dataclasses.replace(_TINY_RENDERER.model, resolution=128, picture_features="vgg16"),
-        loss=dataclasses.replace(
-            _TINY_RENDERER.loss, colour_floor=1e-2, material=4.0, albedo=8.0, specular=6.0, diffuse=8.0
-        ),
-        augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
-        p_render=0.25,
+    "small": _SMALL,
+    "small_vgg": dataclasses.replace(
+        _SMALL,
+        model=dataclasses.replace(_SMALL.model, picture_features="vgg16"),
+        loss=dataclasses.replace(_SMALL.loss, material=4.0),
     ),
     "medium": dataclasses.replace(
         _TINY,
