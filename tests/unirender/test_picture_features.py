@@ -139,6 +139,12 @@ def test_absent_weights_say_how_to_get_them(tmp_path: Path, monkeypatch: pytest.
         read_vgg()
 
 
+def test_a_damaged_file_of_weights_is_said_to_be_one(cached: Path) -> None:
+    cached.write_bytes(cached.read_bytes()[:1000])
+    with pytest.raises(UnirenderError, match=r"lpips_vgg\.safetensors cannot be read .*; delete it"):
+        read_vgg()
+
+
 # --- in the network
 
 

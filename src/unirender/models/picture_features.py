@@ -23,6 +23,7 @@ from pathlib import Path
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -146,7 +147,7 @@ def read_vgg() -> dict[str, Tensor]:
     """The weights of VGG-16 in the user's cache, which LPIPS reads too.
 
     Raises:
-        UnirenderError: they are not there.
+        UnirenderError: they are not there, or cannot be read.
     """
     path: Path = cache_dir() / "lpips" / "lpips_vgg.safetensors"
     if not path.is_file():
@@ -154,4 +155,10 @@ def read_vgg() -> dict[str, Tensor]:
             f"weights of VGG-16: no {path}, which this preset's network begins with; run `python -m "
             "unirender_evaluation.lpips_convert vgg`, or begin with a network that has them (--init)"
         )
-    return load_file(path)
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise UnirenderError(
+            f"weights of VGG-16: {path} cannot be read ({error}); delete it and convert it again with `python -m "
+            "unirender_evaluation.lpips_convert vgg`"
+        ) from error
