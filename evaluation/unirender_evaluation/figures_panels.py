@@ -19,11 +19,11 @@ from unirender_evaluation.engine import answer
 from unirender_evaluation.figures import Grid, Line, Tile
 from unirender_evaluation.methods import Image, Mask, capabilities
 from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.mitsuba_method import MitsubaScene
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.scoring import over_white, score_image, score_maps
 from unirender_evaluation.suites import Material, Scene, Suite
 from unirender_evaluation.tasks import Task, picture, tasks
-from unirender_evaluation.truth_object import object_hash
 from unirender_evaluation.truth_render import good_spp, item_seed
 
 Truth = Callable[[Scene, Material, Float[np.ndarray, "eh ew 3"]], Image]
@@ -52,7 +52,7 @@ class MitsubaTruth:
 
     def __init__(self, suite: Suite, spp: int) -> None:
         self.suite, self.spp = suite, good_spp(spp, suite.spec)
-        self._renderers: dict[str, Any] = {}
+        self._objects: dict[str, MitsubaScene] = {}
 
     def __call__(self, scene: Scene, material: Material, environment: Float[np.ndarray, "eh ew 3"]) -> Image:
         """Linear image, premultiplied.
@@ -62,25 +62,20 @@ class MitsubaTruth:
         """
         seed = item_seed("figures", scene.key, material)
         metallic, roughness = material
-        found = self._renderer(scene).image(environment, roughness, metallic, self.spp, seed)
+        found = self._object(scene).renderer.image(environment, roughness, metallic, self.spp, seed)
         return np.asarray(found.mean[..., :3], np.float32)
 
-    def _renderer(self, scene: Scene) -> Any:
-        from unirender_evaluation.suite_objects import scene_object
-        from unirender_reference.render import Renderer
-
-        if scene.object not in self._renderers:
-            obj = scene_object(self.suite, scene)
-            expected, got = self.suite.provenance["objects"][scene.object]["sha256"], object_hash(obj)
-            if got != expected:
+    def _object(self, scene: Scene) -> MitsubaScene:
+        if scene.object not in self._objects:
+            made = MitsubaScene(self.suite, scene)
+            if not made.geometry_test.passed:
                 raise UnirenderError(
-                    f"figures, {scene.object}: got a mesh {got[:12]} from its generator, expected {expected[:12]}, "
-                    f"which suite {self.suite.spec.name} was rendered from; make its truth on this machine with "
+                    f"figures, {scene.object}: got another object from its generator than suite {self.suite.spec.name} "
+                    f"was rendered from ({made.geometry_test}), expected the same; make its truth on this machine with "
                     "`unirender bench truth`"
                 )
-            spec = self.suite.spec
-            self._renderers[scene.object] = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
-        return self._renderers[scene.object]
+            self._objects[scene.object] = made
+        return self._objects[scene.object]
 
 
 def material_strip(

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import KeyOf
 from unirender_evaluation.engine import Job, Prediction, record_of, score
-from unirender_evaluation.geometry_check import compare_geometry
+from unirender_evaluation.geometry_check import GeometryTest, compare_geometry
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import evenly
@@ -68,10 +68,15 @@ class MitsubaScene:
         return self.renderer.geometry(self.suite.spec.geometry_spp, item_seed("mitsuba", self.scene.object))
 
     @cached_property
+    def geometry_test(self) -> GeometryTest:
+        """What was traced beside what is stored; their last bits differ where another CPU made the object."""
+        spec = self.suite.spec
+        return compare_geometry(self.suite.intrinsics(self.scene, spec.base), self.geometry, spec.geometry_spp)
+
+    @property
     def shows_the_truth(self) -> bool:
         """Whether this is the object of the stored truth."""
-        spec = self.suite.spec
-        return compare_geometry(self.suite.intrinsics(self.scene, spec.base), self.geometry, spec.geometry_spp).passed
+        return self.geometry_test.passed
 
     def maps(self, material: Material) -> Intrinsics:
         """What a perfect decomposition says: traced buffers, the scene's material; no light."""

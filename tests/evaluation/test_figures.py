@@ -178,7 +178,7 @@ def test_a_figure_that_no_method_can_fill_is_refused_by_name(suite: Suite) -> No
 
 def test_the_truth_of_an_object_that_is_made_otherwise_here_is_refused(suite: Suite) -> None:
     scene = suite.scenes[0]
-    with pytest.raises(UnirenderError, match=r"ball-0: got a mesh .* expected none, which suite ball"):
+    with pytest.raises(UnirenderError, match=r"ball-0: got another object .* suite ball .*geometry FAILED on"):
         MitsubaTruth(suite, 8)(scene, suite.spec.base, suite.environment(scene))
 
 

@@ -318,7 +318,11 @@ def test_under_autocast_the_cycle_has_the_same_gradients(steps: int) -> None:
     plain, cast = (
         gradients(loss_function(cycle_steps=steps), "cycle", dtype) for dtype in (torch.float32, torch.bfloat16)
     )
-    assert cast.keys() == plain.keys()
+    # The attention to one token of a prompt has none but of rounding, which bfloat16 may have at zero.
+    size = {name: float(g.abs().max()) for name, g in plain.items()}
+    plainly = {name for name, largest in size.items() if largest > 1e-6 * max(size.values())}
+    assert len(plainly) > 0.9 * len(plain)
+    assert plainly <= cast.keys() <= plain.keys()
 
 
 class CountingCodec(KLCodec):
