@@ -66,12 +66,13 @@ class Network:
         Returns:
             For each image the maps of each sample, in physical units.
         """
+        device = self.model.device  # asked once: diffusers searches all modules for it, milliseconds
         maps = infer_attributes(
             self.model,
             self.conditioning,
             self.scheduler,
-            self._batch(images, how.count),
-            self._batch(masks, how.count),
+            _batch(images, how.count, device),
+            _batch(masks, how.count, device),
             steps=how.steps,
             generator=how.generators(len(images)),
             camera=_repeat(cameras, how.count),
@@ -91,18 +92,19 @@ class Network:
             how: steps, samples and noise.
             derived: for each scene, which of its maps were derived from its light, without shadows; None: none.
         """
+        device = self.model.device
         flags = [[name in own for name in TRIPLETS] for own in derived or [()] * len(scenes)]
         image = infer_image(
             self.model,
             self.conditioning,
             self.scheduler,
-            {name: self._batch([self._map(scene, name) for scene in scenes], how.count) for name in MAPS},
-            torch.tensor(_repeat([_given(scene) for scene in scenes], how.count), device=self.model.device),
+            {name: _batch([self._map(scene, name) for scene in scenes], how.count, device) for name in MAPS},
+            torch.tensor(_repeat([_given(scene) for scene in scenes], how.count), device=device),
             steps=how.steps,
             generator=how.generators(len(scenes)),
             camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
-            derived=torch.tensor(_repeat(flags, how.count), device=self.model.device),
+            derived=torch.tensor(_repeat(flags, how.count), device=device),
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
         return list(means.permute(0, 2, 3, 1).float().cpu().numpy())
@@ -124,11 +126,14 @@ class Network:
         rows, columns = self.conditioning.packing.environment_size if name == "environment" else (self.size, self.size)
         return np.zeros((rows, columns, MAPS[name]), np.float32)
 
-    def _batch(self, arrays: Sequence[Float[np.ndarray, "h w c"]], count: int) -> Float[torch.Tensor, "b c h w"]:
-        """Each array `count` times in a row, on the model's device."""
-        stack = np.stack([np.moveaxis(array, -1, 0) for array in arrays])
-        tensor = torch.from_numpy(np.ascontiguousarray(stack, dtype=np.float32)).to(self.model.device)
-        return tensor.repeat_interleave(count, dim=0)
+
+def _batch(
+    arrays: Sequence[Float[np.ndarray, "h w c"]], count: int, device: torch.device
+) -> Float[torch.Tensor, "b c h w"]:
+    """Each array `count` times in a row, on a device."""
+    stack = np.stack([np.moveaxis(array, -1, 0) for array in arrays])
+    tensor = torch.from_numpy(np.ascontiguousarray(stack, dtype=np.float32)).to(device)
+    return tensor.repeat_interleave(count, dim=0)
 
 
 def _given(scene: Intrinsics) -> list[bool]:
