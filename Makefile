@@ -1,6 +1,7 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
+# make test-long   what make test leaves out because it takes long: 5 minutes; CI runs it too
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
 # make test-demo   likewise: the page of `unirender demo` in Chromium
@@ -18,13 +19,15 @@ BENCH_ARGS ?=
 PYTEST_ARGS ?= -n auto
 SUITE ?= tiny
 OUT ?= results
+# Of the multi-view table, which is not the paper's: 3 minutes each. `unirender bench run` takes 4.
+VIEW_OBJECTS ?= 2
 
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-large test-report test-demo test-latex lint docs format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -47,7 +50,7 @@ lpips-vgg: $(VENV)/.runtime
 	$(BIN)/python -m unirender_evaluation.lpips_convert vgg || echo "LPIPS-VGG is not to be had here: n/a in the tables"
 
 bench: $(VENV)/.runtime lpips-vgg
-	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) $(BENCH_ARGS)
+	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --view-objects $(VIEW_OBJECTS) $(BENCH_ARGS)
 
 bench-full: $(VENV)/.runtime lpips-vgg
 	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --full $(BENCH_ARGS)
@@ -60,6 +63,9 @@ lint: $(VENV)/.dev
 
 test: lint docs
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-long: $(VENV)/.dev
+	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
 
 # One process, not $(PYTEST_ARGS): it measures its own memory.
 test-large: $(VENV)/.dev
