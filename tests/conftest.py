@@ -45,12 +45,13 @@ def pytest_configure(config: pytest.Config) -> None:
         )
 
 
-# Markers of what needs a program or a machine that not everybody has: such tests never skip; they run by their own
-# command alone, and fail there where what they need is missing.
+# Markers of what takes long, or needs a program or a machine that not everybody has: such tests never skip; they run by
+# their own command alone, and fail there where what they need is missing.
 OWN_COMMANDS = {
     "demo": "make test-demo",
     "large": "make test-large",
     "latex": "make test-latex",
+    "long": "make test-long",
     "report": "make test-report",
 }
 

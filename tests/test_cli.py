@@ -159,6 +159,7 @@ def test_an_alpha_channel_that_hides_nothing_is_no_mask(tmp_path: Path, capsys: 
         assert ("covers the whole frame" in capsys.readouterr().err) == told
 
 
+@pytest.mark.long
 def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
     small = Image.fromarray(rng.integers(0, 255, (20, 30, 3), dtype=np.uint8))

@@ -62,7 +62,7 @@ def wanted_of(run: Run) -> dict[str, frozenset[str]]:
     return {scene.key: frozenset(job.key for job in quick(run, scene)) for scene in run.scenes}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_records_and_pictures_are_those_of_one_machine(
     tmp_path: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -70,7 +70,7 @@ def text(out: Path, name: str) -> str:
     return DATE.sub("(date)", (out / name).read_text(encoding="utf-8"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_run_ends_in_the_same_tables(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     left = kill_in_the_middle(killed)

@@ -70,6 +70,7 @@ def test_too_few_samples_have_no_region() -> None:
         inside(np.zeros((8, 3)), np.zeros((1, 3)))
 
 
+@pytest.mark.long
 def test_what_mitsuba_finds_explains_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """The true material does, and so do materials found, rendered again with many samples; others do not. A perfect
     posterior passes both tests, and their twins fail."""

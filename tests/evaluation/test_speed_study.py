@@ -164,7 +164,7 @@ def test_the_table_has_the_mean_of_the_ratios() -> None:
     assert mitsuba_table([one("a", None)], 3).sections[0][0][-2:] == ("-", "-")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cold_start_is_split_into_what_it_is(suite: Suite) -> None:
     (row,) = cold_starts(suite, suite.scenes[0], None, ("--device", "cpu", "--dtype", "float32"), 1)
     assert set(row) == {"torch", "command", *SPLIT, "interpreter"}

@@ -137,6 +137,7 @@ def test_negative_pixels_of_a_sweep_are_counted(swept: Path, capsys: pytest.Capt
     assert f"{count} pixels of interpolated pictures" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_procedural_objects_with_maps_of_their_own(tmp_path: Path) -> None:
     (first, second) = made(tmp_path, objects=2, vary="independent", materials="maps", pairs=2, resolution=16)
     assert first["shared.exr"] != second["shared.exr"]
@@ -154,6 +155,7 @@ def test_procedural_objects_with_maps_of_their_own(tmp_path: Path) -> None:
     assert len(GroupDataset(tmp_path)) == 4
 
 
+@pytest.mark.long
 def test_noise_floor_is_reached_and_said(tmp_path: Path) -> None:
     """Members, the group's json and the report agree; the floor holds against an independent render."""
     asked = 30.0

@@ -137,6 +137,7 @@ def test_effects_add_up_to_the_full_render(shape: str, material: str, torus: Ren
         assert not compare(twin.total(), full).passed, label
 
 
+@pytest.mark.long
 def test_maps_and_bumped_normals_add_up_too() -> None:
     """Normals bent by a normal map are where lit directions lie under the surface."""
     renderer = Renderer(occluders.textured(occluders.torus(), bumps=0.6), resolution=SIZE)

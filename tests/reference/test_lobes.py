@@ -138,7 +138,7 @@ def test_another_index_of_refraction_fails(torus: Renderer, plain: Lobes) -> Non
         assert result.passed == (eta == 1.5), f"eta {eta}: {result}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_textures_under_the_pixel_need_weighted_means() -> None:
     """Colour, metallic, roughness and normal change inside every pixel: there the product of means is not the mean."""
     renderer = Renderer(occluders.textured(scenes.sphere(), texels=64), resolution=SIZE)

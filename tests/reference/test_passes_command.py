@@ -20,7 +20,7 @@ def small(out: Path, **options: Any) -> Passes:
     return Passes(out=out, **{"resolution": 16, "spp": 128, **options})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_hold_the_passes_and_a_wrong_sum_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = small(tmp_path / "new" / "folder")
     assert command.run() == 0

@@ -60,7 +60,7 @@ def renderer() -> Renderer:
     return Renderer(replace(obj, albedo=np.full_like(obj.albedo, 0.95)), resolution=24)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_equals_brute_force(renderer: Renderer) -> None:
     """z-test over all values of all pairs, and the same total error. Twins: linear interpolation, and roughness 12 %
     off."""

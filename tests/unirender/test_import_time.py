@@ -49,7 +49,7 @@ def test_decompose_does_without_what_it_does_not_use(tmp_path: Path) -> None:
     assert not imported & set(FORBIDDEN)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_library_import_has_all_of_diffusers() -> None:
     """The twin: without `lean_imports` the same model brings most of the list; inside a library nothing is hidden."""
     _, imported = run_python("import unirender.pipelines.unirender_pipeline")

@@ -92,7 +92,7 @@ def one_process(run: Run, out: Path, seed: int) -> list[dict[str, float]]:
     return losses(out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads: None) -> None:
     assert [f"process {rank} of 2" in run.printed for rank in range(3)] == [True, True, False]
     assert len(json.loads((run.out / "config.json").read_text())["hardware"]) == 2
@@ -105,7 +105,7 @@ def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads:
         assert a != pytest.approx(c, rel=1e-2)  # the twin: another seed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_processes_resume_and_end_by_one_clock(run: Run) -> None:
     """Each with a clock of its own, one of them would stop a step before the other, and the other wait for ever."""
     state = load_state(run.out)

@@ -56,7 +56,7 @@ def kill_after(process: subprocess.Popen[str], out: Path, lines: int) -> None:
     assert process.returncode == -SIGKILL
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_losses_after_a_kill_are_those_without(tmp_path: Path) -> None:
     data, killed, whole = write_dataset(tmp_path / "data", size=32), tmp_path / "killed", tmp_path / "whole"
     first = start(data, killed)

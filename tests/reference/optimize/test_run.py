@@ -151,7 +151,7 @@ def test_a_file_that_was_deleted_comes_back(whole: Path, tmp_path: Path, lost: s
     assert (out / lost).read_bytes() == (whole / lost).read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pictures_may_be_drawn_later(whole: Path, tmp_path: Path):
     out = tmp_path / "run"
     shutil.copytree(whole, out)

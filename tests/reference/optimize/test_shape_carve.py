@@ -46,7 +46,7 @@ def cup() -> MeshObject:
     return make_object(23, "test")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cup_is_hollow() -> None:
     views, config = pictures(cup(), 1.0, 0.3), ShapeConfig(cells=CELLS)
     other = Cameras(blank_views(5, SIZE))
@@ -92,7 +92,7 @@ def test_a_point_is_not_seen_through_the_object() -> None:
     assert carve(visual_hull(masks, cameras, 32), turned, masks, cameras, 0.06)[1] < 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_pictures_decide_between_solutions() -> None:
     obj, light = sphere(), environment(3)
     views = _ball()

@@ -101,7 +101,7 @@ def test_the_derivative_of_the_shading_is_its_finite_difference() -> None:
     assert np.linalg.norm(across - slope) / np.linalg.norm(slope) > 0.2  # twin: another tilt
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_shading_carves_a_dent_that_no_mask_shows() -> None:
     true, light = dented_sphere(), _soft_light()
     views = _pictures(true, light, 8, 256)
@@ -218,7 +218,7 @@ def test_environment_is_used() -> None:
     np.testing.assert_allclose(two, 2 * one, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_measure_scores_every_stage(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     shape = ShapeConfig(cells=20, mask_steps=2, image_steps=1, spp=4)

@@ -112,7 +112,7 @@ def test_it_stops_when_told(views) -> None:
     assert len(steps) == len(STARTS) + 1  # none of the materials' and the corrections' solves
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mirror_gets_a_finer_light() -> None:
     """Its pictures are explained better than by a light of 16 rows."""
     sharp = cases.coarse_light(1, rows=32)
