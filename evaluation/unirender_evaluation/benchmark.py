@@ -216,6 +216,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
     processes."""
     missing = {scene.key: [job for job in here.jobs(scene) if not job.is_done(store.has)] for scene in here.scenes}
     scenes = [scene for scene in here.scenes if missing[scene.key]]
+    scenes.sort(key=lambda scene: -len(missing[scene.key]))  # those with slow rows first: none is left for the end
     if not scenes:
         return  # a finished run needs no cluster to write its tables again
     total = sum(map(len, missing.values()))
