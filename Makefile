@@ -1,7 +1,7 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
-# make test-long   what make test leaves out because it takes long: 5 minutes; CI runs it too
+# make test-long   what make test leaves out because it takes long: notebooks, and some 30 tests; CI runs it too
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
 # make test-demo   likewise: the page of `unirender demo` in Chromium
@@ -27,7 +27,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs docs-check format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -61,10 +61,11 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-test: lint docs
+test: lint docs-check
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-test-long: $(VENV)/.dev
+# The notebooks run in `docs`.
+test-long: docs
 	$(BIN)/python -m pytest -m long $(PYTEST_ARGS)
 
 # One process, not $(PYTEST_ARGS): it measures its own memory.
@@ -83,6 +84,10 @@ test-latex: $(VENV)/.dev
 
 docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -b html docs docs/_build/html
+
+# The same pages, with notebooks that are not run: minutes less.
+docs-check: $(VENV)/.dev
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -D nb_execution_mode=off -b html docs docs/_build/check
 
 format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .

@@ -73,6 +73,7 @@ def test_closed_loop_of_true_maps(suite: Suite) -> None:
         assert test.fails(bad, good)
 
 
+@pytest.mark.long
 def test_the_loops_twin_is_wrong_on_the_most_concave_scenes() -> None:
     """There the object's own shadows, which no loop has, can make half the albedo score better than the true one."""
     suite = load_suite("tiny")

@@ -139,7 +139,7 @@ def test_nothing_is_rendered_for_a_suite_whose_hash_cannot_be_written(tmp_path: 
     assert not (tmp_path / "work").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) -> None:
     """One object at 16 px: what the suite file asks for is there; finished parts are kept; another work folder gives
     the same bytes; another suite file does not reuse parts."""
@@ -222,6 +222,7 @@ def write_mesh_suite(folder: Path, names: str) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_part_is_kept_for_the_same_file_lights_turns_and_materials_alone(tmp_path: Path) -> None:
     spec, _ = target(write_mesh_suite(tmp_path, "a"))
     (source,), pool = suite_sources(spec), light_sources(spec)
@@ -269,7 +270,7 @@ def test_a_truth_follows_the_files_that_are_in_the_folder(tmp_path: Path) -> Non
         assert object_hash(scene_object(suite, scene)) == suite.provenance["objects"][scene.object]["sha256"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: Path) -> None:
     """Two GLB files and two PNG at 16 px: the truth names what it was made of, its hash follows the files' content, and
     rows that are told the shape read it again."""

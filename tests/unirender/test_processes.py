@@ -118,7 +118,7 @@ def test_two_processes_resume_and_end_by_one_clock(run: Run) -> None:
     assert steps == list(range(1, steps[-1] + 1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_error_of_one_process_ends_all_with_a_line(run: Run, tmp_path: Path) -> None:
     script = tmp_path / "broken_disk.py"
     script.write_text(f"{BROKEN_DISK}\nimport runpy, sys\nsys.path.insert(0, {str(SCRIPT.parent)!r})\n")

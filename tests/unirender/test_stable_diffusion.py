@@ -399,7 +399,7 @@ def train(capsys: pytest.CaptureFixture[str], *options: str | Path) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_training_from_the_folder_to_a_pipeline_that_decomposes(
     first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

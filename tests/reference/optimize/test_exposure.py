@@ -57,7 +57,7 @@ def test_one_bright_picture_hardly_moves_the_exposure(views: Views):
     assert image.mean() > 3 * views.seen[0].image.mean()  # the mean is another
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_scale_of_linear_pictures_does_not_matter(views: Views):
     """Equal materials, up to the rounding of float32, and the light times the factor; not so without the exposure."""
     start, factor = flat_start(truth().obj), 100.0

@@ -62,7 +62,7 @@ def command(*arguments: str | Path) -> Optimize:
     return tyro.cli(Optimize, args=[*map(str, arguments)])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_folder_with_its_mesh(data: Path, solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
     assert command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK).run() == 0
