@@ -105,7 +105,7 @@ def _docstring(app: Sphinx, what: str, name: str, obj: object, options: object, 
 def _results(app: Sphinx, docname: str, source: list[str]) -> None:
     """Puts the committed result tables of each suite where the results page names it."""
     if docname == "results":
-        source[0] = re.sub(r"<!-- tables: (\w+) -->", lambda found: _tables(RESULTS / found[1]), source[0])
+        source[0] = re.sub(r"<!-- tables: ([\w-]+) -->", lambda found: _tables(RESULTS / found[1]), source[0])
 
 
 def _tables(folder: Path) -> str:

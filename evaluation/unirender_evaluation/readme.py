@@ -1,12 +1,13 @@
 """Copies the tables of a benchmark run into the README and into the documentation, so that no number is typed.
 
-    python -m unirender_evaluation.readme RUN [--readme README.md] [--stored FOLDER]
+    python -m unirender_evaluation.readme RUN [--readme README.md] [--stored FOLDER] [--of CHECKPOINT]
 
 `RUN` is the folder that `unirender bench run` wrote, or its results file. The README gets tables of the suite and the
 facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`.
 The stored folder (`evaluation/results` of a checkout, which the documentation reads) gets a folder by the name of the
 suite, with every value (`results.json.gz`) and one Markdown file per table; from that file the command makes both anew.
-A partial run (`--limit`) is refused.
+With `--of` that of a shipped checkpoint which is not the default gets a folder SUITE-CHECKPOINT instead, and the README
+nothing. A partial run (`--limit`) is refused.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
+from unirender.files import checkpoint_sha256
 from unirender.shipped import checkpoint_folder, shipped_names
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
@@ -63,6 +65,23 @@ def fill(readme: str, name: str, text: str) -> str:
     if readme.count(begin) != 1 or readme.count(end) != 1 or not pattern.search(readme):
         raise UnirenderError(f"README: expected one {begin!r} followed by one {end!r}")
     return pattern.sub(lambda _: f"{begin}\n\n{text.strip()}\n\n{end}", readme)
+
+
+def place(results: Results, checkpoint: str | None) -> str:
+    """The stored folder's name: the suite's, or for a shipped checkpoint that is not the default SUITE-CHECKPOINT.
+
+    Raises:
+        UnirenderError: the run has other weights than that checkpoint.
+    """
+    if checkpoint is None:
+        return results.run.suite
+    expected = checkpoint_sha256(checkpoint_folder(checkpoint))
+    got = {info.config["weights"] for info in results.run.methods if "weights" in info.config}
+    if got != {expected}:
+        names = ", ".join(sorted(weights[:12] for weights in got)) or "no weights"
+        wanted = f"expected {expected[:12]}, those of {checkpoint}"
+        raise UnirenderError(f"weights: got {names}, {wanted}; run the benchmark with --checkpoint {checkpoint}")
+    return f"{results.run.suite}-{checkpoint}"
 
 
 def checkpoint_text(folder: Path) -> str:
@@ -132,10 +151,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="checkpoints to list in the README; those that ship if none is named",
     )
     parser.add_argument("--stored", type=Path, help="gets a folder by the suite's name: values, and a file per table")
+    parser.add_argument("--of", choices=shipped_names(), help="checkpoint of the run: its stored folder is SUITE-OF")
     arguments = parser.parse_args(argv)
+    if arguments.of and arguments.readme:
+        parser.error("--of: the README shows the default checkpoint alone; leave out --readme")
     try:
         results, tables = whole_run(arguments.run)
-        suite, date = results.run.suite, results.run.date
+        suite, date, folder = results.run.suite, results.run.date, place(results, arguments.of)
         if arguments.readme:
             shipped = suite == SHIPPED_SUITE
             command = "make bench" if shipped else f"unirender bench run --suite {suite}"
@@ -145,7 +167,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=pixels_of)))
             arguments.readme.write_text(fill(text, "checkpoint", facts))
         if arguments.stored:
-            store(arguments.stored / suite, results, tables)
+            store(arguments.stored / folder, results, tables)
     except (UnirenderError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -10,6 +10,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from unirender.errors import UnirenderError
+from unirender.files import checkpoint_sha256
+from unirender.shipped import checkpoint_folder
 from unirender_evaluation import readme
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
 
@@ -89,19 +91,36 @@ def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> Non
     assert "21.50" in after
 
 
+def test_the_results_of_another_shipped_checkpoint_have_a_place_of_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, stored = write_example(tmp_path / "run", suite="large"), tmp_path / "stored"
+    options = [str(run), "--stored", str(stored), "--of", "small"]
+    for weights, code in (("0" * 64, 1), (checkpoint_sha256(checkpoint_folder("small")), 0)):
+        methods = (MethodInfo("mine", "Mine", "ours", config={"weights": weights}),)
+        write_run(run / "run.json", RunInfo("large", "0" * 64, 64, methods, date="2026-11-21"))
+        assert readme.main(options) == code
+        assert stored.exists() == (code == 0)
+    assert "weights: got 000000000000, expected " in capsys.readouterr().err
+    assert (stored / "large-small" / "results.json.gz").is_file()
+    with pytest.raises(SystemExit):
+        readme.main([*options, "--readme", "README.md"])
+
+
 @pytest.mark.parametrize("suite", sorted(path.name for path in STORED.iterdir()))
 def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
     own = (STORED.parents[1] / "README.md").read_text()
     target = tmp_path / "README.md"
     target.write_text(own)
+    _, _, checkpoint = suite.partition("-")
     # In a process of its own: the checks of every call that tests run under take ten times as long as the work.
-    options = ["--readme", str(target), "--stored", str(tmp_path)]
+    options = ["--stored", str(tmp_path), *(["--of", checkpoint] if checkpoint else ["--readme", str(target)])]
     subprocess.run([sys.executable, "-m", "unirender_evaluation.readme", str(STORED / suite), *options], check=True)
     folders = STORED / suite, tmp_path / suite
     committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
     again = (
         "make them again: python -m unirender_evaluation.readme evaluation/results/SUITE --readme README.md "
-        "--stored evaluation/results"
+        "--stored evaluation/results (SUITE-CHECKPOINT: --of CHECKPOINT instead of --readme)"
     )
     assert committed == made, again
     assert target.read_text() == own, again
