@@ -5,8 +5,8 @@ both answered, with the interval of the bootstrap over objects.
 """
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,28 @@ def _word(found: Comparison) -> str:
     if not found.decided:
         return "one object: no interval"
     return "**A is better**" if found.a_beats_b else "**B is better**" if found.b_beats_a else "no difference shown"
+
+
+def together(runs: Mapping[str, Results]) -> Results:
+    """Runs of one suite as one, so that rows of different runs stand side by side: row `ours-mean` of the run named
+    `small` is `ours-mean@small`, and its label says the name.
+
+    Their truths may have been rendered on different processors, which differ by far less than the truth's noise.
+
+    Raises:
+        UnirenderError: no run, or runs of different suites or sizes.
+    """
+    suites = {(results.run.suite, results.run.resolution) for results in runs.values()}
+    if len(suites) != 1:
+        raise UnirenderError(f"runs to put side by side: got suites and sizes {sorted(suites)}, expected the same one")
+    methods = [
+        replace(info, key=f"{info.key}@{name}", label=f"{info.label}, {name}")
+        for name, results in runs.items()
+        for info in results.run.methods
+    ]
+    records = [replace(r, method=f"{r.method}@{name}") for name, results in runs.items() for r in results.records]
+    first = next(iter(runs.values()))
+    return replace(first, run=replace(first.run, methods=tuple(methods)), records=tuple(records))
 
 
 def by_material(results: Results, method: str, numbers: Sequence[tuple[str, str]]) -> str:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from small_results import METHODS, RUN, small_records, small_results
 
+from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import SCALES, Variant, metric_key
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
@@ -20,6 +21,7 @@ from unirender_evaluation.results_findings import (
     published_against_constant,
     run_line,
     seconds,
+    together,
 )
 
 ALBEDO = ("albedo", "psnr")
@@ -50,6 +52,22 @@ def test_an_answer_is_both_means_over_shared_samples_and_the_paired_difference()
     assert found == [["albedo", *rows, *means, "+8.00 [+8.00, +8.00]", "**A is better**", "4 (2)"]]
     backwards = lines(answers(small_results(), [question("input-as-albedo", "ours-mean")]))
     assert backwards[0][5:7] == ["-8.00 [-8.00, -8.00]", "**B is better**"]
+
+
+def test_rows_of_two_runs_of_a_suite_are_paired_by_sample() -> None:
+    one = small_results()
+    key = metric_key("albedo", "psnr")
+    lower = [r for r in one.records if r.method == "ours-mean" and key in r.values]
+    lower = [replace(r, values={key: r.values[key] - 3}) for r in lower]
+    other = replace(one, records=tuple(lower))
+    both = together({"small": one, "tiny": other})
+    found = lines(answers(both, [question("ours-mean@small", "ours-mean@tiny")]))
+    rows = ["Ours (mean), small", "Ours (mean), tiny"]
+    assert found == [["albedo", *rows, "20.75", "17.75", "+3.00 [+3.00, +3.00]", "**A is better**", "4 (2)"]]
+    larger = replace(other, run=replace(other.run, resolution=2 * other.run.resolution))
+    for wrong in ({}, {"small": one, "tiny": larger}):
+        with pytest.raises(UnirenderError, match="expected the same one"):
+            together(wrong)
 
 
 def test_samples_that_only_one_row_has_do_not_count() -> None:
