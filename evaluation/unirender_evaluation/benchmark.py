@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UsageError
 from unirender.files import checkpoint_sha256, replace_file
 from unirender.shipped import checkpoint_folder
 from unirender_evaluation import bounds, multiview_methods, physics_rows
@@ -54,6 +54,7 @@ from unirender_evaluation.truth import quality_summary
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import installed_version, versions
 from unirender_evaluation.workers import Run, run_in_workers, run_on_cluster
+from unirender_reference.folder_lock import locked, made_folder
 
 GROUPS = ("ours", "optimisation", "trivial", "plugins")
 FEW = 100  # records: fewer are not worth starting processes
@@ -162,16 +163,16 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     """Runs or continues a benchmark and writes its folder (see the module).
 
     Raises:
-        UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions; nothing has run then. A failed
-            truth check or claim is no error: the verdict says so.
+        UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions, or another run is writing to the
+            folder; nothing has run then. A failed truth check or claim is no error: the verdict says so.
     """
-    console = console or Console()
     here = prepare(config)
+    with made_folder(config.out), locked(config.out):
+        return _run(config, here, console or Console())
+
+
+def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     suite, request = here.suite, check_request(config)
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnirenderError(f"{config.out}: cannot be made ({error.strerror}); choose another --out") from error
     store = Store.open(config.out / "records.jsonl")
     before = set(store.known)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

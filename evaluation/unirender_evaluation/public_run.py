@@ -23,7 +23,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from unirender.files import replace_file
 from unirender_evaluation import lpips
 from unirender_evaluation.engine import KEY_PREFIX, Store
-from unirender_evaluation.optimiser_study import open_folder
 from unirender_evaluation.prediction_check import PredictionError, folder_problems
 from unirender_evaluation.public_answers import asked, questions, read_answer, takes_part
 from unirender_evaluation.public_sets import PublicSet, Sample
@@ -33,6 +32,7 @@ from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
 from unirender_evaluation.tables import Table
 from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
+from unirender_reference.folder_lock import locked, made_folder
 
 
 @dataclass(frozen=True)
@@ -97,17 +97,22 @@ def run(what: PublicRun, console: Console) -> PublicResult:
     Raises:
         PublicSetError: the folder is not the set; nothing has run then.
         PredictionError: a folder of predictions has other files than the set asks for; nothing has run then.
-        UnirenderError: a file of the set is broken, or a method fails; a second run continues from there.
+        UnirenderError: another run is writing to the folder; or a file of the set is broken, or a method fails: a
+            second run continues from there.
     """
     every = what.public.samples()
     check_folders(what)
-    samples = evenly(every, what.limit)
+    with made_folder(what.out), locked(what.out):
+        return _run(what, evenly(every, what.limit), console)
+
+
+def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> PublicResult:
     missing = {
         row.info.label: [f"{sample.table}/{sample.key}" for sample in samples if not takes_part(row, sample)]
         for row in what.rows
         if row.predictions is not None
     }
-    store = Store.open(open_folder(what.out) / "records.jsonl")
+    store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     contents, computed = [], 0
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:

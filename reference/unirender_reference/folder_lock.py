@@ -1,8 +1,8 @@
-"""The folder of a data set: made, and written by one process at a time."""
+"""The folder of a data set or of a run: made, and written by one process at a time."""
 
 import contextlib
 import errno
-import fcntl
+import importlib.util
 import logging
 import os
 from collections.abc import Iterator
@@ -36,11 +36,15 @@ def locked(folder: Path) -> Iterator[None]:
     """Holds the folder's lock; the system lets go of it when the process is killed.
 
     The file `LOCK` is there meanwhile. Found without a writer, it means nothing. A file system without locks is a
-    warning.
+    warning, and so is Windows.
 
     Raises:
         UnirenderError: another process holds it.
     """
+    if importlib.util.find_spec("fcntl") is None:
+        _warn(folder, "Windows")
+        yield
+        return
     path = folder / LOCK
     handle = _acquire(folder, path)
     try:
@@ -50,7 +54,13 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def _warn(folder: Path, why: str) -> None:
+    _log.warning("%s: no locks here (%s); let no second run write to it", folder, why)
+
+
 def _acquire(folder: Path, path: Path) -> int:
+    import fcntl
+
     while True:
         try:
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
@@ -64,7 +74,7 @@ def _acquire(folder: Path, path: Path) -> int:
                 raise UnirenderError(
                     f"{folder}: another run is writing here; wait for it, or choose another --out"
                 ) from error
-            _log.warning("%s: no locks here (%s); let no second run write to it", folder, error.strerror)
+            _warn(folder, str(error.strerror))
             return handle
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), os.stat(path)):

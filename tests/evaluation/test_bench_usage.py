@@ -14,6 +14,7 @@ from unirender.models.precision import resolve_device
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.truth import make_truth
+from unirender_reference.folder_lock import LOCK, locked, made_folder
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[object, str]:
@@ -116,6 +117,17 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match=r"cannot be made \(Not a directory\); choose another --work"):
         next(make_truth(suite, file))
     assert file.read_text() == "kept"
+
+
+def test_a_second_run_in_the_same_folder_waits_for_the_first(tmp_path: Path) -> None:
+    """It would cut off the line that the first is writing, and rewrite the records without those that come later."""
+    out = tmp_path / "out"
+    with made_folder(out), locked(out):
+        (out / "records.jsonl").write_text('{"half a line')
+        with pytest.raises(UnirenderError, match="another run is writing here; wait for it, or choose another --out"):
+            run(BenchConfig(suite=str(write_suite(tmp_path / "suite", objects=1)), out=out), Console(quiet=True))
+        assert {path.name: path.read_text() for path in out.iterdir()} == {"records.jsonl": '{"half a line', LOCK: ""}
+    assert not (out / LOCK).exists()
 
 
 def test_repeated_options_add_up(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from public_folders import make_iiw, make_maw, make_orb
 from rich.console import Console
 
 from unirender import cli
+from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.files import write_png
 from unirender.intrinsics import Intrinsics
@@ -33,6 +34,7 @@ from unirender_evaluation.public_tables import averaged
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, plugin_rows, prediction_rows
 from unirender_evaluation.versions import Versions, package_folder
+from unirender_reference.folder_lock import LOCK, locked, made_folder
 
 
 class Ramp:
@@ -142,6 +144,15 @@ def test_a_killed_run_leaves_no_table_and_goes_on(tmp_path: Path, monkeypatch: p
 
     assert told(continued.records) == told(whole.records)
     assert (out / "tables.md").read_text() == (tmp_path / "whole" / "tables.md").read_text()
+
+
+def test_a_second_run_in_the_same_folder_waits_for_the_first(tmp_path: Path) -> None:
+    iiw, out = Iiw(make_iiw(tmp_path / "iiw")), tmp_path / "out"
+    with made_folder(out), locked(out):
+        with pytest.raises(UnirenderError, match="another run is writing here"):
+            done(iiw, trivial_rows(iiw), out)
+        assert [path.name for path in out.iterdir()] == [LOCK]
+    assert done(iiw, trivial_rows(iiw), out).computed == 4
 
 
 def test_orb_averages_each_capture_first(tmp_path: Path) -> None:

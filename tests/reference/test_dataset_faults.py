@@ -284,6 +284,15 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
     assert not (own.out / LOCK).exists()
 
 
+def test_a_system_without_locks_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with locked(tmp_path):
+        assert not list(tmp_path.iterdir())
+    assert "no locks here (Windows); let no second run write to it" in caplog.text
+
+
 def test_other_versions_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = config(tmp_path, None, objects=1)
     generate(own, executor=Stored())
