@@ -22,26 +22,26 @@ def run(what: DerivedLight, console: Console) -> list[Record]:
         what: the measurement.
         console: for progress and the table.
     """
-    open_folder(what.out)
-    pictures = (1 + len(what.objects)) * len(what.lights)
-    total = pictures * sum(len(methods(question)) for question in what.questions)
-    records, computed = [], 0
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
-        bar = progress.add_task("derived light", total=total)
-        for record, new in measure(what):
-            records.append(record)
-            computed += new
-            progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}")
-    made = table(records, what.questions, what.lights)
-    about = {
-        **settings(what),
-        "mitsuba": installed_version("mitsuba"),
-        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
-        "date": datetime.now(UTC).date().isoformat(),
-    }
-    line = ", ".join(f"{name} {about[name]}" for name in ("resolution", "mitsuba", "code", "date"))
-    write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{line}.\n", f"{NAME}.json": to_json(records, about)})
-    made.show(console)
-    console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
-    return records
+    with open_folder(what.out):
+        pictures = (1 + len(what.objects)) * len(what.lights)
+        total = pictures * sum(len(methods(question)) for question in what.questions)
+        records, computed = [], 0
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+            bar = progress.add_task("derived light", total=total)
+            for record, new in measure(what):
+                records.append(record)
+                computed += new
+                progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}")
+        made = table(records, what.questions, what.lights)
+        about = {
+            **settings(what),
+            "mitsuba": installed_version("mitsuba"),
+            "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
+            "date": datetime.now(UTC).date().isoformat(),
+        }
+        line = ", ".join(f"{name} {about[name]}" for name in ("resolution", "mitsuba", "code", "date"))
+        write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{line}.\n", f"{NAME}.json": to_json(records, about)})
+        made.show(console)
+        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        return records

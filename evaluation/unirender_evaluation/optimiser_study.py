@@ -1,8 +1,9 @@
 """What the studies of the optimiser share: the objects of the multi-view table, content keys, the protocol."""
 
+import contextlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.errors import UnirenderError
 from unirender.files import replace_file
 from unirender_evaluation.engine import content_key
 from unirender_evaluation.multiview_scenes import MultiviewScene, multiview_scenes, suite_scene
@@ -27,6 +27,7 @@ from unirender_evaluation.versions import (
     modules_version,
     versions,
 )
+from unirender_reference.folder_lock import locked, made_folder
 
 USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
 
@@ -106,17 +107,15 @@ class Study:
         )
 
 
-def open_folder(path: Path) -> Path:
-    """A folder to write to, made if it is not there.
+@contextlib.contextmanager
+def open_folder(path: Path) -> Iterator[Path]:
+    """A folder to write to, made if it is not there, and held against a second run.
 
     Raises:
-        UnirenderError: it cannot be made.
+        UnirenderError: it cannot be made, or another run writes to it.
     """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be made ({error.strerror}); choose another --out") from error
-    return path
+    with made_folder(path), locked(path):
+        yield path
 
 
 def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:

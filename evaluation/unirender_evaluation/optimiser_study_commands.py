@@ -47,18 +47,17 @@ class BenchIngredients:
         from unirender_evaluation.optimiser_study_measure import measure_all, rendered_protocol
         from unirender_evaluation.study_rows import chosen
 
-        console, folder = Console(), open_folder(self.out)
-        study = Study.of(self.suite, self.objects, self.seed, "optimiser_study_measure")
-        rows = chosen(ingredients(self.seed), self.variants, "--variants")
-        records = measure_all(study, rows, folder, console)
-        lines, protocol = texts.summarise(rows, records), rendered_protocol(study)
-        write_files(
-            folder,
-            {
+        console = Console()
+        with open_folder(self.out) as folder:
+            study = Study.of(self.suite, self.objects, self.seed, "optimiser_study_measure")
+            rows = chosen(ingredients(self.seed), self.variants, "--variants")
+            records = measure_all(study, rows, folder, console)
+            lines, protocol = texts.summarise(rows, records), rendered_protocol(study)
+            files = {
                 "ingredients.md": texts.to_markdown(lines, protocol),
                 "ingredients.json": texts.to_json(lines, records, protocol),
-            },
-        )
+            }
+            write_files(folder, files)
         texts.show(console, lines, protocol)
         return 0
 
@@ -101,15 +100,16 @@ class BenchRace:
         from unirender_evaluation.optimiser_study_race_report import draw, race_table, to_json
         from unirender_reference.optimize.config import OptimizeConfig
 
-        console, folder = Console(), open_folder(self.out)
-        study = Study.of(self.suite, self.objects, self.seed, "optimiser_study_race")
-        settings = RaceSettings(OptimizeConfig(seed=self.seed), self.iterations, self.losses, self.every)
-        races = race_all(study, settings, folder, console)
-        protocol = study.protocol(
-            **{"plain loop": f"Adam, {self.iterations} steps of 16 samples, measured every {self.every} steps"}
-        )
-        table = race_table(races, protocol)
-        files = {"race.md": table.markdown(), "race.json": to_json(races, protocol), "race.png": draw(races)}
-        write_files(folder, files)
+        console = Console()
+        with open_folder(self.out) as folder:
+            study = Study.of(self.suite, self.objects, self.seed, "optimiser_study_race")
+            settings = RaceSettings(OptimizeConfig(seed=self.seed), self.iterations, self.losses, self.every)
+            races = race_all(study, settings, folder, console)
+            protocol = study.protocol(
+                **{"plain loop": f"Adam, {self.iterations} steps of 16 samples, measured every {self.every} steps"}
+            )
+            table = race_table(races, protocol)
+            files = {"race.md": table.markdown(), "race.json": to_json(races, protocol), "race.png": draw(races)}
+            write_files(folder, files)
         table.show(console)
         return 0

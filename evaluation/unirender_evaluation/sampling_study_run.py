@@ -28,30 +28,30 @@ def run(what: SamplingStudy, scenes: Sequence[Scene], console: Console) -> list[
         scenes: at least one.
         console: for progress and tables.
     """
-    open_folder(what.out)
-    records, computed = [], 0
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
-        bar = progress.add_task("sampling", total=len(scenes) * len(what.settings) * len(PROTOCOLS))
-        for record, new in measure(what, scenes):
-            records.append(record)
-            computed += new
-            progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
-    about = protocol(what, scenes)
-    made = sampling_study_tables.tables(records, what.settings, about)
-    files: dict[str, str | bytes] = {
-        f"{NAME}.md": "\n".join(table.markdown() for table in made),
-        f"{NAME}.json": sampling_study_tables.to_json(records, what.settings, about),
-        STEPS_PLOT: draw_steps(records, what.settings),
-    }
-    if (shown := sampling_study_tables.headline(what.settings)) is not None:
-        files[RELIABILITY_PLOT] = draw_reliability(records, shown)
-    write_files(what.out, files)
-    for table in made:
-        table.show(console)
-    names = ", ".join(files)
-    console.print(f"{computed} new records of {len(records)}; {what.out}: {names}", highlight=False, markup=False)
-    return records
+    with open_folder(what.out):
+        records, computed = [], 0
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+            bar = progress.add_task("sampling", total=len(scenes) * len(what.settings) * len(PROTOCOLS))
+            for record, new in measure(what, scenes):
+                records.append(record)
+                computed += new
+                progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
+        about = protocol(what, scenes)
+        made = sampling_study_tables.tables(records, what.settings, about)
+        files: dict[str, str | bytes] = {
+            f"{NAME}.md": "\n".join(table.markdown() for table in made),
+            f"{NAME}.json": sampling_study_tables.to_json(records, what.settings, about),
+            STEPS_PLOT: draw_steps(records, what.settings),
+        }
+        if (shown := sampling_study_tables.headline(what.settings)) is not None:
+            files[RELIABILITY_PLOT] = draw_reliability(records, shown)
+        write_files(what.out, files)
+        for table in made:
+            table.show(console)
+        names = ", ".join(files)
+        console.print(f"{computed} new records of {len(records)}; {what.out}: {names}", highlight=False, markup=False)
+        return records
 
 
 def protocol(what: SamplingStudy, scenes: Sequence[Scene]) -> tuple[tuple[str, str], ...]:

@@ -27,17 +27,17 @@ def run(
         protocol: (what, value) pairs.
         console: for progress and tables.
     """
-    open_folder(out)
-    parts: list[Part] = []
-    for name, measure in measures.items():
-        with console.status(f"{name} ..."):
-            parts.append(measure())
-        write_files(out, {f"{NAME}.md": to_markdown(parts, protocol), f"{NAME}.json": to_json(parts, protocol)})
-        for table in parts[-1].tables:
-            table.show(console)
-    console.print(f"Protocol: {protocol_text(protocol)}.", style="dim", highlight=False, markup=False)
-    console.print(f"{out / NAME}.md, .json", highlight=False, markup=False)
-    return parts
+    with open_folder(out):
+        parts: list[Part] = []
+        for name, measure in measures.items():
+            with console.status(f"{name} ..."):
+                parts.append(measure())
+            write_files(out, {f"{NAME}.md": to_markdown(parts, protocol), f"{NAME}.json": to_json(parts, protocol)})
+            for table in parts[-1].tables:
+                table.show(console)
+        console.print(f"Protocol: {protocol_text(protocol)}.", style="dim", highlight=False, markup=False)
+        console.print(f"{out / NAME}.md, .json", highlight=False, markup=False)
+        return parts
 
 
 def to_markdown(parts: Sequence[Part], protocol: Sequence[tuple[str, str]]) -> str:

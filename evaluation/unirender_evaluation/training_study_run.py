@@ -161,17 +161,17 @@ def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], c
         scenes: at least one.
         console: for progress and tables.
     """
-    open_folder(study.out)
-    records, computed = [], 0
-    for record, new in measure(study, rows, scenes):
-        records.append(record)
-        computed += new
-    table, about = tables.table(rows, records), description(study, rows)
-    text = table.markdown() + "\n" + ", ".join(f"{name} {value}" for name, value in about.items()) + ".\n"
-    write_files(study.out, {f"{NAME}.md": text, f"{NAME}.json": tables.to_json(rows, records, about)})
-    table.show(console)
-    console.print(f"{computed} new records of {len(records)}; {study.out / NAME}.md, .json", highlight=False)
-    return records
+    with open_folder(study.out):
+        records, computed = [], 0
+        for record, new in measure(study, rows, scenes):
+            records.append(record)
+            computed += new
+        table, about = tables.table(rows, records), description(study, rows)
+        text = table.markdown() + "\n" + ", ".join(f"{name} {value}" for name, value in about.items()) + ".\n"
+        write_files(study.out, {f"{NAME}.md": text, f"{NAME}.json": tables.to_json(rows, records, about)})
+        table.show(console)
+        console.print(f"{computed} new records of {len(records)}; {study.out / NAME}.md, .json", highlight=False)
+        return records
 
 
 def description(study: TrainingStudy, rows: Sequence[Choice]) -> dict[str, str]:

@@ -32,28 +32,28 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
         progress: show where an optimisation stands.
     """
     names = {scene.key: scene_name(scene, scene_material(what.suite, scene)) for scene in scenes}
-    open_folder(what.out)
-    records, computed = [], 0
-    with contextlib.ExitStack() as shown:
+    with open_folder(what.out):
+        records, computed = [], 0
+        with contextlib.ExitStack() as shown:
 
-        def listener(scene: Scene) -> Progress | None:
-            shown.close()
-            console.print(f"{names[scene.key]}: {what.folder(scene)}", highlight=False, markup=False)
-            return shown.enter_context(live_report(console)) if progress else None
+            def listener(scene: Scene) -> Progress | None:
+                shown.close()
+                console.print(f"{names[scene.key]}: {what.folder(scene)}", highlight=False, markup=False)
+                return shown.enter_context(live_report(console)) if progress else None
 
-        for record, new in measure(what, scenes, listener):
-            shown.close()
-            records.append(record)
-            computed += new
-    made = unknown_mesh_tables.tables(records, names, what.settings)
-    about = description(what)
-    lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
-    content = unknown_mesh_tables.to_json(records, names, about)
-    write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
-    for table in made:
-        table.show(console)
-    console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
-    return records
+            for record, new in measure(what, scenes, listener):
+                shown.close()
+                records.append(record)
+                computed += new
+        made = unknown_mesh_tables.tables(records, names, what.settings)
+        about = description(what)
+        lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+        content = unknown_mesh_tables.to_json(records, names, about)
+        write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
+        for table in made:
+            table.show(console)
+        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        return records
 
 
 def scene_name(scene: Scene, material: Material) -> str:

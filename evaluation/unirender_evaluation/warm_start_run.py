@@ -41,24 +41,24 @@ def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Reco
         scenes: at least one.
         console: for progress and tables.
     """
-    open_folder(what.out)
-    records, computed = [], 0
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
-        bar = progress.add_task("warm start", total=len(scenes) * len(list(what.questions())))
-        for record, new in measure(what, scenes):
-            records.append(record)
-            computed += new
-            progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
-    made = warm_start_tables.tables(records, what.geometries)
-    about = description(what)
-    lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
-    content = warm_start_tables.to_json(records, what.geometries, about)
-    write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
-    for table in made:
-        table.show(console)
-    console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
-    return records
+    with open_folder(what.out):
+        records, computed = [], 0
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+            bar = progress.add_task("warm start", total=len(scenes) * len(list(what.questions())))
+            for record, new in measure(what, scenes):
+                records.append(record)
+                computed += new
+                progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
+        made = warm_start_tables.tables(records, what.geometries)
+        about = description(what)
+        lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+        content = warm_start_tables.to_json(records, what.geometries, about)
+        write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
+        for table in made:
+            table.show(console)
+        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        return records
 
 
 def description(what: WarmStart) -> dict[str, str]:

@@ -96,8 +96,18 @@ def test_wrong_usage_ends_before_anything_is_made(options: dict, tmp_path: Path)
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(UnirenderError, match="choose another --out"):
-        open_folder(tmp_path / "file")
+    with pytest.raises(UnirenderError, match="choose another --out"), open_folder(tmp_path / "file"):
+        pass
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_a_second_run_in_the_folder_is_refused(tmp_path: Path) -> None:
+    refused = pytest.raises(UnirenderError, match="another run is writing here")
+    with open_folder(tmp_path / "study") as held, refused:
+        BenchIngredients(out=held, objects=1).run()
+    assert list((tmp_path / "study").iterdir()) == []  # the lock is gone, and nothing was left
+    with open_folder(held):
+        pass
 
 
 @pytest.fixture(scope="module")
