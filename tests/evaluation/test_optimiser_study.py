@@ -5,7 +5,9 @@ import io
 import json
 import re
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -108,6 +110,19 @@ def test_a_second_run_in_the_folder_is_refused(tmp_path: Path) -> None:
     assert list((tmp_path / "study").iterdir()) == []  # the lock is gone, and nothing was left
     with open_folder(held):
         pass
+
+
+STUDIES = ("derived_light_study", "sampling_study", "training_study", "unknown_mesh", "warm_start")
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_every_study_holds_its_folder(study: str, tmp_path: Path) -> None:
+    run = import_module(f"unirender_evaluation.{study}_run").run
+    what = object.__new__(next(iter(get_type_hints(run).values())))  # no more of it is looked at
+    object.__setattr__(what, "out", tmp_path / "study")
+    others = {"derived_light": (QUIET,), "training": ([], [], QUIET)}.get(study.removesuffix("_study"), ([], QUIET))
+    with open_folder(what.out), pytest.raises(UnirenderError, match="another run is writing here"):
+        run(what, *others)
 
 
 @pytest.fixture(scope="module")
