@@ -218,9 +218,9 @@ def test_a_split_network_has_them_where_images_are_clean() -> None:
     assert model.inverse.vgg is not None
 
 
-@pytest.mark.parametrize(("features", "codec"), [("vgg19", "pixel"), ("vgg16", "kl")])
+@pytest.mark.parametrize(("features", "codec"), [("vgg19", "pixel"), ("vgg16", "kl"), ("encoder", "kl")])
 def test_features_that_a_network_cannot_have_are_refused(features: str, codec: str) -> None:
-    with pytest.raises(ValueError, match="expected one of none, vgg16, and 'none' where"):
+    with pytest.raises(ValueError, match="expected one of none, vgg16, encoder, and 'none' where"):
         DualStreamModel(picture_features=features, codec=codec)
 
 

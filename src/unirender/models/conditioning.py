@@ -125,6 +125,11 @@ class Packing:
         return curve_decode(self.curves[name], (0.5 * x + 0.5).clamp(0, 2))
 
 
+def coverage_of(extra: Float[Tensor, "b e h w"], factor: int) -> Float[Tensor, "b 1 H W"]:
+    """The mask in extra inputs that `Conditioning.extras` made, `factor` that of the codec."""
+    return F.pixel_shuffle(extra[:, len(TRIPLETS) : len(TRIPLETS) + factor**2], factor)
+
+
 def pack_image(image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b 3 H W"]:
     """Premultiplied linear image -> what the image stream denoises: clipped, sRGB-encoded, [-1, 1]."""
     return 2 * srgb_encode(image_linear.clamp(0, 1)) - 1

@@ -8,6 +8,7 @@ Notation: `a` attribute stream, `i` image stream; a *feature pyramid* is the tup
 The path of this module is recorded by saved checkpoints: it never moves.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -21,11 +22,13 @@ from diffusers.utils.outputs import BaseOutput
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from unirender.models.conditioning import coverage_of
 from unirender.models.light_encoder import LightEncoder
+from unirender.models.picture_encoder import PictureEncoder, Seen
 from unirender.models.picture_features import Added, PictureFeatures
 
 ALL_ROWS = slice(None)
-FEATURES = ("none", "vgg16")  # what a clean image enters through besides the image stream's own encoder
+FEATURES = ("none", "vgg16", "encoder")  # what a clean image enters through besides the image stream's own encoder
 
 
 @dataclass
@@ -37,19 +40,22 @@ class Encoded:
         time: its time embedding.
         context: what its cross-attention saw: the prompt and, of a light with an encoder of its own, the tokens.
         summary: of a clean image's features, which comes to the time embedding of the other stream's decoder.
+        skips: of them to each entry of the pyramid in that decoder; () or None: nothing.
     """
 
     features: tuple[Tensor, ...]
     time: Tensor
     context: Tensor
     summary: Tensor | None = None
+    skips: tuple[Tensor | None, ...] = ()
 
     def __getitem__(self, rows: slice) -> "Encoded":
         """The same for some samples of the batch."""
         if rows == ALL_ROWS:
             return self
         summary = None if self.summary is None else self.summary[rows]
-        return Encoded(tuple(f[rows] for f in self.features), self.time[rows], self.context[rows], summary)
+        skips = tuple(None if x is None else x[rows] for x in self.skips)
+        return Encoded(tuple(f[rows] for f in self.features), self.time[rows], self.context[rows], summary, skips)
 
 
 @dataclass
@@ -62,12 +68,14 @@ class DualStreamOutput(BaseOutput):
         encoded_attributes: the attribute stream as the image's decoder saw it. It may stand for the same latents at the
             same timestep in another call.
         encoded_image: the image stream as the attributes' decoder saw it.
+        seen: what the picture encoder's heads say of the rows whose image is clean; None without one.
     """
 
     attributes: Tensor | None = None
     image: Tensor | None = None
     encoded_attributes: Encoded | None = None
     encoded_image: Encoded | None = None
+    seen: Seen | None = None
 
 
 def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d:
@@ -86,6 +94,15 @@ def pyramid_channels(unet: UNet2DConditionModel) -> list[int]:
     for level, width in enumerate(widths):
         channels += [width] * (layers + (level < len(widths) - 1))
     return [*channels, widths[-1]]
+
+
+def pyramid_strides(unet: UNet2DConditionModel, patch: int) -> list[int]:
+    """Pixels of the picture, one way, for each pixel of the entries of the feature pyramid."""
+    levels, layers = len(tuple(unet.config["block_out_channels"])), unet.config["layers_per_block"]
+    strides = [patch]
+    for level in range(levels):
+        strides += [patch << level] * layers + [patch << level + 1] * (level < levels - 1)
+    return [*strides, patch << levels - 1]
 
 
 class DualStreamModel(ModelMixin, ConfigMixin):
@@ -121,7 +138,8 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
         light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
         derived_light: bool = False,  # s and d that were derived from a light, without shadows, have their own flag
-        picture_features: str = "none",  # "vgg16": a clean image also enters through frozen features of ImageNet
+        # a clean image also enters through frozen features of ImageNet ("vgg16"), or an "encoder" of its own
+        picture_features: str = "none",
     ):
         super().__init__()
         if not set(attention_levels) <= set(range(len(block_out_channels))):
@@ -151,10 +169,13 @@ class DualStreamModel(ModelMixin, ConfigMixin):
                 f"picture_features {picture_features!r} with codec {codec!r}: expected one of {', '.join(FEATURES)}, "
                 "and 'none' where the streams see an autoencoder's latents"
             )
-        self.patch, vgg = patch, picture_features == "vgg16"
+        self.patch, vgg, encoder = patch, picture_features == "vgg16", picture_features == "encoder"
         entering = (width, *block_out_channels[:-1])  # channels that come into each level of the encoder
         time_width = self.attribute_unet.time_embedding.linear_2.out_features
         self.vgg = PictureFeatures(entering, patch, time_width) if vgg else None
+        strides = pyramid_strides(self.attribute_unet, patch)
+        shape = (channels, strides, sample_size * patch, time_width, (rows, columns))
+        self.encoder = PictureEncoder(*shape) if encoder else None
         self.register_buffer("prompt_embedding", torch.ones(1, prompt_tokens, cross_attention_dim))
         self.prompt_embedding: Tensor
 
@@ -188,13 +209,13 @@ class DualStreamModel(ModelMixin, ConfigMixin):
             image_rows: Rows whose image is predicted; None: none.
         """
         context = self.context(attributes, image, light)
-        a, i = attributes, image
+        a, i, added = attributes, image, None
         if isinstance(a, Tensor):
             a = self.encode(self.attribute_unet, a, attributes_timestep, context, attribute_extra, self.attribute_extra)
         if isinstance(i, Tensor):
-            added = self.features_of(i, image_timestep)
+            added = self.features_of(i, image_timestep, image_extra)
             i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra, added)
-        output = DualStreamOutput()
+        output = DualStreamOutput(seen=added.seen if added else None)
         if attribute_rows is not None:
             seen = output.encoded_image = i[attribute_rows]
             output.attributes = self.decode(self.attribute_unet, a[attribute_rows], seen, self.image_to_attributes)
@@ -218,12 +239,19 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         prompt = self.prompt_embedding.to(image.dtype).expand(len(image), -1, -1)
         return prompt if self.light_encoder is None else torch.cat([prompt, self.light_encoder(light)], dim=1)
 
-    def features_of(self, image: Float[Tensor, "b ci h w"], timestep: Int[Tensor, " b"]) -> Added | None:
+    def features_of(
+        self, image: Float[Tensor, "b ci h w"], timestep: Int[Tensor, " b"], extra: Tensor | None
+    ) -> Added | None:
         """What the features of clean images add; None without any."""
         clean = timestep == 0
-        if self.vgg is None or not clean.any():
+        if (self.vgg is None and self.encoder is None) or not clean.any():
             return None
-        return self.vgg(F.pixel_shuffle(image, self.patch), clean)
+        picture = F.pixel_shuffle(image, self.patch)
+        if self.vgg is not None:
+            return self.vgg(picture, clean)
+        assert self.encoder is not None
+        assert extra is not None, "they hold the mask"
+        return self.encoder(picture, coverage_of(extra, self.patch), clean)
 
     def encode(
         self,
@@ -254,11 +282,14 @@ class DualStreamModel(ModelMixin, ConfigMixin):
             features += tuple(skips)
         assert unet.mid_block is not None
         hidden = unet.mid_block(hidden, time, encoder_hidden_states=context)
-        return Encoded((*features, hidden), time, context, added.summary if added else None)
+        encoded = Encoded((*features, hidden), time, context)
+        return dataclasses.replace(encoded, summary=added.summary, skips=tuple(added.skips)) if added else encoded
 
     def decode(self, unet: UNet2DConditionModel, own: Encoded, other: Encoded, bridge: nn.ModuleList) -> Tensor:
         """Runs one decoder on its own features plus the other stream's, brought over by zero convolutions."""
         fused = [mine + conv(theirs) for mine, theirs, conv in zip(own.features, other.features, bridge, strict=True)]
+        for n, skip in enumerate(other.skips):
+            fused[n] = fused[n] if skip is None else fused[n] + skip
         hidden, skips = fused[-1], fused[:-1]
         time = own.time if other.summary is None else own.time + other.summary
         for block in unet.up_blocks:

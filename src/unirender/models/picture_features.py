@@ -19,6 +19,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -41,12 +42,16 @@ class Added:
     """What the features of a batch add to a network; zeros in rows without any.
 
     Attributes:
-        levels: to what comes into each level that has a stage, finest first.
-        summary: to the time embedding.
+        levels: to what comes into each level of the image stream's encoder that has a stage, finest first.
+        summary: to the time embedding of the attribute stream's decoder.
+        skips: to each entry of the feature pyramid that comes to that decoder; None: nothing.
+        seen: what a `unirender.models.picture_encoder.PictureEncoder` says itself; None of other features.
     """
 
     levels: Sequence[Tensor]
     summary: Float[Tensor, "b e"]
+    skips: Sequence[Tensor | None] = ()
+    seen: Any = None
 
 
 class PictureFeatures(nn.Module):

@@ -32,7 +32,7 @@ class SplitDualStreamModel(DualStreamModel):
         self.inverse.attributes_to_image = nn.ModuleList()
         remove_decoder(self.inverse.image_unet)
         self.inverse.light_encoder = None  # no light is given where it is asked for
-        self.vgg = None  # and where an image is asked for, none is clean
+        self.vgg, self.encoder = None, None  # and where an image is asked for, none is clean
 
     def forward(
         self,
@@ -57,6 +57,7 @@ class SplitDualStreamModel(DualStreamModel):
         if attribute_rows is not None:
             inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
             found.attributes, found.encoded_image = inverse.attributes, inverse.encoded_image
+            found.seen = inverse.seen
         if image_rows is not None:
             lit = None if light is None else light[image_rows]
             rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)

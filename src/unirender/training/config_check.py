@@ -41,7 +41,7 @@ RANGES: dict[str, Range] = {
     **{f"loss.{name}": _NOT_NEGATIVE for name in ("material", "albedo", "normal", "specular", "diffuse")},
     **{
         f"loss.{name}": _NOT_NEGATIVE
-        for name in ("environment", "image", "image_floor", "colour_floor", "background", "cycle", "composite")
+        for name in ("environment", "image", "image_floor", "colour_floor", "background", "cycle", "seen", "composite")
     },
     "loss.snr_bound": Range(1),  # the weight's floor
     **dict.fromkeys(("optimizer.learning_rate", "optimizer.clip_norm"), _POSITIVE),
@@ -62,3 +62,13 @@ def check_config(config: TrainConfig) -> None:
         value = operator.attrgetter(name)(config)
         if value not in allowed:
             raise UnirenderError(f"training config: {name} is {value!r}, expected {allowed}; correct it in the preset")
+    encoder = config.model.picture_features == "encoder"
+    if config.trains == "encoder" and not (encoder and config.loss.seen):
+        raise UnirenderError(
+            "training config: trains is 'encoder', expected picture_features 'encoder' and loss.seen above 0"
+        )
+    if config.trains != "all" and (config.p_render or config.timestep_rule != "conditional"):
+        raise UnirenderError(
+            f"training config: trains is {config.trains!r}, which renders nothing; expected p_render 0 and the "
+            "conditional rule of timesteps"
+        )

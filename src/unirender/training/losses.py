@@ -17,12 +17,14 @@ from torch import Tensor
 
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.picture_encoder import Seen, seen_error, truth_of
 from unirender.models.priors import Maps
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights
 from unirender.training.presets import LossConfig
+from unirender.training.trained import encoder_of
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without
 
@@ -32,6 +34,7 @@ class LossFunction:
     """The loss of a model under a config.
 
     Attributes:
+        encoder_alone: whether only what the picture encoder's heads say is compared; nothing goes through the streams.
         cycle_scale: multiplies the cycle's weight; the trainer raises it from 0 after the warm-up.
     """
 
@@ -41,6 +44,7 @@ class LossFunction:
     config: LossConfig
     map_dropout: float = 0.0
     cycle_scale: float = 1.0
+    encoder_alone: bool = False
 
     def terms(self, batch: Maps, timesteps: Timesteps, generator: torch.Generator) -> LossTerms:
         """The loss terms of a batch; {} where nothing is noisy.
@@ -54,6 +58,8 @@ class LossFunction:
                 do not stand together; under Section 3.2's rule they do.
             generator: CPU generator of noise and dropped maps.
         """
+        if self.encoder_alone:
+            return self._encoder_terms(batch)
         clean_a, clean_i = self._encode(batch)
         seen, derived = self._seen(batch, timesteps.attributes == 0)
         shown_a = clean_a if seen is batch else self._encode_attributes(seen)
@@ -69,6 +75,8 @@ class LossFunction:
         output = predict(self.model, attributes, image, timesteps, extras, span_a, span_i)
         errors = Errors(self.conditioning, self.config.background)
         terms: LossTerms = {}
+        if output.seen is not None and self.config.seen:
+            terms["seen"] = self._seen_error(output.seen, {n: v[~noisy_i] for n, v in batch.items()})
         if span_i is not None:
             assert output.image is not None
             rows = _Rows(span_i, noisy_i)
@@ -107,6 +115,19 @@ class LossFunction:
     @torch.no_grad()
     def _encode_attributes(self, batch: Maps) -> Tensor:
         return self.conditioning.encode_attributes(batch)
+
+    def _encoder_terms(self, batch: Maps) -> LossTerms:
+        """Of the picture encoder by itself: every image is clean."""
+        encoder = encoder_of(self.model)
+        assert encoder is not None, "the config was checked"
+        return {"seen": self._seen_error(encoder.look(pack_image(batch["image"]), batch["mask"])[2], batch)}
+
+    def _seen_error(self, said: Seen, batch: Maps) -> Float[Tensor, ""]:
+        packing, cells = self.conditioning.packing, (said.cells.shape[-2], said.cells.shape[-1])
+        with torch.no_grad():
+            light = packing.pack_light(batch["environment"])
+            truth, covered = truth_of(packing.pack(batch), batch["mask"], light, cells)
+        return seen_error(said, truth, covered)
 
     def _seen(self, batch: Maps, clean: Bool[Tensor, " b"]) -> tuple[Maps, Bool[Tensor, "b 6"] | None]:
         """The maps that a renderer sees, in which s and d may have been derived from the light; and which were."""

@@ -32,6 +32,7 @@ STEPS, A, B, C = 5, 3.4445, -4.775, 2.0315  # of the iteration; Jordan et al.
 STEP_RMS = 0.2  # of AdamW's update; Liu et al.
 LEAST_SIDE = 32  # smaller matrices have few directions
 KEPT = frozenset(("conv_in", "conv_out", "time_embedding", "attribute_extra", "image_extra"))
+KEPT |= frozenset(("stem", "heads", "adapters", "summary"))  # of a clean picture's features
 KEPT_BETWEEN = frozenset(("attributes_to_image", "image_to_attributes"))
 
 

@@ -37,6 +37,7 @@ OWN_ROWS = (
     "environment",
     "composite",
     "cycle",
+    "seen",
 )  # terms that are means over rows, or with weights, of their own
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
@@ -133,7 +134,7 @@ class BatchGradient:
             The loss terms of the whole batch.
         """
         model: nn.Module = self.loss.model
-        parameters = list(model.parameters())
+        parameters = [p for p in model.parameters() if p.requires_grad]
         parts = self.parts(batch)
         mass = _sum(self.split.processes.gather(_sum(part.mass for part in parts)))
 
@@ -184,6 +185,7 @@ class BatchGradient:
             a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
             w = weight[rows]
             mass = {"image": w[i > 0], "attributes": w[a > 0], "environment": a > 0, "composite": w[x], "cycle": w[y]}
+            mass["seen"] = i == 0
             seed = seeds[split.processes.rank + split.processes.size * j]
             share = int(y.sum()) / max(1, int(x.sum()))
             parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))

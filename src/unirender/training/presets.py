@@ -32,7 +32,8 @@ class ModelConfig:
     # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
     light: Literal["latent", "encoder"] = "latent"
     derived_light: bool = False  # the network is told which of s and d were derived from a light, without shadows
-    picture_features: Literal["none", "vgg16"] = "none"  # a clean image also enters through frozen features of ImageNet
+    # a clean image also enters through frozen features of ImageNet, or through an encoder of its own
+    picture_features: Literal["none", "vgg16", "encoder"] = "none"
     unified: bool = True  # False: a network for each direction, and the widths are those of each
 
 
@@ -56,6 +57,7 @@ class LossConfig:
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
     cycle_steps: int = 1  # 1: what is rendered again is the step's own prediction; more: a sample of so many steps
+    seen: float = 0.0  # weight of what the picture encoder's heads say; 0: not compared
     composite: float = 0.0  # weight of the closed-form image of the predicted maps; 0: none
     # how the squared error of x0 counts by its timestep; see `unirender.training.loss_terms.timestep_weights`
     timestep_weight: Literal["none", "v", "min_snr"] = "none"
@@ -104,6 +106,7 @@ class TrainConfig:
     batch_size: int = 16
     group_size: int = 1  # pictures side by side in a batch that differ in one thing only; 1: they may differ in all
     steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
+    trains: Literal["all", "encoder", "inverse"] = "all"  # which weights; see `unirender.training.trained`
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
     p_render: float = 0.5  # share of rendering; the paper's p_direction
     p_t: float = 0.5  # share of random t instead of T
@@ -139,6 +142,17 @@ _SMALL = dataclasses.replace(  # the network of `tiny_renderer`, whose weights i
     loss=dataclasses.replace(_TINY_RENDERER.loss, colour_floor=1e-2, albedo=8.0, specular=6.0, diffuse=8.0),
     augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
     p_render=0.25,
+)
+# `tiny` with a picture encoder: first that alone, then with the decoder that it serves.
+_TINY_ENCODER = dataclasses.replace(
+    _TINY_RENDERER,
+    model=dataclasses.replace(_TINY_RENDERER.model, picture_features="encoder"),
+    loss=dataclasses.replace(_SMALL.loss, seen=1.0),
+    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
+    optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3),
+    batch_size=96,
+    trains="encoder",
+    p_render=0.0,
 )
 _SD_MODEL = ModelConfig(
     resolution=512,
@@ -180,6 +194,10 @@ PRESETS: dict[str, TrainConfig] = {
         p_render=0.25,
     ),
     "tiny_renderer": _TINY_RENDERER,
+    "tiny_encoder": _TINY_ENCODER,
+    "tiny_inverse": dataclasses.replace(
+        _TINY_ENCODER, trains="inverse", batch_size=24, optimizer=OptimizerConfig(kind="muon")
+    ),
     "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),

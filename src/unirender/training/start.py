@@ -23,7 +23,7 @@ from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
 
-FEATURES_PREFIXES = ("vgg.", "inverse.vgg.")  # of the entries of `PictureFeatures` in a network
+FEATURES_PREFIXES = ("vgg.", "inverse.vgg.", "encoder.", "inverse.encoder.")  # of the entries of a picture's features
 _KINDS = {True: "one network for both directions (unified)", False: "a network for each direction (unified=False)"}
 
 

@@ -40,6 +40,7 @@ from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource
 from unirender.training.stopping import stopping_gently
+from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
 
 
@@ -94,9 +95,11 @@ class Trainer:
         for p in model.parameters():
             if p.dim() == 4:
                 p.data = p.data.contiguous(memory_format=torch.channels_last)
+        train_only(model, config.trains)
         self.model = model
         self.generator = torch.Generator().manual_seed(config.seed)
         self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
+        self.loss.encoder_alone = config.trains == "encoder"
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
         self.optimizer = make_optimizer(self.model, config.optimizer, self.gradient.pool)
         self.ema = Ema(self.model, config.optimizer.ema_decay)

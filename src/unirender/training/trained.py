@@ -1,0 +1,35 @@
+"""Which weights a run trains: all of them, the picture encoder by itself, or whatever inverse rendering alone uses.
+
+all       the whole network
+encoder   the picture encoder, against what its heads should say; no pass through the streams
+inverse   the picture encoder, the attribute stream's decoder, and what comes into it from the image stream: nothing
+          that renders uses any of these, so that rendering is the same to the bit before and after
+"""
+
+from torch import nn
+
+from unirender.models.dual_stream import DualStreamModel
+from unirender.models.picture_encoder import PictureEncoder
+
+DECODER = ("up_blocks", "conv_norm_out", "conv_out")
+
+
+def train_only(model: DualStreamModel, trains: str) -> None:
+    """Freezes all weights but those that `TrainConfig.trains` names."""
+    if trains == "all":
+        return
+    nn.Module.requires_grad_(model, requires_grad=False)
+    for part in model.modules():
+        if isinstance(part, PictureEncoder):
+            part.requires_grad_()
+        if trains == "inverse" and isinstance(part, DualStreamModel):
+            part.image_to_attributes.requires_grad_()
+            for name in DECODER:
+                layers = getattr(part.attribute_unet, name, None)  # a network that only renders has none
+                if layers is not None:
+                    layers.requires_grad_()
+
+
+def encoder_of(model: nn.Module) -> PictureEncoder | None:
+    """The picture encoder of a network; None where it has none."""
+    return next((part for part in model.modules() if isinstance(part, PictureEncoder)), None)

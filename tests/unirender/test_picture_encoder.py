@@ -1,0 +1,303 @@
+"""A picture encoder of the network's own: what it sees, where it enters, and how it is trained."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from tiny_models import SIZE, TRAIN, make_batch, make_model, make_pipeline
+from torch import Tensor
+
+from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.diffusion.schedule import make_scheduler
+from unirender.errors import UnirenderError
+from unirender.models.conditioning import TRIPLETS, Conditioning, coverage_of, pack_image
+from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
+from unirender.models.picture_encoder import (
+    CELLS_WEIGHT,
+    LIGHT_WEIGHT,
+    PICTURES,
+    PictureEncoder,
+    Seen,
+    over_object,
+    seen_error,
+    truth_of,
+)
+from unirender.training.config_check import check_config
+from unirender.training.data import Batch
+from unirender.training.export import export_pipeline
+from unirender.training.presets import PRESETS, TrainConfig
+from unirender.training.start import begin_with_network
+from unirender.training.trained import encoder_of
+from unirender.training.trainer import RunConfig, Trainer
+
+ENCODED = dataclasses.replace(
+    TRAIN,
+    model=dataclasses.replace(TRAIN.model, picture_features="encoder"),
+    loss=dataclasses.replace(TRAIN.loss, seen=1.0),
+    p_render=0.0,
+)
+BOTH = pytest.mark.parametrize("unified", [True, False], ids=["unified", "split"])
+
+
+class Batches:
+    """The same batch again and again."""
+
+    def next(self) -> Batch:
+        return make_batch(ENCODED.batch_size)
+
+    def read_ahead(self) -> None: ...
+
+    def state_dict(self) -> dict:
+        return {}
+
+    def load_state_dict(self, state: dict) -> None: ...
+
+    def refresh(self) -> None: ...
+
+
+def decompose(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor], steps: int = 1) -> Tensor:
+    seed = torch.Generator().manual_seed(0)
+    return infer_attributes(*parts, make_scheduler(), maps["image"], maps["mask"], steps=steps, generator=seed)[
+        "albedo"
+    ]
+
+
+def render(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor]) -> Tensor:
+    given = torch.ones(len(maps["mask"]), len(TRIPLETS), dtype=torch.bool)
+    return infer_image(*parts, make_scheduler(), maps, given, generator=torch.Generator().manual_seed(0))
+
+
+def trainer(folder: Path, config: TrainConfig = ENCODED, steps: int = 3) -> Trainer:
+    return Trainer(config, RunConfig(folder, steps=steps), torch.device("cpu"), torch.float32)
+
+
+def encoder(model: DualStreamModel) -> PictureEncoder:
+    found = encoder_of(model)
+    assert found is not None
+    return found
+
+
+# --- what it sees
+
+
+def test_mean_and_deviation_are_of_the_object_alone() -> None:
+    x = torch.full((1, 2, 4, 4), 100.0)
+    x[:, 0, :, :2], x[:, 1, :, :2] = 3.0, 0.0
+    x[:, 1, :2, :2] = 1.0
+    coverage = torch.zeros(1, 1, 8, 8)
+    coverage[..., :4] = 1
+    torch.testing.assert_close(over_object(x, coverage), torch.tensor([[3.0, 0.5, 0.0, 0.5]]), rtol=0, atol=2e-3)
+    assert torch.isfinite(over_object(x, torch.zeros(1, 1, 8, 8))).all()
+
+
+def test_the_truth_is_the_mean_over_the_object() -> None:
+    _, conditioning = make_model()
+    maps = make_batch(3)
+    packing = conditioning.packing
+    truth, covered = truth_of(packing.pack(maps), maps["mask"], packing.pack_light(maps["environment"]), (4, 4))
+    inside = maps["mask"][0, 0] > 0
+    for n in range(3):
+        assert truth.whole[n, 0] == pytest.approx(2 * float(maps["metallic"][n, 0][inside].mean()) - 1, abs=1e-5)
+        assert truth.whole[n, 1] == pytest.approx(2 * float(maps["roughness"][n, 0][inside].mean()) - 1, abs=1e-5)
+        assert truth.whole[n, 2] == pytest.approx(1, abs=1e-5)  # the mask itself
+    packed = packing.pack(maps)[:, 4, 8:16, 8:16].mean(dim=(1, 2))  # all of that cell is covered
+    torch.testing.assert_close(truth.cells[:, 4, 1, 1], packed)
+    assert covered[0, 0, 1, 1] == 1
+    assert covered[0, 0, 0, 0] == 0.25
+
+
+def test_the_error_counts_each_head_by_its_weight() -> None:
+    truth = Seen(torch.zeros(2, PICTURES), torch.zeros(2, PICTURES, 2, 2), torch.zeros(2, 3, 4, 8))
+    covered = torch.tensor([1.0, 0.0, 0.0, 0.0]).reshape(1, 1, 2, 2).expand(2, -1, -1, -1)
+
+    def error(**changes: Tensor) -> float:
+        return float(seen_error(dataclasses.replace(truth, **changes), truth, covered))
+
+    metallic, mask = torch.zeros(2, PICTURES), torch.zeros(2, PICTURES)
+    metallic[:, 0], mask[:, 2] = 0.5, 0.5
+    assert error() == 0
+    assert error(whole=metallic) == pytest.approx(0.25)
+    assert error(whole=mask) == 0  # it is given
+    outside = torch.zeros(2, PICTURES, 2, 2)
+    outside[..., 1, 1] = 1.0
+    assert error(cells=outside) == 0
+    outside[:, 0, 0, 0] = 1.0
+    assert error(cells=outside) == pytest.approx(CELLS_WEIGHT)
+    assert error(light=torch.full_like(truth.light, 2.0)) == pytest.approx(4 * LIGHT_WEIGHT)
+
+
+def test_the_mask_comes_with_the_extra_inputs() -> None:
+    _, conditioning = make_model()
+    mask = torch.rand(2, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    extras = conditioning.extras(mask, torch.zeros(2, len(TRIPLETS), dtype=torch.bool))
+    assert torch.equal(coverage_of(extras.image, conditioning.codec.factor), mask)
+
+
+# --- in the network
+
+
+@pytest.mark.parametrize(("resolution", "stages"), [(64, (0, 1, 2, 3)), (128, (None, 0, 1, 2))])
+def test_a_stage_goes_where_the_decoder_has_its_size(resolution: int, stages: tuple[int | None, ...]) -> None:
+    model = DualStreamModel(
+        sample_size=resolution // 2, block_out_channels=(32, 32, 64, 64), picture_features="encoder"
+    )
+    strides = pyramid_strides(model.attribute_unet, 2)
+    assert len(strides) == len(pyramid_channels(model.attribute_unet))
+    by_stride = dict(zip(strides, encoder(model).stage_of, strict=True))
+    assert tuple(by_stride[2 << level] for level in range(4)) == stages
+    extra = torch.zeros(1, 12, resolution // 2, resolution // 2)  # nothing is added where nothing has been learned
+    added = model.features_of(torch.zeros_like(extra), torch.zeros(1, dtype=torch.long), extra)
+    assert added is not None
+    assert all(skip is None or not skip.any() for skip in added.skips)
+
+
+def test_pictures_that_do_not_become_64_are_refused() -> None:
+    with pytest.raises(ValueError, match="got pictures of 96 pixels, expected a multiple of 64"):
+        PictureEncoder([8], [2], 96, 24, (16, 32))
+
+
+@BOTH
+def test_a_new_encoder_changes_nothing(unified: bool) -> None:
+    maps = make_batch(2)
+    with_it, without = make_model(unified=unified, picture_features="encoder"), make_model(unified=unified)
+    for part in (encoder(with_it[0]).adapters, encoder(with_it[0]).summary):
+        for parameter in part.parameters():
+            torch.nn.init.zeros_(parameter)
+    without[0].load_state_dict({k: v for k, v in with_it[0].state_dict().items() if "encoder." not in k})
+    assert torch.equal(decompose(with_it, maps), decompose(without, maps))
+
+
+@BOTH
+def test_it_informs_the_decomposition_and_not_the_render(unified: bool) -> None:
+    maps, parts = make_batch(2), make_model(unified=unified, picture_features="encoder")
+    before = decompose(parts, maps), render(parts, maps)
+    for parameter in encoder(parts[0]).parameters():
+        torch.nn.init.zeros_(parameter)
+    assert (decompose(parts, maps) - before[0]).abs().max() > 1e-3
+    assert torch.equal(render(parts, maps), before[1])
+
+
+def test_each_way_into_the_decoder_counts() -> None:
+    maps, parts = make_batch(2), make_model(picture_features="encoder")
+    for module in (encoder(parts[0]).summary, *encoder(parts[0]).adapters.values()):
+        before, kept = decompose(parts, maps), [p.clone() for p in module.parameters()]
+        for parameter in module.parameters():
+            torch.nn.init.zeros_(parameter)
+        assert (decompose(parts, maps) - before).abs().max() > 1e-4
+        with torch.no_grad():
+            for parameter, value in zip(module.parameters(), kept, strict=True):
+                parameter.copy_(value)
+
+
+def test_the_mask_is_looked_at() -> None:
+    """Two masks that agree wherever the picture is not black: only the encoder's means can tell them apart."""
+    model, _ = make_model(picture_features="encoder")
+    maps = make_batch(1)
+    picture = pack_image(maps["image"])
+    whole = [encoder(model).look(picture, mask)[2].whole for mask in (maps["mask"], torch.ones_like(maps["mask"]))]
+    assert (whole[0] - whole[1]).abs().max() > 1e-4
+
+
+def test_rows_keep_to_themselves() -> None:
+    """Of a batch with clean and noisy images each row is as if it were alone."""
+    model, _ = make_model(picture_features="encoder")
+    maps = make_batch(3)
+    picture, mask = pack_image(maps["image"]), maps["mask"]
+    together = encoder(model)(picture, mask, torch.tensor([True, False, True]))
+    assert not together.summary[1].any()
+    for n, row in enumerate((0, 2)):
+        alone = encoder(model)(picture[row : row + 1], mask[row : row + 1], torch.tensor([True]))
+        torch.testing.assert_close(together.summary[row : row + 1], alone.summary)
+        torch.testing.assert_close(together.seen.whole[n : n + 1], alone.seen.whole)
+        for x, y in zip(together.skips, alone.skips, strict=True):
+            assert (x is None) == (y is None)
+            if x is not None:
+                torch.testing.assert_close(x[row : row + 1], y)
+
+
+def test_several_steps_look_once() -> None:
+    parts = make_model(picture_features="encoder")
+    looks: list[int] = []
+    encoder(parts[0]).stem.register_forward_hook(lambda *_: looks.append(1))
+    decompose(parts, make_batch(2), steps=4)
+    assert len(looks) == 1
+
+
+# --- in training
+
+
+@pytest.mark.parametrize("trains", ["encoder", "inverse"])
+def test_a_run_moves_what_it_trains_and_nothing_that_renders(trains: str, tmp_path: Path) -> None:
+    run = trainer(tmp_path / "run", dataclasses.replace(ENCODED, trains=trains))  # type: ignore[arg-type]  # a literal
+    begin_with_network(run, make_model(picture_features="encoder")[0])
+    before = {name: value.clone() for name, value in run.model.state_dict().items()}
+    maps = make_batch(2)
+    image = render((run.model, run.loss.conditioning), maps)
+    run.fit(Batches())
+    moved = {name for name, value in run.model.state_dict().items() if not torch.equal(value, before[name])}
+    heads = {"encoder"} if trains == "encoder" else {"encoder", "attribute_unet", "image_to_attributes"}
+    assert {name.split(".")[0] for name in moved} == heads
+    assert not [name for name in moved if "down_blocks" in name or "mid_block" in name]
+    assert torch.equal(render((run.model, run.loss.conditioning), maps), image)
+
+
+def test_the_encoder_learns_a_batch_by_itself(tmp_path: Path) -> None:
+    run = trainer(tmp_path / "run", dataclasses.replace(ENCODED, trains="encoder"), steps=40)
+    batch = make_batch(4)
+    errors = [run.train_step(dict(batch)) for _ in range(40)]
+    assert set(errors[0]) == {"seen", "grad_norm", "lr"}
+    assert errors[-1]["seen"] < 0.2 * errors[0]["seen"]
+
+
+def test_heads_are_compared_in_a_whole_training_too(tmp_path: Path) -> None:
+    run = trainer(tmp_path / "run", dataclasses.replace(ENCODED, p_render=0.5))
+    terms = run.train_step(make_batch(4))
+    assert terms["seen"] > 0
+    assert "image" in terms
+    silent = dataclasses.replace(ENCODED, loss=dataclasses.replace(ENCODED.loss, seen=0.0))
+    assert "seen" not in trainer(tmp_path / "silent", silent).train_step(make_batch(4))
+
+
+def test_a_network_without_an_encoder_is_given_one_and_keeps_it(tmp_path: Path) -> None:
+    plain, run = trainer(tmp_path / "a", TRAIN), trainer(tmp_path / "b")
+    begin_with_network(run, plain.model)
+    for name, value in plain.model.state_dict().items():
+        assert torch.equal(run.model.state_dict()[name], value)
+    third = trainer(tmp_path / "c")
+    begin_with_network(third, run.model)
+    assert torch.equal(encoder(third.model).stem.weight, encoder(run.model).stem.weight)
+
+
+def test_a_pipeline_keeps_its_encoder(tmp_path: Path) -> None:
+    run = trainer(tmp_path / "run")
+    run.fit(Batches())
+    folder = export_pipeline(run, tmp_path / "pipeline")
+    pipeline = type(make_pipeline()).from_pretrained(folder)
+    network = pipeline.dual_stream
+    assert network.config["picture_features"] == "encoder"
+    assert encoder(network).summary.weight.any()
+    torch.testing.assert_close(
+        encoder(network).stem.weight, dict(run.ema.average)["encoder.stem.weight"], rtol=2e-3, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"trains": "encoder", "model": TRAIN.model}, "expected picture_features 'encoder' and loss.seen above 0"),
+        ({"trains": "encoder", "loss": TRAIN.loss}, "expected picture_features 'encoder' and loss.seen above 0"),
+        ({"trains": "inverse", "p_render": 0.3}, "renders nothing; expected p_render 0"),
+        ({"trains": "inverse", "timestep_rule": "algorithm1"}, "conditional rule"),
+    ],
+)
+def test_stages_that_fit_nothing_are_refused(changes: dict, message: str) -> None:
+    with pytest.raises(UnirenderError, match=message):
+        check_config(dataclasses.replace(ENCODED, **changes))
+
+
+def test_the_presets_go_together() -> None:
+    """The weights of each stage are those that the next one begins with."""
+    assert PRESETS["tiny_encoder"].model == PRESETS["tiny_inverse"].model
+    assert PRESETS["tiny_encoder"].trains == "encoder"
+    assert PRESETS["tiny_inverse"].trains == "inverse"
