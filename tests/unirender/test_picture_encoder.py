@@ -11,6 +11,7 @@ from torch import Tensor
 from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
+from unirender.models.added import Seen
 from unirender.models.conditioning import TRIPLETS, Conditioning, coverage_of, pack_image
 from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
 from unirender.models.picture_encoder import (
@@ -18,7 +19,6 @@ from unirender.models.picture_encoder import (
     LIGHT_WEIGHT,
     PICTURES,
     PictureEncoder,
-    Seen,
     over_object,
     seen_error,
     truth_of,
@@ -26,6 +26,7 @@ from unirender.models.picture_encoder import (
 from unirender.training.config_check import check_config
 from unirender.training.data import Batch
 from unirender.training.export import export_pipeline
+from unirender.training.memory import training_bytes
 from unirender.training.presets import PRESETS, TrainConfig
 from unirender.training.start import begin_with_network
 from unirender.training.trained import encoder_of
@@ -240,6 +241,13 @@ def test_a_run_moves_what_it_trains_and_nothing_that_renders(trains: str, tmp_pa
     assert {name.split(".")[0] for name in moved} == heads
     assert not [name for name in moved if "down_blocks" in name or "mid_block" in name]
     assert torch.equal(render((run.model, run.loss.conditioning), maps), image)
+
+
+def test_frozen_weights_are_held_without_gradient_and_moments(tmp_path: Path) -> None:
+    whole = training_bytes(trainer(tmp_path / "a").model)
+    alone = trainer(tmp_path / "b", dataclasses.replace(ENCODED, trains="encoder")).model
+    held, own = training_bytes(alone), sum(p.nbytes for p in encoder(alone).parameters())
+    assert (held.weights, held.gradients, held.moments) == (whole.weights, own, 2 * own)
 
 
 def test_the_encoder_learns_a_batch_by_itself(tmp_path: Path) -> None:

@@ -22,10 +22,11 @@ from diffusers.utils.outputs import BaseOutput
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from unirender.models.added import Added, Seen
 from unirender.models.conditioning import coverage_of
 from unirender.models.light_encoder import LightEncoder
-from unirender.models.picture_encoder import PictureEncoder, Seen
-from unirender.models.picture_features import Added, PictureFeatures
+from unirender.models.picture_encoder import PictureEncoder
+from unirender.models.picture_features import PictureFeatures
 
 ALL_ROWS = slice(None)
 FEATURES = ("none", "vgg16", "encoder")  # what a clean image enters through besides the image stream's own encoder

@@ -21,38 +21,23 @@ l of the feature pyramid of `unirender.models.dual_stream`.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from unirender.models.picture_features import EPSILON, Added
+from unirender.models.added import Added, Seen
 
 SIDE = 64  # pixels along each side of the picture that it sees
 WIDTHS, BLOCKS = (32, 64, 128, 256), (1, 2, 2, 2)  # channels and residual blocks of each stage, finest first
 GROUP = 16  # channels of a group of the normalisation
 HIDDEN = 384
+EPSILON = 1e-3  # beside sums over an object, which may be empty
 PICTURES = 15  # channels of the attribute pictures without the light: material, albedo, normal, s, d
 # of each channel's squared error: metallic, roughness, mask; albedo; normal; s; d
 CHANNEL_WEIGHTS = (1.0, 1.0, 0.0, *3 * (1.0,), *3 * (0.3,), *3 * (0.5,), *3 * (0.5,))
 CELLS_WEIGHT, LIGHT_WEIGHT = 0.1, 0.5  # beside 1 of the whole
-
-
-@dataclass(frozen=True)
-class Seen:
-    """What the heads say; of packed pictures, in [-1, 1].
-
-    Attributes:
-        whole: mean over the object.
-        cells: mean over the object inside each cell.
-        light: packed.
-    """
-
-    whole: Float[Tensor, "b 15"]
-    cells: Float[Tensor, "b 15 h w"]
-    light: Float[Tensor, "b 3 eh ew"]
 
 
 class Block(nn.Module):

@@ -17,9 +17,7 @@ Notation: b batch, H W image size, s stage, l level, c channels.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -29,29 +27,13 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from unirender.errors import UnirenderError
+from unirender.models.added import Added
 from unirender.paths import cache_dir
 
 STAGES = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512))  # output channels of each stage's 3x3 convolutions
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, sRGB in [0, 1]
 BLACK = -1 + 1 / 255  # of packed pictures
 EPSILON = 1e-3  # beside the root mean square of an activation: where nothing is seen nothing is amplified
-
-
-@dataclass(frozen=True)
-class Added:
-    """What the features of a batch add to a network; zeros in rows without any.
-
-    Attributes:
-        levels: to what comes into each level of the image stream's encoder that has a stage, finest first.
-        summary: to the time embedding of the attribute stream's decoder.
-        skips: to each entry of the feature pyramid that comes to that decoder; None: nothing.
-        seen: what a `unirender.models.picture_encoder.PictureEncoder` says itself; None of other features.
-    """
-
-    levels: Sequence[Tensor]
-    summary: Float[Tensor, "b e"]
-    skips: Sequence[Tensor | None] = ()
-    seen: Any = None
 
 
 class PictureFeatures(nn.Module):

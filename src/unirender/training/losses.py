@@ -17,9 +17,10 @@ from torch import Tensor
 
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
+from unirender.models.added import Seen
 from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.picture_encoder import Seen, seen_error, truth_of
+from unirender.models.picture_encoder import seen_error, truth_of
 from unirender.models.priors import Maps
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights

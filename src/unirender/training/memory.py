@@ -32,18 +32,21 @@ class TrainingBytes:
 
 
 def training_bytes(model: nn.Module, optimizer: str = "adamw") -> TrainingBytes:
-    """Bytes of the training of all parameters of a model, of which each is kept in its own precision.
+    """Bytes of the training of a model's parameters, of which each is kept in its own precision; frozen ones have
+    neither gradient nor moments.
 
     Args:
         model: the network.
         optimizer: `OptimizerConfig.kind`.
     """
     one_moment = optimizer == "muon"
-    weights = moments = 0
+    weights = gradients = moments = 0
     for name, p in model.named_parameters():
         weights += p.nbytes
-        moments += p.nbytes if one_moment and is_hidden_matrix(name, p) else 2 * p.nbytes
-    return TrainingBytes(weights, gradients=weights, moments=moments, average=weights)
+        if p.requires_grad:
+            gradients += p.nbytes
+            moments += p.nbytes if one_moment and is_hidden_matrix(name, p) else 2 * p.nbytes
+    return TrainingBytes(weights, gradients=gradients, moments=moments, average=weights)
 
 
 def readable(number: int) -> str:
