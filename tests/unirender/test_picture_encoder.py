@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_models import SIZE, TRAIN, make_batch, make_model, make_pipeline
+from tiny_models import SIZE, TRAIN, make_batch, make_model
 from torch import Tensor
 
 from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.diffusion.schedule import make_scheduler
-from unirender.errors import UnirenderError
-from unirender.models.added import Seen
+from unirender.errors import UnirenderError, UsageError
+from unirender.models.added import Answers
 from unirender.models.conditioning import TRIPLETS, Conditioning, coverage_of, pack_image
 from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
 from unirender.models.picture_encoder import (
@@ -19,23 +19,25 @@ from unirender.models.picture_encoder import (
     LIGHT_WEIGHT,
     PICTURES,
     PictureEncoder,
+    answers_error,
     over_object,
-    seen_error,
     truth_of,
 )
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.config_check import check_config
 from unirender.training.data import Batch
 from unirender.training.export import export_pipeline
 from unirender.training.memory import training_bytes
 from unirender.training.presets import PRESETS, TrainConfig
-from unirender.training.start import begin_with_network
+from unirender.training.run import Train
+from unirender.training.start import begin_with_network, read_start
 from unirender.training.trained import encoder_of
 from unirender.training.trainer import RunConfig, Trainer
 
 ENCODED = dataclasses.replace(
     TRAIN,
     model=dataclasses.replace(TRAIN.model, picture_features="encoder"),
-    loss=dataclasses.replace(TRAIN.loss, seen=1.0),
+    loss=dataclasses.replace(TRAIN.loss, answers=1.0),
     p_render=0.0,
 )
 BOTH = pytest.mark.parametrize("unified", [True, False], ids=["unified", "split"])
@@ -109,11 +111,11 @@ def test_the_truth_is_the_mean_over_the_object() -> None:
 
 
 def test_the_error_counts_each_head_by_its_weight() -> None:
-    truth = Seen(torch.zeros(2, PICTURES), torch.zeros(2, PICTURES, 2, 2), torch.zeros(2, 3, 4, 8))
+    truth = Answers(torch.zeros(2, PICTURES), torch.zeros(2, PICTURES, 2, 2), torch.zeros(2, 3, 4, 8))
     covered = torch.tensor([1.0, 0.0, 0.0, 0.0]).reshape(1, 1, 2, 2).expand(2, -1, -1, -1)
 
     def error(**changes: Tensor) -> float:
-        return float(seen_error(dataclasses.replace(truth, **changes), truth, covered))
+        return float(answers_error(dataclasses.replace(truth, **changes), truth, covered))
 
     metallic, mask = torch.zeros(2, PICTURES), torch.zeros(2, PICTURES)
     metallic[:, 0], mask[:, 2] = 0.5, 0.5
@@ -138,6 +140,34 @@ def test_the_mask_comes_with_the_extra_inputs() -> None:
 # --- in the network
 
 
+@pytest.mark.parametrize("features", ["encoder", "vgg16"])
+def test_a_network_in_half_precision_sees_as_well(features: str) -> None:
+    """`--dtype auto` may choose it, and then no autocast brings dtypes together."""
+    maps = make_batch(2)
+    model, conditioning = make_model(picture_features=features)
+    if features == "vgg16":
+        for name, kernel in model.named_buffers():
+            if "kernel" in name:
+                kernel.normal_(0, 0.05)
+    exact = decompose((model, conditioning), maps)
+    torch.nn.Module.to(model, torch.bfloat16)
+    assert (decompose((model, conditioning), maps) - exact).abs().mean() < 0.03
+
+
+def test_at_another_size_it_sees_the_whole_picture_at_its_own() -> None:
+    """What it says is that of the same picture, averaged; its stages reach the decoder at the decoder's size."""
+    model, conditioning = make_model(picture_features="encoder", resolution=64)
+    maps = make_batch(1, size=64)
+    large = {
+        name: value if name == "environment" else value.repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+        for name, value in maps.items()
+    }
+    look = encoder(model).look
+    small, same = (look(pack_image(m["image"]), m["mask"])[2].whole for m in (maps, large))
+    torch.testing.assert_close(small, same, rtol=0, atol=1e-5)
+    assert decompose((model, conditioning), large).shape == (1, 3, 128, 128)
+
+
 @pytest.mark.parametrize(("resolution", "stages"), [(64, (0, 1, 2, 3)), (128, (None, 0, 1, 2))])
 def test_a_stage_goes_where_the_decoder_has_its_size(resolution: int, stages: tuple[int | None, ...]) -> None:
     model = DualStreamModel(
@@ -151,11 +181,6 @@ def test_a_stage_goes_where_the_decoder_has_its_size(resolution: int, stages: tu
     added = model.features_of(torch.zeros_like(extra), torch.zeros(1, dtype=torch.long), extra)
     assert added is not None
     assert all(skip is None or not skip.any() for skip in added.skips)
-
-
-def test_pictures_that_do_not_become_64_are_refused() -> None:
-    with pytest.raises(ValueError, match="got pictures of 96 pixels, expected a multiple of 64"):
-        PictureEncoder([8], [2], 96, 24, (16, 32))
 
 
 @BOTH
@@ -207,10 +232,11 @@ def test_rows_keep_to_themselves() -> None:
     picture, mask = pack_image(maps["image"]), maps["mask"]
     together = encoder(model)(picture, mask, torch.tensor([True, False, True]))
     assert not together.summary[1].any()
-    for n, row in enumerate((0, 2)):
+    assert not together.answers.whole[1].any()
+    for row in (0, 2):
         alone = encoder(model)(picture[row : row + 1], mask[row : row + 1], torch.tensor([True]))
         torch.testing.assert_close(together.summary[row : row + 1], alone.summary)
-        torch.testing.assert_close(together.seen.whole[n : n + 1], alone.seen.whole)
+        torch.testing.assert_close(together.answers.whole[row : row + 1], alone.answers.whole)
         for x, y in zip(together.skips, alone.skips, strict=True):
             assert (x is None) == (y is None)
             if x is not None:
@@ -254,17 +280,17 @@ def test_the_encoder_learns_a_batch_by_itself(tmp_path: Path) -> None:
     run = trainer(tmp_path / "run", dataclasses.replace(ENCODED, trains="encoder"), steps=40)
     batch = make_batch(4)
     errors = [run.train_step(dict(batch)) for _ in range(40)]
-    assert set(errors[0]) == {"seen", "grad_norm", "lr"}
-    assert errors[-1]["seen"] < 0.2 * errors[0]["seen"]
+    assert set(errors[0]) == {"answers", "grad_norm", "lr"}
+    assert errors[-1]["answers"] < 0.2 * errors[0]["answers"]
 
 
 def test_heads_are_compared_in_a_whole_training_too(tmp_path: Path) -> None:
     run = trainer(tmp_path / "run", dataclasses.replace(ENCODED, p_render=0.5))
     terms = run.train_step(make_batch(4))
-    assert terms["seen"] > 0
+    assert terms["answers"] > 0
     assert "image" in terms
-    silent = dataclasses.replace(ENCODED, loss=dataclasses.replace(ENCODED.loss, seen=0.0))
-    assert "seen" not in trainer(tmp_path / "silent", silent).train_step(make_batch(4))
+    silent = dataclasses.replace(ENCODED, loss=dataclasses.replace(ENCODED.loss, answers=0.0))
+    assert "answers" not in trainer(tmp_path / "silent", silent).train_step(make_batch(4))
 
 
 def test_a_network_without_an_encoder_is_given_one_and_keeps_it(tmp_path: Path) -> None:
@@ -281,7 +307,7 @@ def test_a_pipeline_keeps_its_encoder(tmp_path: Path) -> None:
     run = trainer(tmp_path / "run")
     run.fit(Batches())
     folder = export_pipeline(run, tmp_path / "pipeline")
-    pipeline = type(make_pipeline()).from_pretrained(folder)
+    pipeline = UniRenderPipeline.from_pretrained(folder)
     network = pipeline.dual_stream
     assert network.config["picture_features"] == "encoder"
     assert encoder(network).summary.weight.any()
@@ -293,15 +319,66 @@ def test_a_pipeline_keeps_its_encoder(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"trains": "encoder", "model": TRAIN.model}, "expected picture_features 'encoder' and loss.seen above 0"),
-        ({"trains": "encoder", "loss": TRAIN.loss}, "expected picture_features 'encoder' and loss.seen above 0"),
+        ({"trains": "encoder", "model": TRAIN.model}, "expected picture_features 'encoder' and loss.answers above 0"),
+        ({"trains": "encoder", "loss": TRAIN.loss}, "expected picture_features 'encoder' and loss.answers above 0"),
         ({"trains": "inverse", "p_render": 0.3}, "renders nothing; expected p_render 0"),
         ({"trains": "inverse", "timestep_rule": "algorithm1"}, "conditional rule"),
+        ({"model": dataclasses.replace(ENCODED.model, resolution=96)}, "pictures of 96 pixels, expected one of 32, 64"),
+        ({"model": dataclasses.replace(ENCODED.model, resolution=192)}, "pictures of 192 pixels"),
     ],
 )
 def test_stages_that_fit_nothing_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(UnirenderError, match=message):
         check_config(dataclasses.replace(ENCODED, **changes))
+
+
+def test_another_prior_is_refused_where_nothing_could_learn_it(tmp_path: Path) -> None:
+    """It would start the image's last convolution anew, and leave it there."""
+    other = trainer(
+        tmp_path / "a", dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="composite"))
+    )
+    with pytest.raises(UnirenderError, match="their physics prior is composite, expected split_sum"):
+        begin_with_network(trainer(tmp_path / "b", dataclasses.replace(ENCODED, trains="inverse")), other.model)
+    begin_with_network(trainer(tmp_path / "c"), other.model)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"preset": "tiny_encoder"}, "expected --init with a trained one"),
+        ({"preset": "tiny_inverse"}, "expected --init with a trained one"),
+        ({"preset": "tiny_encoder", "init": Path("tiny"), "validate": 4}, "--validate 4: nothing that is scored"),
+        ({"preset": "tiny_encoder", "init": Path("tiny"), "resolution": 96}, "expected one of 32, 64, 128"),
+    ],
+)
+def test_options_that_make_no_sense_for_a_part_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Train(Path("data"), **options).check()
+
+
+def test_a_shipped_checkpoint_begins_a_run_of_its_encoder(tmp_path: Path) -> None:
+    config = PRESETS["tiny_encoder"]
+    run = trainer(tmp_path / "run", dataclasses.replace(config, batch_size=2), steps=1)
+    read_start(config.model, Path("tiny")).apply(run)
+    assert torch.equal(
+        run.model.image_unet.conv_in.weight,
+        UniRenderPipeline.from_pretrained("tiny").dual_stream.image_unet.conv_in.weight,
+    )
+    assert [part["preset"] for part in run.continues if "preset" in part]
+
+
+def test_a_killed_run_of_a_part_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
+    config = dataclasses.replace(ENCODED, trains="inverse")
+    whole, half = trainer(tmp_path / "whole", config, steps=4), trainer(tmp_path / "half", config, steps=2)
+    for run in (whole, half):
+        begin_with_network(run, make_model(picture_features="encoder")[0])
+        run.fit(Batches())
+    again = trainer(tmp_path / "half", config, steps=4)
+    again.fit(Batches())
+    assert again.step == 4
+    frozen = [p for p in again.model.parameters() if not p.requires_grad]
+    assert frozen
+    assert not [p for p in frozen if p in again.optimizer.state]
 
 
 def test_the_presets_go_together() -> None:

@@ -3,7 +3,7 @@
 Notation: b batch, H W image size; 15 channels: attribute pictures without the light (material, albedo, normal, s, d).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Seen:
+class Answers:
     """What a `unirender.models.picture_encoder.PictureEncoder` says itself of pictures; packed, in [-1, 1].
 
     Attributes:
@@ -24,6 +24,10 @@ class Seen:
     cells: Float[Tensor, "b 15 h w"]
     light: Float[Tensor, "b 3 eh ew"]
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Answers":
+        """The same of the rows, or in the form, that `change` makes of a tensor."""
+        return Answers(change(self.whole), change(self.cells), change(self.light))
+
 
 @dataclass(frozen=True)
 class Added:
@@ -33,10 +37,10 @@ class Added:
         levels: to what comes into each level of the image stream's encoder that has a stage, finest first.
         summary: to the time embedding of the attribute stream's decoder.
         skips: to each entry of the feature pyramid that comes to that decoder; None: nothing.
-        seen: of the rows that have features, in their order; None of features that say nothing themselves.
+        answers: of an encoder that is asked; None of other features.
     """
 
     levels: Sequence[Tensor]
     summary: Float[Tensor, "b e"]
     skips: Sequence[Tensor | None] = ()
-    seen: Seen | None = None
+    answers: Answers | None = None

@@ -22,7 +22,7 @@ from diffusers.utils.outputs import BaseOutput
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from unirender.models.added import Added, Seen
+from unirender.models.added import Added, Answers
 from unirender.models.conditioning import coverage_of
 from unirender.models.light_encoder import LightEncoder
 from unirender.models.picture_encoder import PictureEncoder
@@ -69,14 +69,15 @@ class DualStreamOutput(BaseOutput):
         encoded_attributes: the attribute stream as the image's decoder saw it. It may stand for the same latents at the
             same timestep in another call.
         encoded_image: the image stream as the attributes' decoder saw it.
-        seen: what the picture encoder's heads say of the rows whose image is clean; None without one.
+        answers: of the picture encoder, for the rows whose attributes are predicted, zeros where the image is not
+            clean; None without one, and where it was asked in a call before.
     """
 
     attributes: Tensor | None = None
     image: Tensor | None = None
     encoded_attributes: Encoded | None = None
     encoded_image: Encoded | None = None
-    seen: Seen | None = None
+    answers: Answers | None = None
 
 
 def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d:
@@ -119,7 +120,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
     @register_to_config
     def __init__(
         self,
-        sample_size: int = 32,  # latent pixels; only recorded, the network is fully convolutional
+        sample_size: int = 32,  # latent pixels; the streams take any size, the picture encoder is made for this one
         attribute_channels: int = 72,  # latent channels of the six attribute triplets
         image_channels: int = 12,  # latent channels of the image
         attribute_extra_channels: int = 0,  # presence flags, mask, rays: enter by a zero-initialised convolution
@@ -216,10 +217,12 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         if isinstance(i, Tensor):
             added = self.features_of(i, image_timestep, image_extra)
             i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra, added)
-        output = DualStreamOutput(seen=added.seen if added else None)
+        output = DualStreamOutput()
         if attribute_rows is not None:
             seen = output.encoded_image = i[attribute_rows]
             output.attributes = self.decode(self.attribute_unet, a[attribute_rows], seen, self.image_to_attributes)
+            if added and added.answers:
+                output.answers = added.answers.each(lambda x: x[attribute_rows])
         if image_rows is not None:
             seen = output.encoded_attributes = a[image_rows]
             output.image = self.decode(self.image_unet, i[image_rows], seen, self.attributes_to_image)

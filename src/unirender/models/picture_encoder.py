@@ -3,8 +3,8 @@
 How metallic and rough an object is, how bright its paint and how bright its light are one question: they explain the
 same picture together, and a pixel cannot decide it. This network sees the condition of inverse rendering at 64 pixels,
 and its own answers (*heads*) are compared with the truth: mean over the object of every attribute picture, the same by
-cells of 8 pixels, and the light. It learns from some hundred pictures a second where a pass through both streams
-takes as long for ten, so it is trained first, by itself (`trains="encoder"` in a preset).
+cells of 8 pixels, and the light. It sees four pictures in the time of a training pass of one through both streams of
+`tiny`, so it is trained first, by itself (`trains="encoder"` in a preset).
 
 Into the dual stream it comes through zero-initialised maps: its stages are added to what the attribute stream's decoder
 receives at their size, its *summary* to that decoder's time embedding. The image's decoder receives nothing of it, and
@@ -27,9 +27,10 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from unirender.models.added import Added, Seen
+from unirender.models.added import Added, Answers
+from unirender.training.presets import ENCODER_SIDE
 
-SIDE = 64  # pixels along each side of the picture that it sees
+SIDE = ENCODER_SIDE  # pixels along each side of the picture that it sees
 WIDTHS, BLOCKS = (32, 64, 128, 256), (1, 2, 2, 2)  # channels and residual blocks of each stage, finest first
 GROUP = 16  # channels of a group of the normalisation
 HIDDEN = 384
@@ -60,7 +61,7 @@ class PictureEncoder(nn.Module):
     Args:
         channels: of each entry of the feature pyramid.
         strides: of each entry, pixels of the network's picture.
-        resolution: of that picture, one way; it is averaged down to 64 pixels.
+        resolution: of that picture, one way, which is averaged down to 64 pixels; 64 times a power of two, or less.
         embedding_width: of the time embedding.
         environment_size: rows, columns of the light.
     """
@@ -74,9 +75,7 @@ class PictureEncoder(nn.Module):
         environment_size: tuple[int, int],
     ) -> None:
         super().__init__()
-        if resolution > SIDE and resolution % SIDE:
-            raise ValueError(f"picture encoder: got pictures of {resolution} pixels, expected a multiple of {SIDE}")
-        self.shrink, self.environment_size = max(1, resolution // SIDE), environment_size
+        self.shrink, self.environment_size = shrink_of(resolution), environment_size
         self.stem = nn.Conv2d(4 * 4, WIDTHS[0], 3, padding=1)
         self.downs = nn.ModuleList(
             nn.Sequential(nn.GroupNorm(a // GROUP, a), nn.ReLU(), nn.Conv2d(a, b, 3, stride=2, padding=1))
@@ -110,7 +109,7 @@ class PictureEncoder(nn.Module):
     def forward(
         self, picture: Float[Tensor, "b 3 H W"], mask: Float[Tensor, "b 1 H W"], known: Bool[Tensor, " b"]
     ) -> Added:
-        """What it adds, and what its heads say of the rows that are known, in their order.
+        """What it adds, and what its heads say; zeros in rows that are not known.
 
         Args:
             picture: packed images, in [-1, 1]; those that are not known are not looked at.
@@ -122,18 +121,21 @@ class PictureEncoder(nn.Module):
         def in_place(x: Tensor) -> Tensor:
             return x if len(rows) == len(known) else x.new_zeros(len(known), *x.shape[1:]).index_copy(0, rows, x)
 
-        stages, hidden, seen = self.look(picture[rows], mask[rows])
+        stages, hidden, answers = self.look(picture[rows], mask[rows])
+        grown = shrink_of(picture.shape[-1]) / self.shrink
+        if grown != 1:  # asked at another size than its own
+            stages = [F.interpolate(x, scale_factor=grown, mode="nearest") for x in stages]
         skips = [
             None if stage is None else in_place(self.adapters[str(n)](stages[stage]))
             for n, stage in enumerate(self.stage_of)
         ]
-        return Added((), in_place(self.summary(hidden)), skips, seen)
+        return Added((), in_place(self.summary(hidden)), skips, answers.each(in_place))
 
     def look(
         self, picture: Float[Tensor, "n 3 H W"], mask: Float[Tensor, "n 1 H W"]
-    ) -> tuple[list[Tensor], Float[Tensor, "n z"], Seen]:
+    ) -> tuple[list[Tensor], Float[Tensor, "n z"], Answers]:
         """Stages, hidden and heads."""
-        x = F.avg_pool2d(torch.cat([picture, 2 * mask.to(picture) - 1], dim=1), self.shrink)
+        x = F.avg_pool2d(torch.cat([picture, 2 * mask.to(picture) - 1], dim=1), shrink_of(picture.shape[-1]))
         coverage = 0.5 * x[:, 3:].float() + 0.5
         x = self.stem(F.pixel_unshuffle(x, 2).contiguous(memory_format=torch.channels_last))
         stages: list[Tensor] = []
@@ -141,10 +143,16 @@ class PictureEncoder(nn.Module):
             x = blocks(self.downs[n - 1](x) if n else x)
             stages.append(x)
         fine, coarse = stages[-2:]
-        hidden = F.relu(self.hidden(torch.cat([over_object(fine, coverage), over_object(coarse, coverage)], dim=1)))
+        moments = torch.cat([over_object(fine, coverage), over_object(coarse, coverage)], dim=1)
+        hidden = F.relu(self.hidden(moments.to(self.hidden.weight)))
         both = torch.cat([fine, F.interpolate(coarse, size=fine.shape[-2:], mode="nearest")], dim=1)
         light = self.heads["light"](hidden).unflatten(1, (3, *self.environment_size))
-        return stages, hidden, Seen(self.heads["whole"](hidden), self.heads["cells"](both), light)
+        return stages, hidden, Answers(self.heads["whole"](hidden), self.heads["cells"](both), light)
+
+
+def shrink_of(resolution: int) -> int:
+    """Pixels of a picture, one way, for each that the encoder sees."""
+    return max(1, resolution // SIDE)
 
 
 def over_object(x: Float[Tensor, "n c h w"], coverage: Float[Tensor, "n 1 H W"]) -> Float[Tensor, "n moments"]:
@@ -157,8 +165,8 @@ def over_object(x: Float[Tensor, "n c h w"], coverage: Float[Tensor, "n 1 H W"])
     return torch.cat([mean.flatten(1), (variance + EPSILON**2).sqrt()], dim=1)
 
 
-def seen_error(said: Seen, truth: Seen, covered: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
-    """Squared error of the heads.
+def answers_error(said: Answers, truth: Answers, covered: Float[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
+    """Squared error of the heads, a mean over the rows.
 
     Args:
         said: by the heads.
@@ -168,7 +176,7 @@ def seen_error(said: Seen, truth: Seen, covered: Float[Tensor, "b 1 h w"]) -> Fl
     channels = said.whole.new_tensor(CHANNEL_WEIGHTS, dtype=torch.float32)
     whole = (channels * (said.whole.float() - truth.whole).square()).sum(dim=1).mean()
     cells = (channels[:, None, None] * (said.cells.float() - truth.cells).square()).sum(dim=1, keepdim=True)
-    cells = (cells * covered).sum() / covered.sum().clamp_min(EPSILON)
+    cells = ((cells * covered).sum(dim=(1, 2, 3)) / covered.sum(dim=(1, 2, 3)).clamp_min(EPSILON)).mean()
     light = (said.light.float() - truth.light).square().mean()
     return whole + CELLS_WEIGHT * cells + LIGHT_WEIGHT * light
 
@@ -178,7 +186,7 @@ def truth_of(
     mask: Float[Tensor, "b 1 H W"],
     light: Float[Tensor, "b 3 eh ew"],
     cells: tuple[int, int],
-) -> tuple[Seen, Float[Tensor, "b 1 h w"]]:
+) -> tuple[Answers, Float[Tensor, "b 1 h w"]]:
     """What the heads should say of packed attribute pictures, and the coverage of each cell.
 
     Args:
@@ -190,4 +198,4 @@ def truth_of(
     covered = F.adaptive_avg_pool2d(mask, cells)
     summed = F.adaptive_avg_pool2d(pictures[:, :PICTURES] * mask, cells)
     whole = summed.sum(dim=(2, 3)) / covered.sum(dim=(2, 3)).clamp_min(EPSILON)
-    return Seen(whole, summed / covered.clamp_min(EPSILON), light), covered
+    return Answers(whole, summed / covered.clamp_min(EPSILON), light), covered

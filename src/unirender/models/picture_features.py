@@ -79,7 +79,8 @@ class PictureFeatures(nn.Module):
             return x.new_zeros(len(picture), *x.shape[1:]).index_copy(0, rows, x)
 
         levels = [in_place(adapter(x)) for x, adapter in zip(stages, self.adapters, strict=True)]
-        return Added(levels, in_place(self.summary(statistics(stages, picture[rows]))))
+        moments = statistics(stages, picture[rows])
+        return Added(levels, in_place(self.summary(moments.to(self.summary.weight))))
 
     @torch.no_grad()
     def stages(self, picture: Float[Tensor, "n 3 H W"]) -> list[Tensor]:

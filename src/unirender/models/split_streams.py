@@ -57,7 +57,7 @@ class SplitDualStreamModel(DualStreamModel):
         if attribute_rows is not None:
             inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
             found.attributes, found.encoded_image = inverse.attributes, inverse.encoded_image
-            found.seen = inverse.seen
+            found.answers = inverse.answers
         if image_rows is not None:
             lit = None if light is None else light[image_rows]
             rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)

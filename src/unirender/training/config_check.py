@@ -5,7 +5,7 @@ import operator
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender.training.presets import TrainConfig
+from unirender.training.presets import ENCODER_SIDE, TrainConfig
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class Range:
         return f"{above} and {'less than' if self.high_open else 'at most'} {self.high:g}"
 
 
+ENCODER_RESOLUTIONS = (ENCODER_SIDE // 2, *(ENCODER_SIDE << n for n in range(5)))
+
 _COUNT = Range(1)
 _NOT_NEGATIVE = Range(0)
 _POSITIVE = Range(0, low_open=True)
@@ -41,7 +43,16 @@ RANGES: dict[str, Range] = {
     **{f"loss.{name}": _NOT_NEGATIVE for name in ("material", "albedo", "normal", "specular", "diffuse")},
     **{
         f"loss.{name}": _NOT_NEGATIVE
-        for name in ("environment", "image", "image_floor", "colour_floor", "background", "cycle", "seen", "composite")
+        for name in (
+            "environment",
+            "image",
+            "image_floor",
+            "colour_floor",
+            "background",
+            "cycle",
+            "answers",
+            "composite",
+        )
     },
     "loss.snr_bound": Range(1),  # the weight's floor
     **dict.fromkeys(("optimizer.learning_rate", "optimizer.clip_norm"), _POSITIVE),
@@ -63,9 +74,15 @@ def check_config(config: TrainConfig) -> None:
         if value not in allowed:
             raise UnirenderError(f"training config: {name} is {value!r}, expected {allowed}; correct it in the preset")
     encoder = config.model.picture_features == "encoder"
-    if config.trains == "encoder" and not (encoder and config.loss.seen):
+    if config.trains == "encoder" and not (encoder and config.loss.answers):
         raise UnirenderError(
-            "training config: trains is 'encoder', expected picture_features 'encoder' and loss.seen above 0"
+            "training config: trains is 'encoder', expected picture_features 'encoder' and loss.answers above 0"
+        )
+    if encoder and config.model.resolution not in ENCODER_RESOLUTIONS:
+        sizes = ", ".join(map(str, ENCODER_RESOLUTIONS))
+        raise UnirenderError(
+            f"training config: pictures of {config.model.resolution} pixels, expected one of {sizes}: the picture "
+            f"encoder sees them at {ENCODER_SIDE}"
         )
     if config.trains != "all" and (config.p_render or config.timestep_rule != "conditional"):
         raise UnirenderError(

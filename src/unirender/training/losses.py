@@ -17,10 +17,10 @@ from torch import Tensor
 
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.added import Seen
+from unirender.models.added import Answers
 from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.picture_encoder import seen_error, truth_of
+from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights
@@ -76,8 +76,6 @@ class LossFunction:
         output = predict(self.model, attributes, image, timesteps, extras, span_a, span_i)
         errors = Errors(self.conditioning, self.config.background)
         terms: LossTerms = {}
-        if output.seen is not None and self.config.seen:
-            terms["seen"] = self._seen_error(output.seen, {n: v[~noisy_i] for n, v in batch.items()})
         if span_i is not None:
             assert output.image is not None
             rows = _Rows(span_i, noisy_i)
@@ -101,6 +99,9 @@ class LossFunction:
             part = {name: inverse.of(batch[name]) for name in ("image", "mask")}
             predicted = inverse.of_decoded(output.attributes).float()
             terms |= self._consistency(predicted, inverse.of(clean_i), part, errors, generator)
+            if output.answers is not None and self.config.answers and len(predicted):
+                answers = output.answers.each(inverse.of_decoded)
+                terms["answers"] = self._answers_error(answers, {name: inverse.of(x) for name, x in batch.items()})
         return terms
 
     def total(self, terms: LossTerms) -> Float[Tensor, ""]:
@@ -121,14 +122,14 @@ class LossFunction:
         """Of the picture encoder by itself: every image is clean."""
         encoder = encoder_of(self.model)
         assert encoder is not None, "the config was checked"
-        return {"seen": self._seen_error(encoder.look(pack_image(batch["image"]), batch["mask"])[2], batch)}
+        return {"answers": self._answers_error(encoder.look(pack_image(batch["image"]), batch["mask"])[2], batch)}
 
-    def _seen_error(self, said: Seen, batch: Maps) -> Float[Tensor, ""]:
+    def _answers_error(self, said: Answers, batch: Maps) -> Float[Tensor, ""]:
         packing, cells = self.conditioning.packing, (said.cells.shape[-2], said.cells.shape[-1])
         with torch.no_grad():
             light = packing.pack_light(batch["environment"])
             truth, covered = truth_of(packing.pack(batch), batch["mask"], light, cells)
-        return seen_error(said, truth, covered)
+        return answers_error(said, truth, covered)
 
     def _seen(self, batch: Maps, clean: Bool[Tensor, " b"]) -> tuple[Maps, Bool[Tensor, "b 6"] | None]:
         """The maps that a renderer sees, in which s and d may have been derived from the light; and which were."""

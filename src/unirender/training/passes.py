@@ -37,7 +37,7 @@ OWN_ROWS = (
     "environment",
     "composite",
     "cycle",
-    "seen",
+    "answers",
 )  # terms that are means over rows, or with weights, of their own
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
@@ -185,7 +185,7 @@ class BatchGradient:
             a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
             w = weight[rows]
             mass = {"image": w[i > 0], "attributes": w[a > 0], "environment": a > 0, "composite": w[x], "cycle": w[y]}
-            mass["seen"] = i == 0
+            mass["answers"] = x
             seed = seeds[split.processes.rank + split.processes.size * j]
             share = int(y.sum()) / max(1, int(x.sum()))
             parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))

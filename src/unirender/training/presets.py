@@ -9,6 +9,7 @@ from typing import Literal
 
 from unirender.errors import UnirenderError
 
+ENCODER_SIDE = 64  # pixels along each side of the picture that a picture encoder sees
 ENVIRONMENT_SIZE = (16, 32)  # rows, columns of the light that every model predicts; whole pixels make up a texel
 
 
@@ -57,7 +58,7 @@ class LossConfig:
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
     cycle_steps: int = 1  # 1: what is rendered again is the step's own prediction; more: a sample of so many steps
-    seen: float = 0.0  # weight of what the picture encoder's heads say; 0: not compared
+    answers: float = 0.0  # weight of what the picture encoder's heads say; 0: not compared
     composite: float = 0.0  # weight of the closed-form image of the predicted maps; 0: none
     # how the squared error of x0 counts by its timestep; see `unirender.training.loss_terms.timestep_weights`
     timestep_weight: Literal["none", "v", "min_snr"] = "none"
@@ -147,7 +148,7 @@ _SMALL = dataclasses.replace(  # the network of `tiny_renderer`, whose weights i
 _TINY_ENCODER = dataclasses.replace(
     _TINY_RENDERER,
     model=dataclasses.replace(_TINY_RENDERER.model, picture_features="encoder"),
-    loss=dataclasses.replace(_SMALL.loss, seen=1.0),
+    loss=dataclasses.replace(_SMALL.loss, answers=1.0),
     augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
     optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3),
     batch_size=96,

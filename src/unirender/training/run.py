@@ -126,6 +126,16 @@ class Train:
     def _check_start(self, config: TrainConfig) -> None:
         if self.init is not None and self.init_from is not None:
             raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
+        if config.trains != "all" and self.init is None:
+            raise UsageError(
+                f"--preset {self.preset}: it trains a part of a network and leaves the others as they are, expected "
+                "--init with a trained one (the name of a shipped checkpoint, or a pipeline folder)"
+            )
+        if config.trains == "encoder" and self.validate:
+            raise UsageError(
+                f"--validate {self.validate}: nothing that is scored changes while the picture encoder is trained by "
+                f"itself (--preset {self.preset}), expected 0"
+            )
         if config.model.codec == "pixel" and self.init_from is not None:
             raise UsageError(
                 f"--preset {self.preset}: its network works on pixels and cannot begin with Stable Diffusion's "

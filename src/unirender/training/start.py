@@ -99,7 +99,7 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     """Gives a trainer, and its average, the weights of another network.
 
     With another physics prior than the network's the image stream's last convolution starts at zero again. Features of
-    ImageNet that the network has not are added.
+    a clean picture that the network has not are added.
 
     Args:
         trainer: that has not begun.
@@ -124,6 +124,11 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     if network.config["picture_features"] == "none":
         load_features(model)
     if network.config["physics_prior"] != model.config["physics_prior"]:
+        if trainer.config.trains != "all":
+            raise UnirenderError(
+                f"initial weights: their physics prior is {network.config['physics_prior']}, expected "
+                f"{model.config['physics_prior']}: this preset trains nothing that could learn the other one"
+            )
         restart_from_prior(model)  # what it added to the other closed form is no correction of this one
     trainer.begin_anew(history)
 

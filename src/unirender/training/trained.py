@@ -1,9 +1,11 @@
-"""Which weights a run trains: all of them, the picture encoder by itself, or whatever inverse rendering alone uses.
+"""Which weights a run trains: all of them, the picture encoder by itself, or that and the decoder that it serves.
 
-all       the whole network
-encoder   the picture encoder, against what its heads should say; no pass through the streams
-inverse   the picture encoder, the attribute stream's decoder, and what comes into it from the image stream: nothing
-          that renders uses any of these, so that rendering is the same to the bit before and after
+    all       the whole network
+    encoder   the picture encoder, against what its heads should say; no pass through the streams
+    inverse   the picture encoder, the attribute stream's decoder, and what comes into it from the image stream
+
+No weight of the last two takes part in rendering, which is the same to the bit before and after. Neither stream's
+encoder is among them, nor is the way of ImageNet's features into a network.
 """
 
 from torch import nn

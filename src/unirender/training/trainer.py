@@ -98,8 +98,10 @@ class Trainer:
         train_only(model, config.trains)
         self.model = model
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
-        self.loss.encoder_alone = config.trains == "encoder"
+        alone = config.trains == "encoder"
+        self.loss = LossFunction(
+            self.model, conditioning, make_scheduler(), config.loss, config.map_dropout, encoder_alone=alone
+        )
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
         self.optimizer = make_optimizer(self.model, config.optimizer, self.gradient.pool)
         self.ema = Ema(self.model, config.optimizer.ema_decay)
