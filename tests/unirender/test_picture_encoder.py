@@ -5,14 +5,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from both_directions import OneBatch, decompose, render
 from tiny_models import SIZE, TRAIN, make_batch, make_model
 from torch import Tensor
 
-from unirender.diffusion.sampling import infer_attributes, infer_image
-from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.added import Answers
-from unirender.models.conditioning import TRIPLETS, Conditioning, coverage_of, pack_image
+from unirender.models.conditioning import TRIPLETS, coverage_of, pack_image
 from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
 from unirender.models.picture_encoder import (
     CELLS_WEIGHT,
@@ -25,7 +24,6 @@ from unirender.models.picture_encoder import (
 )
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.config_check import check_config
-from unirender.training.data import Batch
 from unirender.training.export import export_pipeline
 from unirender.training.memory import training_bytes
 from unirender.training.presets import PRESETS, TrainConfig
@@ -41,34 +39,6 @@ ENCODED = dataclasses.replace(
     p_render=0.0,
 )
 BOTH = pytest.mark.parametrize("unified", [True, False], ids=["unified", "split"])
-
-
-class Batches:
-    """The same batch again and again."""
-
-    def next(self) -> Batch:
-        return make_batch(ENCODED.batch_size)
-
-    def read_ahead(self) -> None: ...
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state: dict) -> None: ...
-
-    def refresh(self) -> None: ...
-
-
-def decompose(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor], steps: int = 1) -> Tensor:
-    seed = torch.Generator().manual_seed(0)
-    return infer_attributes(*parts, make_scheduler(), maps["image"], maps["mask"], steps=steps, generator=seed)[
-        "albedo"
-    ]
-
-
-def render(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor]) -> Tensor:
-    given = torch.ones(len(maps["mask"]), len(TRIPLETS), dtype=torch.bool)
-    return infer_image(*parts, make_scheduler(), maps, given, generator=torch.Generator().manual_seed(0))
 
 
 def trainer(folder: Path, config: TrainConfig = ENCODED, steps: int = 3) -> Trainer:
@@ -261,7 +231,7 @@ def test_a_run_moves_what_it_trains_and_nothing_that_renders(trains: str, tmp_pa
     before = {name: value.clone() for name, value in run.model.state_dict().items()}
     maps = make_batch(2)
     image = render((run.model, run.loss.conditioning), maps)
-    run.fit(Batches())
+    run.fit(OneBatch())
     moved = {name for name, value in run.model.state_dict().items() if not torch.equal(value, before[name])}
     heads = {"encoder"} if trains == "encoder" else {"encoder", "attribute_unet", "image_to_attributes"}
     assert {name.split(".")[0] for name in moved} == heads
@@ -305,7 +275,7 @@ def test_a_network_without_an_encoder_is_given_one_and_keeps_it(tmp_path: Path) 
 
 def test_a_pipeline_keeps_its_encoder(tmp_path: Path) -> None:
     run = trainer(tmp_path / "run")
-    run.fit(Batches())
+    run.fit(OneBatch())
     folder = export_pipeline(run, tmp_path / "pipeline")
     pipeline = UniRenderPipeline.from_pretrained(folder)
     network = pipeline.dual_stream
@@ -372,9 +342,9 @@ def test_a_killed_run_of_a_part_goes_on_as_if_it_had_not_been(tmp_path: Path) ->
     whole, half = trainer(tmp_path / "whole", config, steps=4), trainer(tmp_path / "half", config, steps=2)
     for run in (whole, half):
         begin_with_network(run, make_model(picture_features="encoder")[0])
-        run.fit(Batches())
+        run.fit(OneBatch())
     again = trainer(tmp_path / "half", config, steps=4)
-    again.fit(Batches())
+    again.fit(OneBatch())
     assert again.step == 4
     frozen = [p for p in again.model.parameters() if not p.requires_grad]
     assert frozen

@@ -6,20 +6,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from both_directions import OneBatch, decompose, render
 from safetensors.torch import save_file
 from tiny_models import SIZE, TRAIN, make_batch, make_model
-from torch import Tensor
 
-from unirender.diffusion.sampling import infer_attributes, infer_image
-from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_features import STAGES, PictureFeatures, read_vgg, statistics
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training.data import Batch
 from unirender.training.export import export_pipeline
 from unirender.training.presets import TrainConfig
 from unirender.training.start import begin_with_network, load_features
@@ -62,38 +59,12 @@ def featured(unified: bool = True) -> tuple[DualStreamModel, Conditioning]:
     return model, conditioning
 
 
-def decompose(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor]) -> Tensor:
-    seed = torch.Generator().manual_seed(0)
-    return infer_attributes(*parts, make_scheduler(), maps["image"], maps["mask"], generator=seed)["albedo"]
-
-
-def render(parts: tuple[DualStreamModel, Conditioning], maps: dict[str, Tensor]) -> Tensor:
-    given = torch.ones(len(maps["mask"]), len(TRIPLETS), dtype=torch.bool)
-    return infer_image(*parts, make_scheduler(), maps, given, generator=torch.Generator().manual_seed(0))
-
-
 def muted(parts: tuple[DualStreamModel, Conditioning]) -> tuple[DualStreamModel, Conditioning]:
     """The same network as it is when its features are new."""
     for name, parameter in parts[0].named_parameters():
         if "vgg." in name:
             torch.nn.init.zeros_(parameter)
     return parts
-
-
-class Batches:
-    """The same batch again and again."""
-
-    def next(self) -> Batch:
-        return make_batch(TRAIN.batch_size)
-
-    def read_ahead(self) -> None: ...
-
-    def state_dict(self) -> dict:
-        return {}
-
-    def load_state_dict(self, state: dict) -> None: ...
-
-    def refresh(self) -> None: ...
 
 
 # --- the features
@@ -234,7 +205,7 @@ def trainer(folder: Path, config: TrainConfig = FEATURED) -> Trainer:
 def test_training_moves_the_way_of_the_features_and_not_them(cached: Path, tmp_path: Path) -> None:
     run = trainer(tmp_path / "run")
     load_features(run.model)
-    run.fit(Batches())
+    run.fit(OneBatch())
     again = UniRenderPipeline.from_pretrained(export_pipeline(run, tmp_path / "pipeline")).dual_stream
     assert again.config["picture_features"] == "vgg16"
     features = again.vgg
