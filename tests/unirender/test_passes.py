@@ -1,6 +1,7 @@
 """The gradient of a batch does not depend on how the batch is cut. Noise does, and is switched off for that."""
 
 import dataclasses
+from typing import Any
 
 import pytest
 import torch
@@ -61,7 +62,8 @@ def run(gradient: BatchGradient, batch: dict[str, Tensor]) -> tuple[dict[str, fl
 def test_the_gradient_is_that_of_the_whole_batch(
     rule: str, features: str, unified: bool, batch: dict[str, Tensor], without_noise: None
 ) -> None:
-    model = dataclasses.replace(CONFIG.model, picture_features=features, unified=unified)  # type: ignore[arg-type]
+    changes: dict[str, Any] = {"picture_features": features, "unified": unified}
+    model = dataclasses.replace(CONFIG.model, **changes)
     loss = dataclasses.replace(CONFIG.loss, answers=1.0)
     config = dataclasses.replace(CONFIG, timestep_rule=rule, model=model, loss=loss)
     terms, whole = run(gradient_of(config), batch)
