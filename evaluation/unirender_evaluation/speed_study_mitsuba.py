@@ -6,7 +6,7 @@ against the same truth. Its seconds are those of that picture alone, twice: with
 loaded anew. Kernels are compiled in both.
 
     given         the model has the true s and d, which somebody must have rendered: nearly closed-form
-    given light   it has the light alone and derives s and d, without shadows, in the time that is measured
+    given light   it has the light alone and derives s and d in the time that is measured
 """
 
 import math

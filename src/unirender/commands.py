@@ -142,13 +142,16 @@ class Render:
     """Lat-long HDR or EXR light, or a photograph, instead of the folder's; s and d are derived from it."""
     exposure: float | None = None
     """Stops to add to that light as it is in its file. None: it is scaled by the rule of the training data."""
+    shadows: bool = True
+    """Where s and d are derived from a light, the surfaces of the picture cast shadows on one another, as far as their
+    normals say where they are."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.inputs import with_mask
+        from unirender.pipelines.inputs import told_derived, with_mask
 
         self.model.check()
         check_exposure(self.exposure)
@@ -159,13 +162,14 @@ class Render:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
             if self.environment is not None:
                 light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
-                intrinsics = under_light(with_mask(intrinsics), light, "auto" if self.exposure is None else "keep")
-                meta |= {"light": self.environment, "exposure_stops": self.exposure}
+                exposure = "auto" if self.exposure is None else "keep"
+                intrinsics = under_light(with_mask(intrinsics), light, exposure, shadows=self.shadows)
+                meta |= {"light": self.environment, "exposure_stops": self.exposure, "shadows": self.shadows}
             if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
                 notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
             pipeline = self.model.load()
-            derived = () if self.environment is None else ("specular", "diffuse")
-            image = pipeline.render(intrinsics, derived=derived, **self.model.sampling())
+            derived = told_derived(() if self.environment is None else ("specular", "diffuse"), self.shadows)
+            image = pipeline.render(intrinsics, derived=derived, shadows=self.shadows, **self.model.sampling())
             meta |= {**self.model.provenance(pipeline), **overflow(pipeline, intrinsics)}
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
@@ -234,6 +238,8 @@ class Relight:
     """Change albedo, s and d so that their rendering is the picture; otherwise the maps are the network's own."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
+    shadows: bool = False
+    """The surfaces of the picture cast shadows on one another, as far as the predicted normals say where they are."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self, read_light: ReadLight) -> int:
@@ -243,7 +249,7 @@ class Relight:
         self.model.check()
         check_exposure(self.exposure)
         picture, camera = self.input.read(), self.model.camera()
-        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile}
+        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
             pipeline, sampling = self.model.load(), self.model.sampling()

@@ -211,11 +211,23 @@ def test_a_pipeline_tells_what_it_derived(told: bool) -> None:
     pipeline = make_pipeline(derived_light=told)
     bare = scene().replace(specular=None, diffuse=None)
     lit = under_light(bare, bare.require("environment")["environment"], "keep")
-    by_itself = pipeline.render(bare)
+    by_itself = pipeline.render(bare, shadows=False)
     np.testing.assert_allclose(by_itself, pipeline.render(lit, derived=LIGHT), atol=1e-6)
     assert np.allclose(by_itself, pipeline.render(lit), atol=1e-6) != told
-    half = pipeline.render(lit.replace(specular=None))
+    half = pipeline.render(lit.replace(specular=None), shadows=False)
     np.testing.assert_allclose(half, pipeline.render(lit, derived=["specular"]), atol=1e-6)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_of_what_has_the_shadows_that_are_seen_d_alone_is_told_to_lack_others(told: bool) -> None:
+    pipeline = make_pipeline(derived_light=told)
+    bare = scene().replace(specular=None, diffuse=None)
+    light = bare.require("environment")["environment"]
+    lit = under_light(bare, light, "keep", shadows=True)
+    assert not np.allclose(lit.require("diffuse")["diffuse"], under_light(bare, light, "keep").diffuse)
+    by_itself = pipeline.render(bare)
+    np.testing.assert_allclose(by_itself, pipeline.render(lit, derived=["diffuse"]), atol=1e-6)
+    assert np.allclose(by_itself, pipeline.render(lit, derived=LIGHT), atol=1e-6) != told
 
 
 def test_a_relit_picture_is_rendered_with_light_that_was_derived() -> None:

@@ -15,7 +15,7 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.intrinsics import Intrinsics
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
-from unirender.pipelines.derived_light import derived_diffuse, derived_specular
+from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.losses import DROPPABLE
 
@@ -68,7 +68,7 @@ def test_light_alone_is_light_with_what_follows_from_it(pipeline: UniRenderPipel
     """With s and d missing they are derived from the environment, each by itself."""
     given = scene()
     environment = given.require("environment")["environment"]
-    derived = {"diffuse": derived_diffuse(given, environment), "specular": derived_specular(given, environment)}
+    derived = derived_light(given, environment, ("specular", "diffuse"))
     image = rendered(pipeline, given)
     for names in (("diffuse",), ("specular",), ("diffuse", "specular")):
         assert np.array_equal(rendered(pipeline, given.replace(**{name: derived[name] for name in names})), image)

@@ -12,6 +12,7 @@ from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
 from unirender.pipelines.editing import specular_for_roughness, under_light
 from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 
 CAMERA = Camera(fov_deg=50.0, principal=(0.35, 0.6))
@@ -149,10 +150,16 @@ def test_edits_relighting_and_rendering_use_it() -> None:
     mask = given.require("mask")["mask"]
     s, d = derived_specular(given, environment), derived_diffuse(given, environment)
     relit = under_light(given, environment, "keep").require("specular", "diffuse")
-    ready = ready_to_render(given.replace(environment=environment, metallic=mask)).require("specular", "diffuse")
+    lit = given.replace(environment=environment, metallic=mask)
+    ready = ready_to_render(lit, shadows=False).require("specular", "diffuse")
     for maps in (relit, ready):
         assert np.array_equal(maps["specular"], s)
         assert np.array_equal(maps["diffuse"], d)
+    shares = visible_shares(given, environment)
+    shadowed = under_light(given, environment, "keep", shadows=True).require("specular", "diffuse")
+    for maps in (shadowed, ready_to_render(lit).require("specular", "diffuse")):
+        np.testing.assert_allclose(maps["specular"], s * shares["specular"], rtol=1e-6)
+        np.testing.assert_allclose(maps["diffuse"], d * shares["diffuse"], rtol=1e-6)
     before = given.replace(environment=environment, specular=0.5 * mask.repeat(3, axis=-1))
     edited, held = specular_for_roughness(before, 0.4 * mask)
     old, new = (every_pixel(given.replace(roughness=r * mask), environment)[0] for r in (0.6, 0.4))

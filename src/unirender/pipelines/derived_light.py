@@ -11,13 +11,14 @@ picture's own size
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 
 LIGHT_SIDE = 256  # pixels along the longer side up to which every pixel is lit by itself
@@ -67,6 +68,34 @@ def derived_specular(
 
     sharp = (maps["roughness"][..., 0] < MIRROR_ROUGHNESS) & (mirrors and environment.shape[0] > COARSE_ROWS)
     return _lit(surface, light, sharp)
+
+
+def derived_light(
+    intrinsics: Intrinsics,
+    environment: Float[np.ndarray, "eh ew 3"],
+    names: Collection[str],
+    *,
+    mirrors: bool = True,
+    shadows: bool = True,
+) -> dict[str, Float[np.ndarray, "h w 3"]]:
+    """s and d by name.
+
+    Args:
+        intrinsics: with normal, roughness and mask; the camera gives the view directions.
+        environment: lat-long radiance in camera axes, any resolution.
+        names: of specular and diffuse, those that are wanted.
+        mirrors: as for `derived_specular`.
+        shadows: whether the picture's own surfaces hide the light (`unirender.pipelines.shadowed_light`).
+    """
+    light = {}
+    if "specular" in names:
+        light["specular"] = derived_specular(intrinsics, environment, mirrors)
+    if "diffuse" in names:
+        light["diffuse"] = derived_diffuse(intrinsics, environment)
+    if not shadows or not light:
+        return light
+    shares = visible_shares(intrinsics, environment)
+    return {name: value * shares[name] for name, value in light.items()}
 
 
 def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | bool = False) -> np.ndarray:

@@ -10,6 +10,7 @@ from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
+from unirender.pipelines.shadowed_light import visible_shares
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
 LOBE_WIDTH = (
@@ -82,8 +83,9 @@ def under_light(
     specular: Float[np.ndarray, "h w 3"] | None = None,
     diffuse: Float[np.ndarray, "h w 3"] | None = None,
     mirrors: bool = True,
+    shadows: bool = False,
 ) -> Intrinsics:
-    """The intrinsics under another light: s and d from its own resolution (without shadows), unless they are given.
+    """The intrinsics under another light: s and d from its own resolution, unless they are given.
 
     Args:
         intrinsics: with normal, roughness and mask.
@@ -92,6 +94,7 @@ def under_light(
         specular: s under that light, if known; not scaled.
         diffuse: the same for d.
         mirrors: as for `derived_specular`; not worth its time for predicted maps.
+        shadows: whether what is derived has the shadows that the picture's own surfaces cast.
 
     Raises:
         UnirenderError: another exposure, a map is missing, or the object receives no light.
@@ -102,11 +105,14 @@ def under_light(
     derived = derived_diffuse(intrinsics, environment)
     factor = exposure_factor(derived, maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
     environment = (environment * factor).astype(np.float32)
+    light = {"specular": specular, "diffuse": derived * factor if diffuse is None else diffuse}
     if specular is None:
-        specular = derived_specular(intrinsics, environment, mirrors)
-    return intrinsics.replace(
-        environment=environment, specular=specular, diffuse=derived * factor if diffuse is None else diffuse
-    )
+        light["specular"] = derived_specular(intrinsics, environment, mirrors)
+    if shadows:
+        own = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        shares = visible_shares(intrinsics, environment) if own else {}
+        light |= {name: light[name] * shares[name] for name in own}
+    return intrinsics.replace(environment=environment, **light)
 
 
 def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:

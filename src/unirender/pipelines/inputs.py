@@ -1,5 +1,6 @@
 """What a user hands to the pipeline, checked: pictures, masks and intrinsics. Each error says what to do about it."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from PIL import Image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import coverage, display_values
-from unirender.pipelines.derived_light import derived_diffuse, derived_specular
+from unirender.pipelines.derived_light import derived_light
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 MIN_SIDE = 8  # pixels
@@ -77,13 +78,26 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
 
 
 def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
-    """Which of specular and diffuse follow from the light, without shadows, where intrinsics are rendered."""
+    """Which of specular and diffuse follow from the light where intrinsics are rendered."""
     names = ("specular", "diffuse") if intrinsics.environment is not None else ()
     return frozenset(name for name in names if getattr(intrinsics, name) is None)
 
 
-def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
+def told_derived(names: Collection[str], shadows: bool) -> frozenset[str]:
+    """Which of the derived maps the network is told to be without shadows, so that it puts them back.
+
+    With the shadows that the picture's own surfaces cast this is d alone: it was taught to add to d what no normal
+    shows, and of s it makes less than the closed form.
+    """
+    return frozenset(names) - {"specular"} if shadows else frozenset(names)
+
+
+def ready_to_render(intrinsics: Intrinsics, shadows: bool = True) -> Intrinsics:
     """Intrinsics that the renderer can use: with a mask, and with s and d derived where a light is given.
+
+    Args:
+        intrinsics: to be rendered.
+        shadows: whether what is derived has the shadows that the picture's own surfaces cast.
 
     Raises:
         UnirenderError: normal, roughness or metallic is missing; leading axes; a bad size.
@@ -98,8 +112,7 @@ def ready_to_render(intrinsics: Intrinsics) -> Intrinsics:
     if intrinsics.environment is None:
         return intrinsics
     light = as_environment(intrinsics.environment)
-    derive = {"specular": derived_specular, "diffuse": derived_diffuse}
-    return intrinsics.replace(**{name: derive[name](intrinsics, light) for name in to_derive(intrinsics)})
+    return intrinsics.replace(**derived_light(intrinsics, light, to_derive(intrinsics), shadows=shadows))
 
 
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:

@@ -10,7 +10,7 @@ from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
 from unirender.models.priors import PRIORS
 from unirender.pipelines.framing import Frame, divide
-from unirender.pipelines.inputs import ready_to_render, to_derive
+from unirender.pipelines.inputs import ready_to_render, to_derive, told_derived
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.settings import Sampling
 
@@ -27,6 +27,7 @@ def render_any_size(
     how: Sampling,
     watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
     derived: Collection[str] = (),
+    shadows: bool = True,
 ) -> list[Float[np.ndarray, "h w 3"]]:
     """The premultiplied linear images in [0, 1] at the sizes of the intrinsics; one batch of the network.
 
@@ -35,11 +36,12 @@ def render_any_size(
         scenes: normal, roughness and metallic are needed; see `UniRenderPipeline.render`.
         how: steps, samples and noise.
         watch: is told which HDR maps exceed the network's range.
-        derived: which of specular and diffuse were derived from the light, without shadows, besides those that are
-            derived here since the intrinsics lack them.
+        derived: which of specular and diffuse were derived from the light, without shadows.
+        shadows: whether what is derived here, since the intrinsics lack it, has the shadows that the picture's own
+            surfaces cast.
     """
-    without_shadows = [to_derive(scene).union(derived) for scene in scenes]
-    ready = [ready_to_render(scene) for scene in scenes]
+    without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
+    ready = [ready_to_render(scene, shadows) for scene in scenes]
     entered = [enter(network, scene) for scene in ready]
     for _, small in entered:
         watch(network.overflow(small))

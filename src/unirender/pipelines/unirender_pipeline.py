@@ -31,7 +31,7 @@ from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
-from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, unit_value
+from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, told_derived, unit_value
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
@@ -229,13 +229,14 @@ class UniRenderPipeline(DiffusionPipeline):
         sampler: str | None = None,
         size: int | None = None,
         derived: Collection[str] = (),
+        shadows: bool = True,
     ) -> Float[np.ndarray, "h w 3"]:
         """Rendering; several samples are averaged in linear light.
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
-                missing, and a missing mask is the whole frame. Missing s and d are derived from the environment
-                (without shadows) where it is given.
+                missing, and a missing mask is the whole frame. Missing s and d are derived from the environment where
+                it is given.
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
@@ -243,7 +244,9 @@ class UniRenderPipeline(DiffusionPipeline):
             sampler: of `sample`.
             size: side of the network's square.
             derived: which of the intrinsics' specular and diffuse have no shadows, since they were derived from a light
-                (as by `unirender.pipelines.editing.under_light`); those that are missing are known to be.
+                (as by `unirender.pipelines.editing.under_light`).
+            shadows: whether s and d that are derived here have the shadows that the surfaces of the picture cast on one
+                another (`unirender.pipelines.self_shadow`); False: none, which the network is told.
 
         Returns:
             Premultiplied linear image at the intrinsics' size, in [0, 1].
@@ -253,7 +256,7 @@ class UniRenderPipeline(DiffusionPipeline):
         """
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
-        return render_any_size(network, [intrinsics], how, self._report_overflow, derived)[0]
+        return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
 
     def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
@@ -318,13 +321,14 @@ class UniRenderPipeline(DiffusionPipeline):
         anchored: bool = True,
         specular: Float[np.ndarray, "h w 3"] | None = None,
         diffuse: Float[np.ndarray, "h w 3"] | None = None,
+        shadows: bool = False,
         decomposition: Decomposition | None = None,
         **sampling: Any,
     ) -> EditResult:
         """Decomposes, puts the object under another light, renders.
 
-        s and d are derived from the predicted normal and roughness at the light's own resolution (without shadows),
-        unless they are given.
+        s and d are derived from the predicted normal and roughness at the light's own resolution, unless they are
+        given.
 
         Args:
             image_srgb: as for `decompose`.
@@ -334,6 +338,7 @@ class UniRenderPipeline(DiffusionPipeline):
             anchored: as for `edit`.
             specular: s under the new light, if known.
             diffuse: d under the new light, if known.
+            shadows: as for `render`; off, since predicted normals place the shadows too badly to gain by them.
             decomposition: of this picture, if it is at hand.
             **sampling: as for `edit`.
 
@@ -348,10 +353,11 @@ class UniRenderPipeline(DiffusionPipeline):
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
         before = decomposition.intrinsics
         if environment is not None:
-            edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False)
+            edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False, shadows=shadows)
         else:
             edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
-        derived = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        missing = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)
 

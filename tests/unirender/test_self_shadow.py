@@ -1,0 +1,207 @@
+"""Depth from normals, and the directions that surfaces hide from one another, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import environment_directions
+from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
+from unirender.pipelines.normal_integration import integrate_normals
+from unirender.pipelines.self_shadow import HALF_PLANES, SECTORS, SelfShadow
+from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, visible_shares
+from unirender.symmetries import mirror, quarter_turn
+
+CAMERA = Camera()
+SIZE = 48
+
+
+def rays(size: int = SIZE, camera: Camera = CAMERA) -> np.ndarray:
+    """(x, y, -1) of each pixel."""
+    directions = camera.rays(size, size)
+    return directions / -directions[..., 2:]
+
+
+def ball(size: int = SIZE, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals, mask and depth along the view axis of a unit ball."""
+    r = rays(size, camera).astype(np.float64)
+    distance = camera.distance()
+    a, b, c = (r * r).sum(-1), distance * np.ones(r.shape[:2]), distance**2 - 1
+    root = b**2 - a * c
+    hit = root > 0
+    depth = np.where(hit, (b - np.sqrt(np.maximum(root, 0))) / a, 1)
+    normal = np.where(hit[..., None], r * depth[..., None] + np.array([0, 0, distance]), 0)
+    return normal.astype(np.float32), hit[..., None].astype(np.float32), depth
+
+
+def gutter(size: int = SIZE, slope_deg: float = 45.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Two planes that meet in the vertical middle line, which is the farthest: both face it."""
+    r = rays(size)
+    slope = math.tan(math.radians(slope_deg))
+    left = r[..., 0] < 0
+    # x = -z' / slope on the left, +z' / slope on the right, z' = 4 - depth
+    depth = 4 / (1 + slope * np.abs(r[..., 0]))
+    c, s = math.cos(math.radians(slope_deg)), math.sin(math.radians(slope_deg))
+    normal = np.where(left[..., None], [s, 0, c], [-s, 0, c]).astype(np.float32)
+    return normal, np.ones((size, size, 1), np.float32), depth
+
+
+def as_maps(normal: np.ndarray, mask: np.ndarray, roughness: float = 0.6) -> Intrinsics:
+    return Intrinsics(normal=normal, mask=mask, roughness=(roughness * mask).astype(np.float32), camera=CAMERA)
+
+
+def sky(rows: int = 16) -> np.ndarray:
+    """A lamp to the right before a dim, coloured sky."""
+    directions = environment_directions(rows, 2 * rows)
+    lamp = 20 * np.exp(15 * (directions @ np.array([0.95, 0.1, 0.3]) - 1))
+    return (lamp[..., None] + np.array([0.1, 0.2, 0.3]) * (1.2 + directions[..., 1:2])).astype(np.float32)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, Camera(fov_deg=60.0)], ids=str)
+def test_the_depth_of_a_ball_is_found(camera: Camera) -> None:
+    normal, mask, depth = ball(camera=camera)
+    inside = mask[..., 0] > 0
+    found = integrate_normals(normal, inside, camera)
+    assert np.isnan(found[~inside]).all()
+    ratio = (found / depth)[inside]
+    error = np.abs(ratio / np.median(ratio) - 1)[normal[..., 2][inside] > 0.3]
+    assert np.median(error) < 0.003
+    assert np.quantile(error, 0.9) < 0.02  # pixels at the rim may be taken for a step
+    assert np.abs(np.log(depth[inside]) - np.log(np.median(depth[inside]))).max() > 0.1  # the twin: no plane
+
+
+def test_planes_that_meet_keep_their_edge() -> None:
+    normal, mask, depth = gutter()
+    found = integrate_normals(normal, mask[..., 0] > 0, CAMERA)
+    ratio = found / depth
+    assert np.abs(ratio / np.median(ratio) - 1).max() < 0.02
+
+
+def test_parts_that_do_not_touch_lie_at_one_depth_and_nothing_is_nothing() -> None:
+    normal = np.zeros((SIZE, SIZE, 3), np.float32)
+    normal[..., 2] = 1
+    inside = np.zeros((SIZE, SIZE), bool)
+    inside[5:15, 5:15] = inside[30:40, 25:40] = True
+    found = integrate_normals(normal, inside, CAMERA)
+    np.testing.assert_allclose(found[inside], 1, atol=1e-3)
+    assert np.isnan(integrate_normals(normal, np.zeros_like(inside), CAMERA)).all()
+    alone = np.zeros_like(inside)
+    alone[3, 3] = True
+    assert integrate_normals(normal, alone, CAMERA)[3, 3] == 1
+
+
+def test_a_ball_hides_nothing_from_itself() -> None:
+    normal, mask, _ = ball()
+    maps, light = as_maps(normal, mask), sky()
+    for share in visible_shares(maps, light).values():
+        assert share.min() > 0.99
+    assert np.allclose(derived_light(maps, light, ["diffuse"])["diffuse"], derived_diffuse(maps, light), rtol=0.01)
+
+
+def test_a_gutter_hides_what_its_other_side_stands_before() -> None:
+    """From a point of one plane all directions are hidden that lie below the other plane's far edge."""
+    normal, mask, depth = gutter()
+    shadow = SelfShadow.of(normal, mask, CAMERA)
+    assert shadow.where.all()
+    points = rays() * depth[..., None]
+    row, column = SIZE // 2, SIZE // 4  # on the left plane
+    number = row * SIZE + column
+    edge = points[row, -1] - points[row, column]  # the farthest that is seen of the right plane
+    rim = math.atan2(edge[2], edge[0])  # above the picture's plane
+    horizon = math.atan2(
+        points[row, SIZE // 2, 2] - points[row, column, 2], points[row, SIZE // 2, 0] - points[row, column, 0]
+    )
+    angles = np.radians(np.arange(-89.5, 90))
+    directions = np.stack([np.cos(angles), np.zeros_like(angles), np.sin(angles)])
+    visible = shadow.visible(slice(number, number + 1), directions)[0]
+    margin = 2 * math.pi / SECTORS
+    assert visible[angles > rim + margin].all()
+    assert not visible[(angles > horizon + 3 * margin) & (angles < rim - margin)].any()
+    left = np.stack([-directions[0], directions[1], directions[2]])
+    above = angles > -math.pi / 4 + margin  # its own plane rises to the left
+    assert shadow.visible(slice(number, number + 1), left)[0][above & (angles > math.pi / 4 + margin)].all()
+
+
+def test_the_light_of_a_gutter_is_less_where_it_is_hidden() -> None:
+    normal, mask, _ = gutter()
+    maps, light = as_maps(normal, mask), sky()
+    shares = visible_shares(maps, light)
+    middle = slice(SIZE // 4, -SIZE // 4)
+    for name, share in shares.items():
+        assert share.shape == normal.shape
+        assert 1 - TRUST - 1e-6 <= share.min() <= share.max() <= 1
+        # the lamp stands to the right: the right plane, which faces left, hides it from the left one
+        left, right = share[middle, SIZE // 2 - 6 : SIZE // 2 - 1], share[middle, SIZE // 2 + 1 : SIZE // 2 + 6]
+        assert left.mean() < 0.6, name
+        assert right.mean() > left.mean() + 0.1, name
+    lit = derived_light(maps, light, ["specular", "diffuse"])
+    without = derived_light(maps, light, ["specular", "diffuse"], shadows=False)
+    assert np.array_equal(without["diffuse"], derived_diffuse(maps, light))
+    assert np.array_equal(without["specular"], derived_specular(maps, light))
+    for name, share in shares.items():
+        np.testing.assert_allclose(lit[name], without[name] * share, rtol=1e-6)
+    assert set(derived_light(maps, light, ["specular"])) == {"specular"}
+    assert derived_light(maps, light, []) == {}
+
+
+def test_shadows_of_d_are_linear_in_the_light() -> None:
+    normal, mask, _ = gutter()
+    maps, one, other = as_maps(normal, mask), sky(), sky()[:, ::-1].copy()
+    a, b, both = (derived_light(maps, light, ["diffuse"])["diffuse"] for light in (one, other, one + other))
+    np.testing.assert_allclose(a + b, both, rtol=1e-3, atol=1e-4)
+    doubled = derived_light(maps, 2 * one, ["specular", "diffuse"])
+    single = derived_light(maps, one, ["specular", "diffuse"])
+    for name, value in single.items():
+        np.testing.assert_allclose(2 * value, doubled[name], rtol=1e-4, atol=1e-5)
+
+
+def uneven() -> Intrinsics:
+    """A gutter that is cut off at one corner."""
+    normal, mask, _ = gutter()
+    mask = mask.copy()
+    mask[: SIZE // 3, : SIZE // 3] = 0
+    return as_maps((normal * mask).astype(np.float32), mask)
+
+
+def test_a_mirrored_and_a_turned_scene_have_mirrored_and_turned_shadows() -> None:
+    given = uneven().replace(environment=sky(33))
+    shares = visible_shares(given, given.require("environment")["environment"])
+    for change in (mirror, quarter_turn):
+        changed = given.replace(**{name: np.ascontiguousarray(value) for name, value in change(given.maps).items()})
+        found = visible_shares(changed, changed.require("environment")["environment"])
+        for name, share in shares.items():
+            expected = change({name: share})[name]
+            assert np.abs(found[name] - expected).mean() < 0.01, (change.__name__, name)
+            assert np.abs(share - expected).mean() > 0.03  # the twin: the change is one
+
+
+def test_larger_pictures_have_the_shadows_of_small_ones() -> None:
+    size = 2 * SHADOW_SIDE
+    normal, mask, _ = gutter(size)
+    large = visible_shares(as_maps(normal, mask), sky())
+    normal, mask, _ = gutter(SHADOW_SIDE)
+    small = visible_shares(as_maps(normal, mask), sky())
+    for name, share in large.items():
+        assert share.shape == (size, size, 3)
+        assert np.abs(share[::2, ::2] - small[name]).mean() < 0.02
+
+
+def test_sizes_and_masks_that_are_not_square_or_empty() -> None:
+    normal, mask, _ = gutter()
+    cut = as_maps(normal[:20], mask[:20])
+    assert visible_shares(cut, sky())["diffuse"].shape == (20, SIZE, 3)
+    nothing = as_maps(normal, np.zeros_like(mask))
+    assert (visible_shares(nothing, sky())["specular"] == 1).all()
+    thin = np.zeros_like(mask)
+    thin[10, 10] = 1
+    assert (visible_shares(as_maps(normal * thin, thin), sky())["diffuse"] == 1).all()
+
+
+def test_a_mask_has_a_bit_for_each_sector() -> None:
+    normal, mask, _ = gutter()
+    hidden = SelfShadow.of(normal, mask, CAMERA).hidden
+    assert hidden.shape == (SIZE * SIZE, HALF_PLANES)
+    assert hidden.dtype == np.uint64
+    assert hidden.any()
