@@ -144,6 +144,14 @@ _SMALL = dataclasses.replace(  # the network of `tiny_renderer`, whose weights i
     augmentation=dataclasses.replace(_TINY_RENDERER.augmentation, repaint=0.5),
     p_render=0.25,
 )
+# `tiny` with the loss of `small`, on many pictures: their light need not be derived, and few are rendered again.
+_TINY_COLOUR = dataclasses.replace(
+    _SMALL,
+    model=_TINY_RENDERER.model,
+    loss=dataclasses.replace(_SMALL.loss, cycle_share=0.125),
+    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
+    batch_size=24,
+)
 # `tiny` with a picture encoder: first that alone, then with the decoder that it serves.
 _TINY_ENCODER = dataclasses.replace(
     _TINY_RENDERER,
@@ -195,6 +203,7 @@ PRESETS: dict[str, TrainConfig] = {
         p_render=0.25,
     ),
     "tiny_renderer": _TINY_RENDERER,
+    "tiny_colour": _TINY_COLOUR,
     "tiny_encoder": _TINY_ENCODER,
     "tiny_inverse": dataclasses.replace(
         _TINY_ENCODER, trains="inverse", batch_size=24, optimizer=OptimizerConfig(kind="muon")
