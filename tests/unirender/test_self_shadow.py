@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from unirender.camera import Camera
+from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
+from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
-from unirender.pipelines.self_shadow import HALF_PLANES, SECTORS, SelfShadow
+from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
 from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, visible_shares
 from unirender.symmetries import mirror, quarter_turn
 
@@ -59,7 +61,7 @@ def sky(rows: int = 16) -> np.ndarray:
     return (lamp[..., None] + np.array([0.1, 0.2, 0.3]) * (1.2 + directions[..., 1:2])).astype(np.float32)
 
 
-@pytest.mark.parametrize("camera", [CAMERA, Camera(fov_deg=60.0)], ids=str)
+@pytest.mark.parametrize("camera", [CAMERA, Camera(fov_deg=60.0), Camera(fov_deg=50.0, principal=(0.4, 0.55))], ids=str)
 def test_the_depth_of_a_ball_is_found(camera: Camera) -> None:
     normal, mask, depth = ball(camera=camera)
     inside = mask[..., 0] > 0
@@ -188,10 +190,38 @@ def test_larger_pictures_have_the_shadows_of_small_ones() -> None:
         assert np.abs(share[::2, ::2] - small[name]).mean() < 0.02
 
 
-def test_sizes_and_masks_that_are_not_square_or_empty() -> None:
+@pytest.mark.parametrize("size", [SIZE, 2 * SHADOW_SIDE])
+def test_a_strip_has_the_shadows_that_it_has_in_a_square(size: int) -> None:
+    normal, mask, _ = gutter(size)
+    rows = slice(3 * size // 8, 5 * size // 8)
+    alone = np.zeros_like(mask)
+    alone[rows] = 1
+    square = visible_shares(as_maps(normal * alone, alone), sky())
+    narrow = Camera(fov_deg=2 * math.degrees(math.atan(math.tan(math.radians(CAMERA.fov_deg) / 2) / 4)))
+    strip = visible_shares(as_maps(normal[rows], mask[rows]).replace(camera=narrow), sky())
+    for name, share in strip.items():
+        assert share.shape == (size // 4, size, 3)
+        # a bit of a mask may fall to either side
+        assert np.abs(share - square[name][rows]).mean() < 0.02 < 0.05 < 1 - share.mean()
+        assert share.min() < 0.6
+
+
+@pytest.mark.parametrize("size", [SIZE, 2 * SHADOW_SIDE])
+def test_what_is_hardly_covered_has_the_shadow_beside_it(size: int) -> None:
+    normal, mask, _ = gutter(size)
+    soft = mask.copy()
+    soft[size // 2 :] = 0.3
+    found = visible_shares(as_maps(normal, soft), sky())["diffuse"]
+    above, below = found[size // 2 - 4 : size // 2], found[size // 2 : size // 2 + 4]
+    assert np.abs(below - above[-1]).mean() < 0.04 < 1 - above.mean()
+    speck = np.zeros_like(mask)
+    speck[size // 4 : size // 2, size // 4 : size // 2] = 1
+    speck[-1, -1] = 1e-3  # too little to be there at a smaller size
+    assert visible_shares(as_maps(normal, speck), sky())["diffuse"][-1, -1].min() > 0.9
+
+
+def test_masks_that_are_empty_or_a_pixel() -> None:
     normal, mask, _ = gutter()
-    cut = as_maps(normal[:20], mask[:20])
-    assert visible_shares(cut, sky())["diffuse"].shape == (20, SIZE, 3)
     nothing = as_maps(normal, np.zeros_like(mask))
     assert (visible_shares(nothing, sky())["specular"] == 1).all()
     thin = np.zeros_like(mask)
@@ -199,9 +229,19 @@ def test_sizes_and_masks_that_are_not_square_or_empty() -> None:
     assert (visible_shares(as_maps(normal * thin, thin), sky())["diffuse"] == 1).all()
 
 
-def test_a_mask_has_a_bit_for_each_sector() -> None:
+def test_an_exposure_that_is_chosen_knows_the_shadows() -> None:
     normal, mask, _ = gutter()
-    hidden = SelfShadow.of(normal, mask, CAMERA).hidden
-    assert hidden.shape == (SIZE * SIZE, HALF_PLANES)
-    assert hidden.dtype == np.uint64
-    assert hidden.any()
+    maps = as_maps(normal, mask)
+    for shadows in (True, False):
+        lit = under_light(maps, sky(), "auto", shadows=shadows).require("diffuse", "environment")
+        assert exposure_factor(lit["diffuse"], mask, RELIGHT_TARGET) == pytest.approx(1, abs=1e-3)
+        derived = derived_light(maps, lit["environment"], ["diffuse"], shadows=shadows)["diffuse"]
+        np.testing.assert_allclose(lit["diffuse"], derived, rtol=1e-4, atol=1e-6)
+
+
+def test_bits_are_those_of_the_sectors_between_two_angles() -> None:
+    cases = [(0, 64), (0, 0), (63, 64), (10, 20), (20, 10), (9.4, 9.6), (9.6, 10.4), (-3, 70)]
+    found = _bits(*np.array(cases, float).T)
+    for (first, last), mask in zip(cases, found, strict=True):
+        expected = sum(1 << sector for sector in range(SECTORS) if first <= sector + 0.5 < last)
+        assert int(mask) == expected, (first, last)

@@ -102,17 +102,16 @@ def under_light(
     if exposure not in ("auto", "keep"):
         raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
     maps = intrinsics.require("normal", "roughness", "mask")
-    derived = derived_diffuse(intrinsics, environment)
+    missing = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+    shares = visible_shares(intrinsics, environment) if shadows and (missing or exposure == "auto") else {}
+    derived = derived_diffuse(intrinsics, environment) * shares.get("diffuse", np.float32(1))
     factor = exposure_factor(derived, maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
     environment = (environment * factor).astype(np.float32)
-    light = {"specular": specular, "diffuse": derived * factor if diffuse is None else diffuse}
     if specular is None:
-        light["specular"] = derived_specular(intrinsics, environment, mirrors)
-    if shadows:
-        own = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
-        shares = visible_shares(intrinsics, environment) if own else {}
-        light |= {name: light[name] * shares[name] for name in own}
-    return intrinsics.replace(environment=environment, **light)
+        specular = derived_specular(intrinsics, environment, mirrors) * shares.get("specular", np.float32(1))
+    return intrinsics.replace(
+        environment=environment, specular=specular, diffuse=derived * factor if diffuse is None else diffuse
+    )
 
 
 def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:

@@ -84,10 +84,10 @@ def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
 
 
 def told_derived(names: Collection[str], shadows: bool) -> frozenset[str]:
-    """Which of the derived maps the network is told to be without shadows, so that it puts them back.
+    """Which of the derived maps the network is told to be derived, as `derived`.
 
-    With the shadows that the picture's own surfaces cast this is d alone: it was taught to add to d what no normal
-    shows, and of s it makes less than the closed form.
+    Without shadows all. It was taught to put shadows into those, and never saw any that have some of them already. Of
+    s with the shadows that the picture shows it makes less than the closed form does; of d it makes more.
     """
     return frozenset(names) - {"specular"} if shadows else frozenset(names)
 

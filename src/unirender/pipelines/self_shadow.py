@@ -23,7 +23,7 @@ HALF_PLANES = 32  # evenly around the viewer's direction
 SECTORS = 64  # of theta, from 0 to pi: the bits of a mask
 STEPS = 24  # along each line, ever longer ones
 NEAREST = 1.5  # pixels: the first step
-FARTHEST = 0.8  # of the frame's height: the last one
+FARTHEST = 0.8  # of the frame's longer side: the last one
 CUT = 4.0  # widths of a pixel by which the depths of neighbours differ where one surface ends in front of another
 ROUNDNESS = 1.0  # times its distance from where it ends is as thick as a surface is taken to be there: a rod is round
 THICKENING = 0.05  # by so much more for each unit of distance: directions between two steps
@@ -34,10 +34,10 @@ _CHUNK = 1 << 20  # pixels times directions at a time
 
 @dataclass(frozen=True)
 class SelfShadow:
-    """Which directions the surfaces of a picture hide from its pixels.
+    """Which directions the surfaces of a picture hide from one another.
 
     Attributes:
-        where: pixels that are known; p of them, in the order of the picture.
+        where: pixels of a surface, covered by half or more; p of them, in the order of the picture.
         hidden: for each of these pixels and each half plane a mask, bit by bit of theta.
         ray: the pixels' rays (x, y, -1).
     """
@@ -51,13 +51,12 @@ class SelfShadow:
         """Of a picture.
 
         Args:
-            normal: camera axes, unit; 0 where nothing is known.
+            normal: camera axes, unit; where it is 0 there is no surface.
             mask: coverage.
             camera: that took it.
         """
-        known = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
-        surface = known & (mask[..., 0] >= COVERED)
-        rays = camera.rays(*known.shape)
+        surface = (mask[..., 0] >= COVERED) & np.any(normal != 0, axis=-1)
+        rays = camera.rays(*surface.shape)
         rays = rays / -rays[..., 2:]
         depth = integrate_normals(normal, surface, camera)
         hidden = np.zeros((int(surface.sum()), HALF_PLANES), np.uint64)
@@ -114,7 +113,7 @@ def _hidden(
     hidden = np.zeros((len(at), HALF_PLANES), np.uint64)
     for plane in range(HALF_PLANES):
         right, up = math.cos(2 * math.pi * plane / HALF_PLANES), math.sin(2 * math.pi * plane / HALF_PLANES)
-        for distance in np.geomspace(NEAREST, max(FARTHEST * height, 2 * NEAREST), STEPS):
+        for distance in np.geomspace(NEAREST, max(FARTHEST * max(height, width), 2 * NEAREST), STEPS):
             i = np.round(row - up * distance).astype(np.int64)
             j = np.round(column + right * distance).astype(np.int64)
             in_frame = (i >= 0) & (i < height) & (j >= 0) & (j < width)

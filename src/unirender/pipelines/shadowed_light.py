@@ -1,14 +1,15 @@
 """s and d from an environment with the shadows that the picture's own surfaces cast (`self_shadow`).
 
-    d = d_0 (1 - H / E),    s = s_0 (integral of V L D n.l) / (integral of L D n.l)
+    d = d_0 (integral of V L n.l) / (integral of L n.l),    s = s_0 (integral of V L D n.l) / (integral of L D n.l)
 
-Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light, V 0 in hidden directions and else 1; E the
-integral of L n.l and H that of (1 - V) L n.l; D the GGX distribution at the half vector. d stays linear in the light; s
-nearly: a lobe's share that is hidden is that of its brightest part.
+Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V = 1 - `TRUST` in hidden directions and
+else 1; D the GGX distribution at the half vector, of a roughness of `LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE`
+pixels d is linear in the light; s is only as far as a lobe has one light.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texels
@@ -36,13 +37,16 @@ def visible_shares(
     mask = surface.require("mask")["mask"]
     frame = Frame(surface.height, surface.width, SHADOW_SIDE)
     small = _shares(frame.enter_intrinsics(surface), environment)
-    return {name: np.where(mask > 0, frame.leave_map(share, mask), 1) for name, share in small.items()}
+    # what is lost, and not what is left: where the small size has no coverage nothing is known to be
+    return {name: 1 - frame.leave_map(1 - share, mask) for name, share in small.items()}
 
 
 def _shares(surface: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """The same at the size that the surface has."""
     normal, roughness, mask = surface.require("normal", "roughness", "mask").values()
-    shadow = SelfShadow.of(normal, mask, surface.camera).where_hidden()
+    everywhere = SelfShadow.of(normal, mask, surface.camera)
+    edge, nearest = _edge(everywhere.where, mask[..., 0] > 0)
+    shadow = everywhere.where_hidden()
     n, alpha = normal[shadow.where], np.square(np.maximum(roughness[shadow.where], LEAST_ROUGHNESS))
     view = -shadow.ray / np.linalg.norm(shadow.ray, axis=1, keepdims=True)
     directions, radiance = texels(environment, QUADRATURE_SHAPE)
@@ -57,7 +61,20 @@ def _shares(surface: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> d
     shares = {name: np.ones_like(normal) for name in found}
     for name, share in shares.items():
         share[shadow.where] = found[name]
+        share[edge] = share[nearest]
     return shares
+
+
+def _edge(
+    surface: Bool[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
+) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Indices of the pixels that are covered by less than a surface, and of the surface's pixel nearest to each."""
+    if not surface.any():
+        nowhere = np.nonzero(surface)
+        return nowhere, nowhere
+    edge = np.nonzero(inside & ~surface)
+    indices = np.asarray(distance_transform_edt(~surface, return_distances=False, return_indices=True))
+    return edge, (indices[0][edge], indices[1][edge])
 
 
 def _distribution(

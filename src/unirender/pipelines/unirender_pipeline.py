@@ -243,8 +243,8 @@ class UniRenderPipeline(DiffusionPipeline):
             generator: of the noise.
             sampler: of `sample`.
             size: side of the network's square.
-            derived: which of the intrinsics' specular and diffuse have no shadows, since they were derived from a light
-                (as by `unirender.pipelines.editing.under_light`).
+            derived: which of the intrinsics' specular and diffuse lack shadows, since they were derived from a light:
+                by `unirender.pipelines.editing.under_light` both, or with its `shadows` d alone.
             shadows: whether s and d that are derived here have the shadows that the surfaces of the picture cast on one
                 another (`unirender.pipelines.self_shadow`); False: none, which the network is told.
 
@@ -258,16 +258,20 @@ class UniRenderPipeline(DiffusionPipeline):
         network = self._network(mode, sampler, size)
         return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
 
-    def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
+    def overflow(self, intrinsics: Intrinsics, *, shadows: bool = True) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
 
         Such values are not clipped: they enter above the range of the training data. `render` logs them, once a map.
+
+        Args:
+            intrinsics: as for `render`.
+            shadows: as for `render`.
 
         Returns:
             By name of the map; {} where nothing does.
         """
         network = self._network()
-        return network.overflow(enter(network, ready_to_render(intrinsics))[1])
+        return network.overflow(enter(network, ready_to_render(intrinsics, shadows))[1])
 
     def edit(
         self,
@@ -338,7 +342,7 @@ class UniRenderPipeline(DiffusionPipeline):
             anchored: as for `edit`.
             specular: s under the new light, if known.
             diffuse: d under the new light, if known.
-            shadows: as for `render`; off, since predicted normals place the shadows too badly to gain by them.
+            shadows: as for `render`; off, since predicted normals say less of where they fall.
             decomposition: of this picture, if it is at hand.
             **sampling: as for `edit`.
 
