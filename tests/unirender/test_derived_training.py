@@ -1,6 +1,7 @@
 """s and d without shadows, in training and in use: what is stored, what the network is told and what it sees."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -224,7 +225,8 @@ def test_of_what_has_the_shadows_that_are_seen_d_alone_is_told_to_lack_others(to
     bare = scene().replace(specular=None, diffuse=None)
     light = bare.require("environment")["environment"]
     lit = under_light(bare, light, "keep", shadows=True)
-    assert not np.allclose(lit.require("diffuse")["diffuse"], under_light(bare, light, "keep").diffuse)
+    without = under_light(bare, light, "keep").require("diffuse")["diffuse"]
+    assert not np.allclose(lit.require("diffuse")["diffuse"], without)
     by_itself = pipeline.render(bare)
     np.testing.assert_allclose(by_itself, pipeline.render(lit, derived=["diffuse"]), atol=1e-6)
     assert np.allclose(by_itself, pipeline.render(lit, derived=LIGHT), atol=1e-6) != told
@@ -238,7 +240,7 @@ def test_a_relit_picture_is_rendered_with_light_that_was_derived() -> None:
     found = pipeline.decompose(picture, mask)
     light = np.random.default_rng(1).uniform(0, 2, (16, 32, 3)).astype(np.float32)
 
-    def relit(**given: np.ndarray) -> np.ndarray:
+    def relit(**given: Any) -> np.ndarray:
         result = pipeline.relight(picture, light, mask, exposure="keep", anchored=False, decomposition=found, **given)
         return result.image_linear
 
