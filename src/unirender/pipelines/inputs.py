@@ -86,8 +86,8 @@ def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
 def told_derived(names: Collection[str], shadows: bool) -> frozenset[str]:
     """Which of the derived maps the network is told to be derived, as `derived`.
 
-    Without shadows all. It was taught to put shadows into those, and never saw any that have some of them already. Of
-    s with the shadows that the picture shows it makes less than the closed form does; of d it makes more.
+    Without shadows all: it was taught to put shadows into those. Such as have some of them already it never saw; that d
+    alone is named then was chosen by what came out.
     """
     return frozenset(names) - {"specular"} if shadows else frozenset(names)
 

@@ -23,7 +23,7 @@ from scipy.special import expit
 
 from unirender.camera import Camera
 
-ROUNDS = 12  # of weighting; more change the depths of 20 test objects by a hundredth of their spread
+ROUNDS = 12  # of weighting
 SHARPNESS = 8.0  # k
 GRAZING = 0.02  # the least N: a surface seen from the side has no slope that a pixel shows
 TETHER = 1e-6  # weight of z = 0, by which parts that do not touch lie at one depth
