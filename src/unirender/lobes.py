@@ -35,7 +35,7 @@ def texels(
     """Directions, and radiance times solid angle, of a light brought to `shape`."""
     if environment.shape[:2] != shape:
         environment = resample_environment(environment, shape)
-    return _directions(shape), (environment * texel_solid_angles(*shape)[..., None]).reshape(-1, 3)
+    return texel_directions(shape), (environment * texel_solid_angles(*shape)[..., None]).reshape(-1, 3)
 
 
 def grid_lobes(
@@ -213,5 +213,5 @@ class MipPyramid:
 
 
 @functools.lru_cache(maxsize=4)
-def _directions(shape: tuple[int, int]) -> Float[np.ndarray, "3 m"]:
+def texel_directions(shape: tuple[int, int]) -> Float[np.ndarray, "3 m"]:
     return np.ascontiguousarray(environment_directions(*shape).reshape(-1, 3).T)

@@ -1,25 +1,28 @@
-"""s and d without shadows, in training and in use: what is stored, what the network is told and what it sees."""
+"""s and d as derived from a light, in training and in use: what is stored, what a network is told, what it sees."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from synthetic_shards import maps_members, write_dataset, write_shard
+from synthetic_shards import group_members, maps_members, sphere, write_dataset, write_shard
 from tiny_models import SIZE, make_batch, make_model, make_pipeline
 from torch import Tensor
 
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr_bytes
+from unirender.exr import channels_rgb, exr_bytes, intrinsics_channels, read_exr_bytes
 from unirender.intrinsics import Intrinsics
 from unirender.models.conditioning import DERIVED_FLAG, TRIPLETS
 from unirender.pipelines.editing import under_light
+from unirender.pipelines.inputs import told_derived
+from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.augment import NO_AUGMENTATION
-from unirender.training.data import BATCH_MAPS, DERIVED_MAPS, GroupDataset
+from unirender.training.data import BATCH_MAPS, DERIVED_FLAGS, DERIVED_MAPS, GroupDataset
 from unirender.training.derived import DerivedLight
 from unirender.training.groups import list_shards, read_groups
 from unirender.training.losses import LossFunction
@@ -48,7 +51,19 @@ def derived_light(dataset: GroupDataset) -> list[DerivedLight]:
 # --- what is stored
 
 
-def test_what_is_stored_is_the_light_without_shadows_of_each_group(folder: Path, dataset: GroupDataset) -> None:
+def bowls(folder: Path) -> Path:
+    """A data folder of bowls: their walls hide light, which no ball does."""
+    members = group_members("basis", 16, 2, (40, 70), (0, 50, 100), seed=0)
+    ball = sphere(16, np.random.default_rng(0))
+    bowl = ball.replace(normal=ball.require("normal")["normal"] * np.array([-1, -1, 1], np.float32))
+    write_shard(folder / "shard-000000.tar", {"a": members | {"shared.exr": exr_bytes(intrinsics_channels(bowl))}})
+    return folder
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_the_light_of_each_group_is_stored_with_and_without_shadows(folder: Path, tmp_path: Path, hollow: bool) -> None:
+    folder = bowls(tmp_path) if hollow else folder
+    dataset = GroupDataset(folder, derived=True)
     members = dict(pair for path in list_shards(folder) for pair in read_groups(path))
     for group, key in enumerate(dataset.keys):
         shard, entry = dataset._groups[group]
@@ -56,15 +71,22 @@ def test_what_is_stored_is_the_light_without_shadows_of_each_group(folder: Path,
         inside = np.moveaxis(shard.shared[entry.shared][6:7], 0, -1) > 0
         stored = derived_light(dataset)[dataset._shard_of[group]]
         lights = sorted({pair.light for pair in entry.pairs})
+        hidden = 0
         for pair in entry.pairs[::5]:
             name = f"l{lights.index(pair.light)}.environment.exr"
             light = channels_rgb(read_exr_bytes(members[key][name], name=name)[0])
-            d = diffuse_light(normal, light)
-            s = specular_light(normal, pair.roughness * inside.astype(np.float32), light)
-            for row, expected in ((pair.diffuse, d), (pair.specular, s)):
-                found = np.moveaxis(stored.of([row])[0], 0, -1)
-                np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+            roughness = pair.roughness * inside.astype(np.float32)
+            mask = np.moveaxis(shard.shared[entry.shared][6:7].astype(np.float32), 0, -1)
+            surface = Intrinsics().replace(normal=normal, roughness=roughness, mask=mask)
+            shares = visible_shares(surface, light)
+            d, s = diffuse_light(normal, light), specular_light(normal, roughness, light)
+            for row, expected, name in ((pair.diffuse, d, "diffuse"), (pair.specular, s, "specular")):
+                for shadows, share in ((False, 1), (True, shares[name])):
+                    found = np.moveaxis(stored.of([row], shadows)[0], 0, -1)
+                    np.testing.assert_allclose(found, expected * share, rtol=2e-3, atol=1e-4)
                 assert expected.max() > 0.01
+                hidden += int((shares[name] < 0.9).sum())
+        assert (hidden > 0) == hollow
         assert (stored.rows[[pair.image for pair in entry.pairs]] == -1).all()
 
 
@@ -72,7 +94,7 @@ def test_it_is_derived_once(folder: Path, dataset: GroupDataset) -> None:
     told: list[tuple[int, int]] = []
     again = GroupDataset(folder, derived=True, progress=lambda done, of: told.append((done, of)))
     assert told == [(i + 1, len(again.shards)) for i in range(len(again.shards))]  # opened; nothing was derived
-    np.testing.assert_array_equal(derived_light(again)[0].pixels, derived_light(dataset)[0].pixels)
+    np.testing.assert_array_equal(derived_light(again)[0].shadowed, derived_light(dataset)[0].shadowed)
 
 
 def test_roughness_maps_have_their_own_lobes(tmp_path: Path) -> None:
@@ -95,13 +117,18 @@ def test_roughness_maps_have_their_own_lobes(tmp_path: Path) -> None:
 
 def test_augmentations_do_to_it_what_they_do_to_rendered_light(folder: Path) -> None:
     dataset = GroupDataset(folder, derived=True)
-    same = [DerivedLight(shard.pixels, np.arange(len(shard.pixels), dtype=np.int32)) for shard in dataset.shards]
-    dataset._derived = same  # as if nothing cast a shadow
-    for index in range(24):
-        sample = dataset.sample(index, 3, ALWAYS)
-        for name in LIGHT:
-            np.testing.assert_array_equal(sample[f"derived_{name}"], sample[name])
-        assert sample["derived"] == 1
+    every = [(shard.pixels, np.arange(len(shard.pixels), dtype=np.int32)) for shard in dataset.shards]
+    # as if nothing cast a shadow; what is not asked for is nowhere
+    kinds = {False: [DerivedLight(x, 0 * x, rows) for x, rows in every]}
+    kinds[True] = [DerivedLight(0 * x, x, rows) for x, rows in every]
+    for shadows, stored in kinds.items():
+        dataset._derived = stored
+        for index in range(24):
+            sample = dataset.sample(index, 3, dataclasses.replace(ALWAYS, shadowed=float(shadows)))
+            for name in LIGHT:
+                np.testing.assert_array_equal(sample[f"derived_{name}"], sample[name])
+            assert sample["derived"] == 1
+            assert sample["shadowed"] == shadows
 
 
 def test_the_rest_of_a_sample_does_not_depend_on_it(folder: Path, dataset: GroupDataset) -> None:
@@ -109,17 +136,19 @@ def test_the_rest_of_a_sample_does_not_depend_on_it(folder: Path, dataset: Group
     never = Augmentation(**{**vars(ALWAYS), "derived": 0.0})
     for index in range(6):
         one, other = plain.sample(index, 3, never), dataset.sample(index, 3, ALWAYS)
-        assert set(other) - set(one) == {*DERIVED_MAPS, "derived"}
+        assert set(other) - set(one) == {*DERIVED_MAPS, *DERIVED_FLAGS}
         for name in BATCH_MAPS:
             np.testing.assert_array_equal(one[name], other[name])
 
 
 def test_a_share_of_a_batch_has_it(dataset: GroupDataset) -> None:
-    half = Augmentation(derived=0.5)
+    half = Augmentation(derived=0.5, shadowed=0.5)
     batch = next(BatchReader(dataset, 16, seed=0, workers=0, augmentation=half))
-    assert tuple(batch) == (*BATCH_MAPS, *DERIVED_MAPS, "derived")
+    assert tuple(batch) == (*BATCH_MAPS, *DERIVED_MAPS, *DERIVED_FLAGS)
     there = batch["derived"].flatten() > 0
-    assert 0 < int(there.sum()) < 16
+    shadowed = batch["shadowed"].flatten() > 0
+    assert 0 < int(shadowed.sum()) < int(there.sum()) < 16
+    assert not shadowed[~there].any()
     for name in DERIVED_MAPS:
         assert batch[name].shape == batch["specular"].shape
         assert batch[name][there].flatten(1).any(dim=1).all()
@@ -149,7 +178,14 @@ def total(loss: LossFunction, batch: dict[str, Tensor], timesteps: Timesteps) ->
 
 def derived_batch(seed: int = 5) -> dict[str, Tensor]:
     other = make_batch(seed=seed)
-    return make_batch() | {f"derived_{n}": other[n] for n in LIGHT} | {"derived": torch.ones(4, 1, 1, 1)}
+    return (
+        make_batch()
+        | {f"derived_{n}": other[n] for n in LIGHT}
+        | {
+            "derived": torch.ones(4, 1, 1, 1),
+            "shadowed": torch.zeros(4, 1, 1, 1),
+        }
+    )
 
 
 def test_a_renderer_sees_it_instead_and_a_decomposer_does_not() -> None:
@@ -171,13 +207,18 @@ def test_rows_without_it_are_what_they_were() -> None:
     loss, plain = loss_function(), make_batch()
     without = derived_batch() | {"derived": torch.zeros(4, 1, 1, 1)}
     assert total(loss, without, RENDERING) == total(loss, plain, RENDERING)
-    some = derived_batch() | {"derived": torch.tensor([0.0, 1, 0, 1]).reshape(4, 1, 1, 1)}
+    has, shadowed = [False, True, False, True], [False, False, False, True]
+    some = derived_batch() | {
+        name: torch.tensor(flags, dtype=torch.float32).reshape(4, 1, 1, 1)
+        for name, flags in (("derived", has), ("shadowed", shadowed))
+    }
     seen, derived = loss._seen(some, torch.ones(4, dtype=torch.bool))
     assert derived is not None
-    for row, has in enumerate((False, True, False, True)):
+    for row in range(4):
         for name in LIGHT:
-            assert torch.equal(seen[name][row], some[f"derived_{name}" if has else name][row])
-        assert [t for t, flag in zip(TRIPLETS, derived[row], strict=True) if flag] == (list(LIGHT) if has else [])
+            assert torch.equal(seen[name][row], some[f"derived_{name}" if has[row] else name][row])
+        told = {t for t, flag in zip(TRIPLETS, derived[row], strict=True) if flag}
+        assert told == (told_derived(LIGHT, shadowed[row]) if has[row] else set())  # as the pipeline tells it
 
 
 # --- what the network is told

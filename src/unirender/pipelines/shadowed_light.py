@@ -7,12 +7,15 @@ else 1; D the GGX distribution at the half vector, of a roughness of `LEAST_ROUG
 pixels d is linear in the light; s is only as far as a lobe has one light.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
+from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.lobes import texels
+from unirender.lobes import texel_directions, texels
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.surface_light import QUADRATURE_SHAPE
@@ -44,25 +47,61 @@ def visible_shares(
 def _shares(surface: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """The same at the size that the surface has."""
     normal, roughness, mask = surface.require("normal", "roughness", "mask").values()
-    everywhere = SelfShadow.of(normal, mask, surface.camera)
-    edge, nearest = _edge(everywhere.where, mask[..., 0] > 0)
-    shadow = everywhere.where_hidden()
-    n, alpha = normal[shadow.where], np.square(np.maximum(roughness[shadow.where], LEAST_ROUGHNESS))
-    view = -shadow.ray / np.linalg.norm(shadow.ray, axis=1, keepdims=True)
-    directions, radiance = texels(environment, QUADRATURE_SHAPE)
-    found = {name: np.ones_like(n) for name in ("specular", "diffuse")}
-    for part in shadow.parts(directions.shape[1]):
-        cosine = np.maximum(n[part] @ directions, 0)
-        visible = shadow.visible(part, directions)
-        lobe = cosine * _distribution(n[part], view[part], alpha[part], directions)
-        for name, weight in (("specular", lobe), ("diffuse", cosine)):
-            total, left = weight @ radiance, np.where(visible, weight, (1 - TRUST) * weight) @ radiance
-            found[name][part] = np.clip(np.divide(left, total, out=np.ones_like(left), where=total > 0), 0, 1)
-    shares = {name: np.ones_like(normal) for name in found}
-    for name, share in shares.items():
-        share[shadow.where] = found[name]
-        share[edge] = share[nearest]
-    return shares
+    seen = SeenShadows(normal, mask, surface.camera)
+    return {"specular": seen.specular_share(roughness, environment), "diffuse": seen.diffuse_share(environment)}
+
+
+class SeenShadows:
+    """What is hidden in one picture, found once for any lights and roughnesses; at the picture's own size."""
+
+    def __init__(
+        self, normal: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], camera: Camera | None = None
+    ) -> None:
+        """Looks where surfaces hide one another.
+
+        Args:
+            normal: camera axes, unit; where it is 0 there is no surface.
+            mask: coverage.
+            camera: that took the picture; the contract's default if None.
+        """
+        everywhere = SelfShadow.of(normal, mask, camera or Camera())
+        self._edge, self._nearest = _edge(everywhere.where, mask[..., 0] > 0)
+        shadow = everywhere.where_hidden()
+        self._where, self._size = shadow.where, normal.shape
+        self._n = normal[shadow.where]
+        self._view = -shadow.ray / np.linalg.norm(shadow.ray, axis=1, keepdims=True)
+        self._directions = texel_directions(QUADRATURE_SHAPE)
+        parts = shadow.parts(self._directions.shape[1])
+        self._parts = [(part, ~shadow.visible(part, self._directions)) for part in parts]
+
+    def diffuse_share(self, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
+        """What is left of d; [0, 1]."""
+        return self._share(environment, lambda part: 1)
+
+    def specular_share(
+        self, roughness: Float[np.ndarray, "h w 1"], environment: Float[np.ndarray, "eh ew 3"]
+    ) -> Float[np.ndarray, "h w 3"]:
+        """What is left of s; [0, 1]."""
+        alpha = np.square(np.maximum(roughness[self._where], LEAST_ROUGHNESS))
+        return self._share(
+            environment,
+            lambda part: _distribution(self._n[part], self._view[part], alpha[part], self._directions),
+        )
+
+    def _share(
+        self, environment: Float[np.ndarray, "eh ew 3"], lobe: Callable[[slice], Float[np.ndarray, "q m"] | int]
+    ) -> Float[np.ndarray, "h w 3"]:
+        """What is left where directions count by `lobe` and their cosine."""
+        _, radiance = texels(environment, QUADRATURE_SHAPE)
+        found = np.ones_like(self._n)
+        for part, hidden in self._parts:
+            weight = np.maximum(self._n[part] @ self._directions, 0) * lobe(part)
+            total, lost = weight @ radiance, TRUST * ((weight * hidden) @ radiance)
+            found[part] -= np.clip(np.divide(lost, total, out=np.zeros_like(total), where=total > 0), 0, 1)
+        share = np.ones(self._size, found.dtype)
+        share[self._where] = found
+        share[self._edge] = share[self._nearest]
+        return share
 
 
 def _edge(

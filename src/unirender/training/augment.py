@@ -101,7 +101,8 @@ class Draw:
     turns: int = 0
     mirror: bool = False
     exposure_target: float | None = None  # None: the stored exposure
-    derived: bool = False  # whether s and d come without shadows, too
+    derived: bool = False  # whether s and d come as they are derived from the light, too
+    shadowed: bool = False  # whether those have the shadows that the picture shows
     paint: int | None = None  # number of the group whose mean colour the object takes on; None: it keeps its own
 
 
@@ -124,6 +125,7 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
     level = int(rng.integers(roughnesses))
     # last, and only where asked for: without them nothing else changes
     derived = bool(config.derived) and bool(rng.random() < config.derived)
+    shadowed = derived and bool(config.shadowed) and bool(rng.random() < config.shadowed)
     painted = bool(config.repaint) and bool(rng.random() < config.repaint)
     paint = int(rng.integers(groups)) if painted else None
     return Draw(
@@ -136,6 +138,7 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
         mirror=flip,
         exposure_target=target,
         derived=derived,
+        shadowed=shadowed,
         paint=paint,
     )
 

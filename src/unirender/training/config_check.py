@@ -59,7 +59,10 @@ RANGES: dict[str, Range] = {
     **dict.fromkeys(("optimizer.beta1", "optimizer.beta2", "optimizer.ema_decay"), _DECAY),
     **dict.fromkeys(("seed", "optimizer.weight_decay", "optimizer.warmup_steps", "augmentation.tint"), _NOT_NEGATIVE),
     "optimizer.final_lr": _SHARE,
-    **{f"augmentation.{name}": _SHARE for name in ("mix", "permute", "mirror", "turn", "derived", "repaint")},
+    **{
+        f"augmentation.{name}": _SHARE
+        for name in ("mix", "permute", "mirror", "turn", "derived", "shadowed", "repaint")
+    },
 }
 
 

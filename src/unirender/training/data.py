@@ -37,7 +37,8 @@ from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_
 from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
 
-DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d without shadows, where `derived` is 1
+DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d as derived from the light, where `derived` is 1
+DERIVED_FLAGS = ("derived", "shadowed")  # 0 or 1 of a sample; shadowed: they have the shadows that the picture shows
 BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask")
 
 ALL_ROWS = slice(None)
@@ -183,7 +184,7 @@ class GroupDataset:
         if drawn.exposure_target is not None:
             factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
         light = self._derived_light(group, rows, drawn) if drawn.derived else None
-        return scale_light(maps, factor) | self._named_derived(light, factor, maps["diffuse"])
+        return scale_light(maps, factor) | self._named_derived(light, drawn.shadowed, factor, maps["diffuse"])
 
     @functools.cache  # noqa: B019 - a dataset lives as long as the training that reads it
     def _mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
@@ -191,7 +192,7 @@ class GroupDataset:
         return mean_colour(maps["albedo"], maps["mask"])
 
     def _derived_light(self, group: int, rows: Mapping[str, Rows], drawn: Draw) -> Maps:
-        """s and d without shadows of what stands in `rows`, under the same augmentation but for the exposure.
+        """s and d as derived for what stands in `rows`, under the same augmentation but for the exposure.
 
         Raises:
             UnirenderError: the folder was opened without them.
@@ -199,17 +200,19 @@ class GroupDataset:
         if self._derived is None:
             raise UnirenderError("derived light was drawn, but the data was opened without it; pass derived=True")
         stored = self._derived[self._shard_of[group]]
-        maps = mix_lights({name: _trailing(stored.of(own)) for name, own in rows.items()}, drawn.weights)
-        maps = quarter_turn({name: maps[name] for name in ("specular", "diffuse")}, drawn.turns)
+        own = {name: stored.of(rows[name], drawn.shadowed) for name in ("specular", "diffuse")}
+        maps = mix_lights({name: _trailing(pixels) for name, pixels in own.items()}, drawn.weights)
+        maps = quarter_turn(maps, drawn.turns)
         return permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
 
-    def _named_derived(self, light: Maps | None, factor: float, like: np.ndarray) -> Maps:
+    def _named_derived(self, light: Maps | None, shadowed: bool, factor: float, like: np.ndarray) -> Maps:
         """As a batch has it: zeros for a sample without it; nothing where the folder was opened without."""
         if self._derived is None:
             return {}
         scaled = {} if light is None else scale_light(light, factor)
         maps = {f"derived_{name}": scaled.get(name, np.zeros_like(like)) for name in ("specular", "diffuse")}
-        return maps | {"derived": np.full((1, 1, 1), light is not None, dtype=np.float32)}
+        flags = {"derived": light is not None, "shadowed": shadowed}
+        return maps | {name: np.full((1, 1, 1), flag, dtype=np.float32) for name, flag in flags.items()}
 
     @functools.lru_cache(maxsize=4)  # noqa: B019 - a dataset lives as long as the training that reads it
     def _order(self, seed: int, epoch: int) -> Int[np.ndarray, " items"]:
@@ -222,7 +225,7 @@ def make_batch(
     """Samples `first` to `first + size` of the stream as float32 tensors; `rows`: these of them only."""
     samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)[rows]]
     batch: Batch = {}
-    derived = (*DERIVED_MAPS, "derived") if "derived" in samples[0] else ()
+    derived = (*DERIVED_MAPS, *DERIVED_FLAGS) if "derived" in samples[0] else ()
     for name in (*BATCH_MAPS, *derived):
         height, width, channels = samples[0][name].shape
         stacked = np.empty((len(samples), channels, height, width), dtype=np.float32)

@@ -1,12 +1,14 @@
-"""s and d of stored groups as a renderer derives them that is given the light alone: in closed form, no shadows.
+"""s and d of stored groups as a renderer derives them that is given the light alone.
 
-A renderer that has only ever seen s and d with shadows takes those without for such, and leaves the shadows out. So
-some of its training pictures come with both (`Augmentation.derived`). A lobe takes long to integrate, about a second
+A renderer that has only ever seen s and d with all their shadows takes those without for such, and leaves the shadows
+out. So some of its training pictures come with both (`Augmentation.derived`): in closed form without shadows, or with
+those that the picture shows (`unirender.pipelines.shadowed_light`). A lobe takes long to integrate, more than a second
 for a group of 52 pictures of 64 pixels. The lights of a shard are derived once, from its own tar, where they have
-their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v1` holds
+their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v2` holds
 
-    pixels.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
-    rows.npy     int32 [n]              for each row of the packed shard's `pixels` the row here; -1: not s or d
+    unshadowed.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
+    shadowed.npy     float16 [m, 3, h, w]   the same with the shadows that the picture shows
+    rows.npy         int32 [n]              for each row of the packed shard's `pixels` the row here; -1: not s or d
 """
 
 import logging
@@ -23,24 +25,29 @@ from jaxtyping import Float, Float16, Int
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
 from unirender.paths import cache_dir, cached_folder
+from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.groups import Group, Shard, read_groups
 
 logger = logging.getLogger(__name__)
 
-DERIVED_VERSION = 1  # part of the cache's path: raise it when what is derived changes
+DERIVED_VERSION = 2  # part of the cache's path: raise it when what is derived changes
+
+_STORED = ("unshadowed", "shadowed")
 
 
 @dataclass(frozen=True)
 class DerivedLight:
     """Of a shard: arrays are read-only memory maps."""
 
-    pixels: Float16[np.ndarray, "m 3 h w"]
+    unshadowed: Float16[np.ndarray, "m 3 h w"]
+    shadowed: Float16[np.ndarray, "m 3 h w"]
     rows: Int[np.ndarray, " n"]
 
-    def of(self, rows: Sequence[int] | Int[np.ndarray, " l"]) -> Float16[np.ndarray, "l 3 h w"]:
-        """What stands in the packed shard's `rows`, all of s or d, without shadows."""
-        return self.pixels[self.rows[np.asarray(rows)]]
+    def of(self, rows: Sequence[int] | Int[np.ndarray, " l"], shadows: bool) -> Float16[np.ndarray, "l 3 h w"]:
+        """What stands in the packed shard's `rows`, all of s or d, derived: with the shadows that are seen, or none."""
+        pixels = self.shadowed if shadows else self.unshadowed
+        return pixels[self.rows[np.asarray(rows)]]
 
 
 def open_derived(
@@ -72,15 +79,16 @@ def _folder(shard: Shard) -> Path:
 
 
 def _open(folder: Path) -> DerivedLight:
-    pixels = np.asarray(np.load(folder / "pixels.npy", mmap_mode="r"))  # a plain view of the memory map
-    return DerivedLight(pixels, np.load(folder / "rows.npy"))
+    mapped = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in _STORED)
+    unshadowed, shadowed = (np.asarray(pixels) for pixels in mapped)  # plain views of the memory maps
+    return DerivedLight(unshadowed, shadowed, np.load(folder / "rows.npy"))
 
 
 def _derive(path: Path, shard: Shard) -> None:
     """Derives the light of a shard into its folder, which appears when it is complete."""
     folder = _folder(shard)
     groups = {group.key: group for group in shard.groups}
-    pixels: list[Float16[np.ndarray, "3 h w"]] = []
+    pixels: list[Float16[np.ndarray, "2 3 h w"]] = []
     rows = np.full(len(shard.pixels), -1, dtype=np.int32)
     for key, members in read_groups(path):
         if key not in groups:
@@ -89,7 +97,8 @@ def _derive(path: Path, shard: Shard) -> None:
             rows[row] = len(pixels)
             pixels.append(light)
     with cached_folder(folder) as made:
-        np.save(made / "pixels.npy", np.stack(pixels))
+        for name, maps in zip(_STORED, np.stack(pixels, axis=1), strict=True):
+            np.save(made / f"{name}.npy", maps)
         np.save(made / "rows.npy", rows)
 
 
@@ -101,17 +110,20 @@ def _environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarra
 
 def _of_group(
     shard: Shard, group: Group, lights: list[Float[np.ndarray, "eh ew 3"]]
-) -> list[tuple[int, Float16[np.ndarray, "3 h w"]]]:
-    """(row of the packed shard, derived light) of every s and d of a group, once each."""
+) -> list[tuple[int, Float16[np.ndarray, "2 3 h w"]]]:
+    """(row of the packed shard, derived light without and with shadows) of every s and d of a group, once each."""
     shared = np.moveaxis(shard.shared[group.shared].astype(np.float32), 0, -1)
-    normal, inside = shared[..., 3:6], shared[..., 6:7] > 0
-    found: dict[int, Float[np.ndarray, "h w 3"]] = {}
+    normal, mask = shared[..., 3:6], shared[..., 6:7]
+    shadows = SeenShadows(normal, mask)
+    found: dict[int, Float[np.ndarray, "2 h w 3"]] = {}
     numbers = {row: number for number, row in enumerate(sorted({pair.light for pair in group.pairs}))}
     for pair in group.pairs:
         light = lights[numbers[pair.light]]
-        rough = shared[..., 7:8] if pair.roughness is None else np.float32(pair.roughness) * inside
+        rough = shared[..., 7:8] if pair.roughness is None else np.float32(pair.roughness) * (mask > 0)
         if pair.diffuse not in found:
-            found[pair.diffuse] = diffuse_light(normal, light)
+            d = diffuse_light(normal, light)
+            found[pair.diffuse] = np.stack([d, d * shadows.diffuse_share(light)])
         if pair.specular not in found:
-            found[pair.specular] = specular_light(normal, rough, light)
-    return [(row, np.moveaxis(np.minimum(v, HALF_MAX), -1, 0).astype(np.float16)) for row, v in found.items()]
+            s = specular_light(normal, rough, light)
+            found[pair.specular] = np.stack([s, s * shadows.specular_share(rough, light)])
+    return [(row, np.moveaxis(np.minimum(v, HALF_MAX), -1, 1).astype(np.float16)) for row, v in found.items()]

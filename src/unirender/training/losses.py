@@ -22,6 +22,7 @@ from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
+from unirender.pipelines.inputs import told_derived
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights
 from unirender.training.presets import LossConfig
@@ -132,14 +133,22 @@ class LossFunction:
         return answers_error(said, truth, covered)
 
     def _seen(self, batch: Maps, clean: Bool[Tensor, " b"]) -> tuple[Maps, Bool[Tensor, "b 6"] | None]:
-        """The maps that a renderer sees, in which s and d may have been derived from the light; and which were."""
+        """The maps that a renderer sees, in which s and d may have been derived from the light; and which lack shadows.
+
+        Of those that have the shadows that are seen, d alone is said to lack others, as
+        `unirender.pipelines.inputs.told_derived` says it of a light that is given.
+        """
         rows = clean & (batch["derived"].flatten() > 0) if "derived" in batch else None
         if rows is None or not rows.any():
             return batch, None
         names = ("specular", "diffuse")
         swapped = {n: torch.where(rows[:, None, None, None], batch[f"derived_{n}"], batch[n]) for n in names}
-        of_light = torch.tensor([name in names for name in TRIPLETS], device=rows.device)
-        return batch | swapped, rows[:, None] & of_light
+        of_light, of_diffuse = (
+            torch.tensor([name in told_derived(names, shadows) for name in TRIPLETS], device=rows.device)
+            for shadows in (False, True)
+        )
+        shadowed = batch["shadowed"].flatten()[:, None] > 0
+        return batch | swapped, rows[:, None] & torch.where(shadowed, of_diffuse, of_light)
 
     def _consistency(
         self, predicted: Tensor, clean_i: Tensor, batch: Maps, errors: Errors, generator: torch.Generator

@@ -32,7 +32,7 @@ class ModelConfig:
     physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
     # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
     light: Literal["latent", "encoder"] = "latent"
-    derived_light: bool = False  # the network is told which of s and d were derived from a light, without shadows
+    derived_light: bool = False  # the network is told which of s and d were derived from a light and lack shadows
     # a clean image also enters through frozen features of ImageNet, or through an encoder of its own
     picture_features: Literal["none", "vgg16", "encoder"] = "none"
     unified: bool = True  # False: a network for each direction, and the widths are those of each
@@ -92,7 +92,8 @@ class Augmentation:
     mirror: float = 0.5  # probability of a mirror flip
     turn: float = 0.15  # probability of a turn by 90, 180 or 270 degrees: rare, since light mostly comes from above
     expose: bool = True  # apply the gauge again with a newly drawn target; False: keep the stored exposure
-    derived: float = 0.0  # probability that a renderer sees s and d derived from the light, without shadows
+    derived: float = 0.0  # probability that a renderer sees s and d derived from the light
+    shadowed: float = 0.0  # share of these that has the shadows that the picture shows, and not none
     repaint: float = 0.0  # probability that an object takes on another's mean colour; close, not exact
 
 
@@ -132,7 +133,7 @@ _HALF_TINY = dataclasses.replace(
 _TINY_RENDERER = dataclasses.replace(
     _TINY,
     model=dataclasses.replace(_TINY.model, derived_light=True),
-    augmentation=dataclasses.replace(_TINY.augmentation, derived=0.3),
+    augmentation=dataclasses.replace(_TINY.augmentation, derived=0.3, shadowed=0.7),
     loss=dataclasses.replace(_TINY.loss, composite=1.0, image=20.0, image_floor=1e-3),
     optimizer=OptimizerConfig(kind="muon"),
     p_render=0.4,
