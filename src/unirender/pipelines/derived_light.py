@@ -75,6 +75,7 @@ def derived_light(
     environment: Float[np.ndarray, "eh ew 3"],
     names: Collection[str],
     *,
+    mirrors: bool = True,
     shadows: bool = True,
 ) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """s and d by name.
@@ -83,11 +84,12 @@ def derived_light(
         intrinsics: with normal, roughness and mask; the camera gives the view directions.
         environment: lat-long radiance in camera axes, any resolution.
         names: of specular and diffuse, those that are wanted.
+        mirrors: as for `derived_specular`.
         shadows: whether the picture's own surfaces hide the light (`unirender.pipelines.shadowed_light`).
     """
     light = {}
     if "specular" in names:
-        light["specular"] = derived_specular(intrinsics, environment)
+        light["specular"] = derived_specular(intrinsics, environment, mirrors)
     if "diffuse" in names:
         light["diffuse"] = derived_diffuse(intrinsics, environment)
     if not shadows or not light:

@@ -9,8 +9,7 @@ from jaxtyping import Bool, Float
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.derived_light import derived_diffuse, derived_specular
-from unirender.pipelines.shadowed_light import visible_shares
+from unirender.pipelines.derived_light import derived_light, derived_specular
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
 LOBE_WIDTH = (
@@ -102,16 +101,12 @@ def under_light(
     if exposure not in ("auto", "keep"):
         raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
     maps = intrinsics.require("normal", "roughness", "mask")
-    missing = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
-    shares = visible_shares(intrinsics, environment) if shadows and (missing or exposure == "auto") else {}
-    derived = derived_diffuse(intrinsics, environment) * shares.get("diffuse", np.float32(1))
-    factor = exposure_factor(derived, maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
-    environment = (environment * factor).astype(np.float32)
-    if specular is None:
-        specular = derived_specular(intrinsics, environment, mirrors) * shares.get("specular", np.float32(1))
-    return intrinsics.replace(
-        environment=environment, specular=specular, diffuse=derived * factor if diffuse is None else diffuse
-    )
+    given = {name: value for name, value in (("specular", specular), ("diffuse", diffuse)) if value is not None}
+    names = {"specular", "diffuse"} - set(given) | ({"diffuse"} if exposure == "auto" else set())
+    derived = derived_light(intrinsics, environment, names, mirrors=mirrors, shadows=shadows)
+    factor = exposure_factor(derived["diffuse"], maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
+    scaled = {name: value * np.float32(factor) for name, value in derived.items()}
+    return intrinsics.replace(environment=(environment * factor).astype(np.float32), **(scaled | given))
 
 
 def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:
