@@ -151,7 +151,7 @@ class Render:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.inputs import to_derive, told_derived, with_mask
+        from unirender.pipelines.inputs import ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
         check_exposure(self.exposure)
@@ -167,12 +167,13 @@ class Render:
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
             if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
                 notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
-            if self.environment is not None or to_derive(intrinsics):
+            of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
+            if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
             pipeline = self.model.load()
-            derived = told_derived(() if self.environment is None else ("specular", "diffuse"), self.shadows)
-            image = pipeline.render(intrinsics, derived=derived, shadows=self.shadows, **self.model.sampling())
-            meta |= {**self.model.provenance(pipeline), **overflow(pipeline, intrinsics, shadows=self.shadows)}
+            ready = ready_to_render(intrinsics, self.shadows)  # here, so that it is done once
+            image = pipeline.render(ready, derived=told_derived(of_light, self.shadows), **self.model.sampling())
+            meta |= {**self.model.provenance(pipeline), **overflow(pipeline, ready)}
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
         return 0
@@ -281,7 +282,7 @@ def check_exposure(stops: float | None) -> None:
         raise UsageError(f"--exposure {stops}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
 
 
-def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics", shadows: bool = True) -> dict[str, Any]:
+def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[str, Any]:
     """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
-    found = pipeline.overflow(intrinsics, shadows=shadows)
+    found = pipeline.overflow(intrinsics)
     return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
