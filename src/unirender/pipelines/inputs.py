@@ -86,8 +86,8 @@ def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
 def told_derived(names: Collection[str], shadows: bool) -> frozenset[str]:
     """Which of the derived maps the network is told to be derived, as `derived`.
 
-    Without shadows all. Of those that have the shadows that the picture shows d alone is named: so it sees them in
-    training, and a model that never saw such maps renders them best.
+    Without shadows all. Of those that have the shadows that the picture shows d alone: chosen by what came out of
+    models that never saw such maps, and so it is in training.
     """
     return frozenset(names) - {"specular"} if shadows else frozenset(names)
 

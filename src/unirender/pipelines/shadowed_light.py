@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
-from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions, texels
 from unirender.pipelines.framing import Frame
@@ -34,37 +33,28 @@ def visible_shares(
         intrinsics: with normal, roughness and mask.
         environment: lat-long radiance in camera axes, any resolution.
     """
-    surface = Intrinsics(**intrinsics.require("normal", "roughness", "mask"), camera=intrinsics.camera)
-    if max(surface.height, surface.width) <= SHADOW_SIDE:
-        return _shares(surface, environment)
-    mask = surface.require("mask")["mask"]
-    frame = Frame(surface.height, surface.width, SHADOW_SIDE)
-    small = _shares(frame.enter_intrinsics(surface), environment)
-    # what is lost, and not what is left: where the small size has no coverage nothing is known to be
-    return {name: 1 - frame.leave_map(1 - share, mask) for name, share in small.items()}
-
-
-def _shares(surface: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]) -> dict[str, Float[np.ndarray, "h w 3"]]:
-    """The same at the size that the surface has."""
-    normal, roughness, mask = surface.require("normal", "roughness", "mask").values()
-    seen = SeenShadows(normal, mask, surface.camera)
+    roughness = intrinsics.require("roughness")["roughness"]
+    seen = SeenShadows(intrinsics)
     return {"specular": seen.specular_share(roughness, environment), "diffuse": seen.diffuse_share(environment)}
 
 
 class SeenShadows:
-    """What is hidden in one picture, found once for any lights and roughnesses; at the picture's own size."""
+    """What is hidden in one picture, found once for any lights and roughnesses."""
 
-    def __init__(
-        self, normal: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], camera: Camera | None = None
-    ) -> None:
+    def __init__(self, intrinsics: Intrinsics) -> None:
         """Looks where surfaces hide one another.
 
         Args:
-            normal: camera axes, unit; where it is 0 there is no surface.
-            mask: coverage.
-            camera: that took the picture; the contract's default if None.
+            intrinsics: with normal and mask; the camera gives the pixels' rays.
         """
-        everywhere = SelfShadow.of(normal, mask, camera or Camera())
+        surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
+        self._mask = surface.require("mask")["mask"]
+        self._frame = None
+        if max(surface.height, surface.width) > SHADOW_SIDE:
+            self._frame = Frame(surface.height, surface.width, SHADOW_SIDE)
+            surface = self._frame.enter_intrinsics(surface)
+        normal, mask = surface.require("normal", "mask").values()
+        everywhere = SelfShadow.of(normal, mask, surface.camera)
         self._edge, self._nearest = _edge(everywhere.where, mask[..., 0] > 0)
         shadow = everywhere.where_hidden()
         self._where, self._size = shadow.where, normal.shape
@@ -82,6 +72,9 @@ class SeenShadows:
         self, roughness: Float[np.ndarray, "h w 1"], environment: Float[np.ndarray, "eh ew 3"]
     ) -> Float[np.ndarray, "h w 3"]:
         """What is left of s; [0, 1]."""
+        if self._frame is not None:
+            entered = self._frame.enter_intrinsics(Intrinsics(roughness=roughness, mask=self._mask))
+            roughness = entered.require("roughness")["roughness"]
         alpha = np.square(np.maximum(roughness[self._where], LEAST_ROUGHNESS))
         return self._share(
             environment,
@@ -101,7 +94,10 @@ class SeenShadows:
         share = np.ones(self._size, found.dtype)
         share[self._where] = found
         share[self._edge] = share[self._nearest]
-        return share
+        if self._frame is None:
+            return share
+        # what is lost, and not what is left: where the small size has no coverage nothing is known to be
+        return 1 - self._frame.leave_map(1 - share, self._mask)
 
 
 def _edge(

@@ -81,8 +81,8 @@ class GroupDataset:
             shards: names of the shards to use; None: all that are complete. A resumed training passes `shard_names` of
                 the interrupted one, so that a folder that grew in between gives the same stream.
             progress: called with (shards opened, shards in all); then with those whose light is derived, if any is.
-            derived: whether samples may have s and d derived from their light besides; takes a second for each group
-                that was not derived before (`unirender.training.derived`).
+            derived: whether samples may have s and d derived from their light besides; takes one or two seconds
+                for each group that was not derived before (`unirender.training.derived`).
         """
         self.folder = Path(folder)
         available = list_shards(self.folder)

@@ -2,8 +2,8 @@
 
 A renderer that has only ever seen s and d with all their shadows takes those without for such, and leaves the shadows
 out. So some of its training pictures come with both (`Augmentation.derived`): in closed form without shadows, or with
-those that the picture shows (`unirender.pipelines.shadowed_light`). A lobe takes long to integrate, more than a second
-for a group of 52 pictures of 64 pixels. The lights of a shard are derived once, from its own tar, where they have
+those that the picture shows (`unirender.pipelines.shadowed_light`). A lobe takes long to integrate, a group of 64
+pixels one or two seconds. The lights of a shard are derived once, from its own tar, where they have
 their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v2` holds
 
     unshadowed.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
@@ -24,6 +24,7 @@ from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
+from unirender.intrinsics import Intrinsics
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
@@ -65,7 +66,7 @@ def open_derived(
     missing = [(path, shard) for path, shard in shards if not _folder(shard).exists()]
     if missing:
         groups = sum(len(shard.groups) for _, shard in missing)
-        logger.warning("deriving the light of %d groups of %d shards once, about a second each", groups, len(missing))
+        logger.warning("deriving the light of %d groups of %d shards once, 1 or 2 seconds each", groups, len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
         with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
             for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
@@ -114,7 +115,7 @@ def _of_group(
     """(row of the packed shard, derived light without and with shadows) of every s and d of a group, once each."""
     shared = np.moveaxis(shard.shared[group.shared].astype(np.float32), 0, -1)
     normal, mask = shared[..., 3:6], shared[..., 6:7]
-    shadows = SeenShadows(normal, mask)
+    shadows = SeenShadows(Intrinsics(normal=normal, mask=mask))
     found: dict[int, Float[np.ndarray, "2 h w 3"]] = {}
     numbers = {row: number for number, row in enumerate(sorted({pair.light for pair in group.pairs}))}
     for pair in group.pairs:
