@@ -37,6 +37,7 @@ LIT = ("from-image-sd", "from-image-hdri")
 OURS, ANCHORED = "ours-mean", "ours-mean-anchored"
 PLAIN_COMPOSITE, ANCHORED_COMPOSITE = "composite-of-ours-mean", "composite-of-ours-mean-anchored"
 COMPOSITE, SPLIT_SUM, CEILING = "composite", "composite-split-sum", "noise-ceiling"
+SHADOWED = "composite-split-sum-seen-shadows"  # where the light is given; with s and d given there is nothing to derive
 
 
 def edit_claims(row: str, expected: str = "beats") -> tuple[Claim, ...]:
@@ -46,12 +47,12 @@ def edit_claims(row: str, expected: str = "beats") -> tuple[Claim, ...]:
     )
 
 
-def given_claims(row: str, against: Sequence[str] = (COMPOSITE, SPLIT_SUM)) -> tuple[Claim, ...]:
+def given_claims(row: str, against: Sequence[str] = (COMPOSITE, SPLIT_SUM, SHADOWED)) -> tuple[Claim, ...]:
     """Renderings of true maps: the distance to closed forms."""
     return tuple(
         Claim("rendering", protocol, quantity, "psnr", row, other, "stated")
         for other in against
-        for protocol in GIVEN
+        for protocol in (GIVEN[1:] if SHADOWED in (row, other) else GIVEN)
         for quantity in EDITS
     )
 
@@ -145,7 +146,7 @@ def run_claims(records: Sequence[Record], run: RunInfo) -> list[Claim]:
     claims = list(OUR_CLAIMS) if ours else []
     present = {(r.table, r.protocol, r.method, key) for r in records for key in r.values}
     others = [c for info in run.methods if info.kind == "external" for c in stranger_claims(info.key)]
-    optional = [*given_claims(SPLIT_SUM, (COMPOSITE,)), *others]
+    optional = [*given_claims(SPLIT_SUM, (COMPOSITE,)), *given_claims(SHADOWED, (SPLIT_SUM,)), *others]
 
     def ran(claim: Claim, row: str) -> bool:
         return (claim.table, claim.protocol, row, claim.key) in present

@@ -195,6 +195,19 @@ class SplitSum:
         return split_sum_image(with_derived_light(intrinsics))
 
 
+class ShadowedSplitSum:
+    """The split-sum composite with s and d derived as our pipeline derives them, with the shadows that the picture's
+    own surfaces cast: what our renderer begins with where only the light is given."""
+
+    name = "composite (split-sum, seen shadows)"
+    config: Mapping[str, Any] = MappingProxyType({"composite": "split-sum", "shadows": "seen"})
+
+    def render(self, intrinsics: Intrinsics) -> Image:
+        from unirender.pipelines.inputs import ready_to_render
+
+        return split_sum_image(ready_to_render(intrinsics, shadows=True))
+
+
 def set_material(intrinsics: Intrinsics, roughness: float | None, metallic: float | None) -> Intrinsics:
     """The same scene with another material; for a new roughness s changes by our pipeline's own rule."""
     from unirender.pipelines.editing import specular_for_roughness

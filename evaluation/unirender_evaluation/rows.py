@@ -18,6 +18,7 @@ from unirender_evaluation.methods import (
     InputAsAlbedo,
     MeanAlbedo,
     MeanNormal,
+    ShadowedSplitSum,
     SphereNormal,
     SplitSum,
     UneditedInput,
@@ -137,12 +138,15 @@ def trivial_rows() -> list[Row]:
     methods = [UneditedInput(), InputAsAlbedo(), MeanAlbedo(), MeanNormal(), SphereNormal(), ConstantMaterial()]
     rows = [make_row(m, "trivial", note=notes.get(m.name, "")) for m in methods]
     given = frozenset({("rendering", "given"), ("rendering", "given-light")})
+    light_alone = frozenset({("rendering", "given-light")})
     note = "given light: s and d derived without shadows"
+    seen = "s and d derived with the shadows that the picture shows"
     split = "reflectance averaged over the GGX lobe instead of that at normal incidence"
     return [
         *rows,
         make_row(Composite(), "baseline", protocols=given, note=note),
         make_row(SplitSum(), "baseline", protocols=given, note=split),
+        make_row(ShadowedSplitSum(), "baseline", protocols=light_alone, note=seen, uses=frozenset({MODEL})),
     ]
 
 

@@ -144,7 +144,7 @@ def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert not ceiling_breaches(first.records)
     methods = {record.method for record in first.records}
     bounds = {"noise-ceiling", "reference-other-seed", "shade-true-maps", "true-maps"}
-    assert bounds | {"composite", "composite-split-sum", "guess"} <= methods
+    assert bounds | {"composite", "composite-split-sum", "composite-split-sum-seen-shadows", "guess"} <= methods
     assert all(record.sample.startswith(tuple(scene.key for scene in scenes)) for record in first.records), (
         "every row keeps to the run's scenes"
     )

@@ -12,6 +12,7 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import methods
+from unirender_evaluation.claims import SHADOWED
 from unirender_evaluation.engine import Prediction, answer, score
 from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
 from unirender_evaluation.suites import Suite
@@ -68,6 +69,19 @@ def test_split_sum_adds_the_angle_of_the_fresnel_term(suite: Suite) -> None:
             assert 1.005 < split.sum() / plain.sum() < 1.3
     for table, protocol in (("rendering", "from-image"), ("inverse", "single-image")):
         assert not row.answers(next(tasks(suite, table, protocol, [suite.scenes[0]])), list(suite.scenes))
+
+
+def test_split_sum_with_seen_shadows(suite: Suite) -> None:
+    """Only where s and d have to be derived; a bowl's walls hide light, a ball's hide none."""
+    row = next(row for row in trivial_rows() if row.info.key == SHADOWED)
+    for protocol, expected in (("given-light", True), ("given", False)):
+        assert row.answers(next(tasks(suite, "rendering", protocol, [suite.scenes[0]])), list(suite.scenes)) == expected
+    task = next(tasks(suite, "rendering", "given-light", [suite.scenes[0]]))
+    ball = task.inputs["render"]["intrinsics"]
+    bowl = ball.replace(normal=ball.normal * np.array([-1, -1, 1], np.float32))
+    shares = [row.method.render(maps).sum() / methods.SplitSum().render(maps).sum() for maps in (ball, bowl)]
+    assert shares[0] == pytest.approx(1, abs=0.02)
+    assert 0.3 < shares[1] < 0.9
 
 
 def test_input_as_albedo_and_constants(suite: Suite) -> None:
