@@ -138,6 +138,9 @@ def test_the_light_of_a_gutter_is_less_where_it_is_hidden() -> None:
         left, right = share[middle, SIZE // 2 - 6 : SIZE // 2 - 1], share[middle, SIZE // 2 + 1 : SIZE // 2 + 6]
         assert left.mean() < 0.6, name
         assert right.mean() > left.mean() + 0.1, name
+    (alone,) = visible_shares(maps.replace(roughness=None), light, ["diffuse"]).items()
+    assert alone[0] == "diffuse"
+    assert np.array_equal(alone[1], shares["diffuse"])
     lit = derived_light(maps, light, ["specular", "diffuse"])
     without = derived_light(maps, light, ["specular", "diffuse"], shadows=False)
     assert np.array_equal(without["diffuse"], derived_diffuse(maps, light))

@@ -94,7 +94,7 @@ def derived_light(
         light["diffuse"] = derived_diffuse(intrinsics, environment)
     if not shadows or not light:
         return light
-    shares = visible_shares(intrinsics, environment)
+    shares = visible_shares(intrinsics, environment, light)
     return {name: value * shares[name] for name, value in light.items()}
 
 

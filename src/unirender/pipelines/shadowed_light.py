@@ -7,7 +7,7 @@ else 1; D the GGX distribution at the half vector, of a roughness of `LEAST_ROUG
 pixels d is linear in the light; s is only as far as a lobe has one light.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,17 +25,23 @@ LEAST_ROUGHNESS = 0.3  # below it a lobe is narrower than the texels over which 
 
 
 def visible_shares(
-    intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"]
+    intrinsics: Intrinsics,
+    environment: Float[np.ndarray, "eh ew 3"],
+    names: Collection[str] = ("specular", "diffuse"),
 ) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """What of s and d without shadows is left where the picture's own surfaces stand in the light's way; [0, 1].
 
     Args:
-        intrinsics: with normal, roughness and mask.
+        intrinsics: with normal and mask, and roughness where s is wanted.
         environment: lat-long radiance in camera axes, any resolution.
+        names: of specular and diffuse, those that are wanted.
     """
-    roughness = intrinsics.require("roughness")["roughness"]
-    seen = SeenShadows(intrinsics)
-    return {"specular": seen.specular_share(roughness, environment), "diffuse": seen.diffuse_share(environment)}
+    seen, shares = SeenShadows(intrinsics), {}
+    if "specular" in names:
+        shares["specular"] = seen.specular_share(intrinsics.require("roughness")["roughness"], environment)
+    if "diffuse" in names:
+        shares["diffuse"] = seen.diffuse_share(environment)
+    return shares
 
 
 class SeenShadows:
