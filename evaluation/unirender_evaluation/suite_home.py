@@ -1,8 +1,9 @@
 """Where the truth of a suite lies, and its TOML file with the folders and the hash that belong to it.
 
-A suite that ships without its truth (`standard`, `paper`) is a definition: `bench truth` writes a copy of its TOML file
-that names the folders it was made from and the truth's hash, and the truth beside it. By name, that copy is looked for
-in `${UNIRENDER_CACHE}/suites/NAME`; elsewhere (`--out`) it is any suite of its own, by the path of its file.
+A suite whose truth is not part of the package (`standard`, `paper`) is a definition: `bench truth` writes a copy of its
+TOML file that names the folders it was made from and the truth's hash, and the truth beside it. By name, that copy is
+looked for in `${UNIRENDER_CACHE}/suites/NAME`, then in the folder `suites` of a checkout, where the truth lies that the
+results in it were measured on; elsewhere (`--out`) it is any suite of its own, by the path of its file.
 """
 
 import json
@@ -15,7 +16,15 @@ from typing import Literal
 
 from unirender.errors import UnirenderError
 from unirender.paths import cache_dir
-from unirender_evaluation.suite_spec import SuiteSpec, is_bundled, parse_spec, read_spec, read_text, suite_path
+from unirender_evaluation.suite_spec import (
+    SuiteSpec,
+    is_bundled,
+    parse_spec,
+    read_spec,
+    read_text,
+    suite_folder,
+    suite_path,
+)
 
 TABLE = re.compile(r"^[ \t]*\[", re.MULTILINE)
 FOLDERS = re.compile(r"^[ \t]*\[[ \t]*folders[ \t]*\][^\n]*\n?", re.MULTILINE)
@@ -26,22 +35,27 @@ def home(name: str) -> Path:
     return cache_dir() / "suites" / name / f"{name}.toml"
 
 
+def shared(name: str) -> Path:
+    """The copy that comes with a checkout: one truth for everybody, so that results can stand in one table."""
+    return suite_folder().parents[2] / "suites" / name / f"{name}.toml"
+
+
 def ships_truth(spec: SuiteSpec) -> bool:
     """Whether a bundled suite comes with its truth: its file then has the hash."""
     return bool(spec.truth_sha256)
 
 
 def found_spec(name_or_path: str | Path) -> SuiteSpec:
-    """A suite's file with a truth: of a bundled suite without one the copy that was made here.
+    """A suite's file with a truth: of a bundled suite without one the copy that was made here, else the shared one.
 
     Raises:
-        UnirenderError: as `read_spec`; or that copy is not there, or of another version of the suite.
+        UnirenderError: as `read_spec`; or neither is there, or it is of another version of the suite.
     """
     spec = read_spec(name_or_path)
     if not is_bundled(spec.path) or ships_truth(spec):
         return spec
-    path = home(spec.name)
-    if not path.is_file():
+    path = next((place for place in (home(spec.name), shared(spec.name)) if place.is_file()), None)
+    if path is None:
         raise UnirenderError(f"suite {spec.name!r} has no truth here: make it once with {truth_command(spec)}")
     made = read_spec(path)
     if definition(made) != definition(spec):

@@ -153,6 +153,12 @@ def _chosen(listed: Sequence[MeshFile], group: Files, spec: SuiteSpec) -> list[M
     return [files[name] for name in drawn(names, group, what)]
 
 
+def object_is_here(suite: Suite, scene: Scene) -> bool:
+    """Whether the object of a scene can be made or read; its file may still be another one than the truth's."""
+    made, folder = suite.provenance["objects"][scene.object], suite.spec.folder("objects")
+    return "seed" in made or (folder is not None and (folder / str(made["file"])).is_file())
+
+
 def scene_object(suite: Suite, scene: Scene) -> MeshObject:
     """The object of a scene, textures included.
 

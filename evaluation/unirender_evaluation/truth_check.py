@@ -10,6 +10,7 @@ All z-tests together raise a false alarm in at most `FAMILY_ALPHA` (1 %) of chec
 error everywhere), where the pixels but not their three channels count as independent.
 """
 
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,11 +20,13 @@ from jaxtyping import Float
 
 from unirender.errors import UsageError
 from unirender_evaluation.geometry_check import GeometryTest, compare_geometry, twin_geometry
-from unirender_evaluation.suite_objects import scene_object
+from unirender_evaluation.suite_objects import object_is_here, scene_object
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_file import diffuse_member, image_member, specular_member
 from unirender_evaluation.truth_render import good_spp, item_seed
 from unirender_reference.scene_spec import object_hash
+
+logger = logging.getLogger(__name__)
 
 LIGHTS = ("specular", "diffuse")
 HALF_ROUNDING = 5e-4  # relative rounding of half floats
@@ -99,12 +102,21 @@ class TruthCheck:
         }
 
 
+def scenes_here(suite: Suite) -> list[Scene]:
+    """The scenes whose objects can be made or read here."""
+    return [scene for scene in suite.scenes if object_is_here(suite, scene)]
+
+
 def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
-    """`count` scenes at random, of different objects as long as there are enough."""
+    """`count` scenes at random, of different objects as long as there are enough.
+
+    Objects whose mesh file is not here cannot be rendered again and are left out; where that leaves none they are not.
+    """
     if count < 1:
         raise UsageError(f"truth check: got {count} scenes, expected at least 1")
     rng = np.random.default_rng([seed, 0x7E57])
-    scenes = [suite.scenes[i] for i in rng.permutation(len(suite.scenes))]
+    here = scenes_here(suite) or list(suite.scenes)
+    scenes = [here[i] for i in rng.permutation(len(here))]
     first = {scene.object: scene for scene in reversed(scenes)}
     order = [s for s in scenes if first[s.object] is s] + [s for s in scenes if first[s.object] is not s]
     return order[: min(count, len(order))]
@@ -131,6 +143,12 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     from unirender_reference.render import Renderer
     from unirender_reference.statistics import FAMILY_ALPHA
 
+    if (count_here := len(scenes_here(suite))) < len(suite.scenes):
+        where = suite.spec.folder("objects") or "any folder"
+        logger.warning(
+            "the truth check chooses from %d of %d scenes: the meshes of the others are not in %s (%s)",
+            *(count_here, len(suite.scenes), where, suite.spec.objects_from),
+        )
     checks: list[Check] = []
     others: list[str] = []
     geometry: list[GeometryCheck] = []

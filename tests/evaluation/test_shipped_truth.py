@@ -3,19 +3,24 @@
 import hashlib
 import io
 import re
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 
 from unirender.color import image_srgb, unpremultiply
+from unirender.errors import UsageError
 from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
 from unirender_evaluation.metrics import psnr
+from unirender_evaluation.suite_home import definition, found_spec, shared
 from unirender_evaluation.suite_lights import assign_lights, light_sources
 from unirender_evaluation.suite_objects import suite_sources
+from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import quality_summary
-from unirender_evaluation.truth_check import _check_image, chosen_scenes, member_test
+from unirender_evaluation.truth_check import _check_image, check_truth, chosen_scenes, member_test, scenes_here
 from unirender_evaluation.truth_file import (
     CEILING,
     PREFIX,
@@ -29,6 +34,8 @@ from unirender_evaluation.truth_file import (
 )
 from unirender_evaluation.truth_render import stored_ceiling_db
 from unirender_reference.render import shared_scene_hash
+
+COUNTS_OF_STANDARD = {"image": 1186, "specular": 600, "diffuse": 200}
 
 
 @pytest.fixture(scope="module")
@@ -176,15 +183,49 @@ def test_stated_ceilings_are_what_a_nearly_noise_free_picture_scores(tiny: Suite
     assert abs(np.mean(differences)) < 0.6
 
 
+@pytest.fixture(scope="module")
+def standard() -> Suite:
+    return load_suite(shared("standard"))
+
+
+def test_standard_comes_with_the_checkout(
+    standard: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By name, where none was made here; complete, as quiet as promised, and without a path of the machine it is from.
+    Without the meshes the truth check has the procedural objects, and says so."""
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path))
+    assert found_spec("standard").path == standard.spec.path
+    assert definition(standard.spec) == definition(read_spec("standard"))
+    assert standard.spec.objects_folder == "furniture"
+    assert standard.spec.truth_path.stat().st_size < 100e6, "more than a hosting service takes"
+    assert {kind: row["n"] for kind, row in quality_summary(standard).items()} == COUNTS_OF_STANDARD
+    for row in quality_summary(standard).values():
+        assert row["min_db"] > 44
+        assert row["share_below_target"] < 0.005
+    meshes = {row["file"] for row in standard.provenance["objects"].values() if "file" in row}
+    names = standard.spec.path.with_name("ATTRIBUTION.md").read_text(encoding="utf-8")
+    assert len(meshes) == 40
+    assert all(f"| {mesh} |" in names for mesh in meshes)
+
+    bare = Suite(replace(standard.spec, objects_folder="nowhere"))
+    assert len(scenes_here(bare)) == 120
+    with pytest.raises(UsageError, match="got 0 scenes"):
+        next(check_truth(bare, 0, 0))
+    assert "chooses from 120 of 200 scenes" in caplog.text
+    assert "apt-get download" in caplog.text
+
+
 @pytest.mark.slow
-def test_shipped_truth_agrees_with_mitsuba_here(tiny: Suite) -> None:
+@pytest.mark.parametrize("name", ["tiny", "standard"])
+def test_shipped_truth_agrees_with_mitsuba_here(name: str, request: pytest.FixtureRequest) -> None:
     """One image and one roughness 12 % off, rendered here: the first passes the z-test, the second must not."""
     from unirender_reference.render import Renderer
     from unirender_reference.shapes import make_object
 
-    suite = tiny
+    suite: Suite = request.getfixturevalue(name)
+    procedural = Suite(replace(suite.spec, objects_folder=""))
     scene = min(
-        chosen_scenes(suite, 8, seed=5), key=lambda s: suite.provenance["quality"][f"{s.key}.m050_r050.exr"]["spp"]
+        chosen_scenes(procedural, 8, seed=5), key=lambda s: suite.provenance["quality"][f"{s.key}.m050_r050.exr"]["spp"]
     )
     obj = make_object(suite.provenance["objects"][scene.object]["seed"], "test")
     renderer = Renderer(obj, camera=suite.spec.camera, resolution=suite.spec.resolution)

@@ -15,7 +15,7 @@ from tiny_suites import write_suite
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.files import file_sha256
-from unirender_evaluation import results_check
+from unirender_evaluation import results_check, suite_home
 from unirender_evaluation.results_listing import suites as listed_suites
 from unirender_evaluation.stratification import constant_mse
 from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
@@ -323,6 +323,7 @@ def test_a_suite_without_its_truth_says_how_to_make_it(tmp_path: Path, monkeypat
     """One sentence with command, time and source of the files; no smaller suite in its place; once made, the name
     finds it; another version of the suite is not taken for it."""
     monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(suite_home, "shared", lambda name: tmp_path / "checkout" / name / f"{name}.toml")
     spec = read_spec("standard")
     with pytest.raises(UnirenderError) as error:
         load_suite("standard")
@@ -344,6 +345,12 @@ def test_a_suite_without_its_truth_says_how_to_make_it(tmp_path: Path, monkeypat
     with pytest.raises(UnirenderError, match=re.escape(f"has no truth file {made.truth_path}")):
         load_suite("standard")
 
+    shared = suite_home.shared("standard")
+    shared.parent.mkdir(parents=True)
+    shared.write_text(text.replace('sha256 = ""', f'sha256 = "{"1" * 64}"'))
+    assert found_spec("standard").path == made.path, "one's own comes first"
+    made.path.rename(tmp_path / "standard.toml")
+    assert found_spec("standard").path == shared
     made.path.write_text(text.replace("target_db = 45.0", "target_db = 30.0"))
     with pytest.raises(UnirenderError, match=r"of another version of suite 'standard'.*bench truth standard"):
         load_suite("standard")
