@@ -24,6 +24,7 @@ from unirender.subpixel import inside
 TAIL_SHAPE = (64, 128)  # texels over which the tails of sharp lobes are integrated
 GRID_DENSITY = 0.03 * (TAIL_SHAPE[0] - 1) * TAIL_SHAPE[1] / (2 * math.pi**2)  # q: 0.03 a texel at the equator
 LOBE_SAMPLES = 64
+LOBE_WIDTH = 4 * 0.6436  # radians by alpha: where D has fallen to half, to both sides; a reflection turns twice as far
 _CHUNK = 1 << 16  # evaluations at a time: many passes go over them, so they stay in the processor's cache
 _LEAST_TAIL_ALPHA = 2e-3  # below it float32 does not resolve 1 - (n.h)^2, nor has the grid a share where it matters
 _MIN_COSINE = np.float32(1e-4)
@@ -69,6 +70,20 @@ def grid_lobes(
         for part in (group[i : i + step] for i in range(0, len(group), step)):
             out[part] = _weights(n[:, part], v[:, part], alpha[part, None], light, tails) @ energy
     return out
+
+
+def lobe_matrix(
+    n: Float[np.ndarray, "3 p"], v: Float[np.ndarray, "3 p"], alpha: Float[np.ndarray, " p"], shape: tuple[int, int]
+) -> Float[np.ndarray, "p m"]:
+    """What lobes take of the texels of any light of `shape`: times its radiance `[m 3]` it is `grid_lobes`.
+
+    Args:
+        n: unit normals that face v.
+        v: unit directions towards the viewer.
+        alpha: roughness squared; the lobe should be wider than a texel.
+        shape: rows and columns of the light.
+    """
+    return _weights(n, v, alpha[:, None], texel_directions(shape), False) * texel_solid_angles(*shape).reshape(-1)
 
 
 def _alike(n: Float[np.ndarray, "3 p"]) -> Iterator[Int[np.ndarray, " g"]]:

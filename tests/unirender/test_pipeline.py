@@ -19,10 +19,17 @@ from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
 from unirender.options import MOST_STEPS
 from unirender.pipelines.closure import close_decomposition
-from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness
+from unirender.pipelines.derived_light import derived_specular
+from unirender.pipelines.editing import (
+    LOBE_FLOOR,
+    TRUST_SHARPER,
+    TRUST_WIDER,
+    anchor,
+    constant_map,
+    specular_for_roughness,
+)
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.surface_light import specular_light
 
 
 @pytest.fixture(scope="module")
@@ -316,14 +323,16 @@ def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_c
     same, held = specular_for_roughness(given, roughness)
     np.testing.assert_allclose(same, get(given, "specular"), rtol=1e-5)
     assert held == 0
-    uniform = given.replace(environment=np.ones((16, 32, 3), dtype=np.float32))
-    smoother, _ = specular_for_roughness(uniform, constant_map(0.2, get(given, "mask")))
-    maps = uniform.require("normal", "environment")
-    ratio = specular_light(maps["normal"], 0.2, maps["environment"]) / np.maximum(
-        specular_light(maps["normal"], roughness, maps["environment"]), 1e-6
-    )
-    middle = (slice(12, 20), slice(12, 20))
-    np.testing.assert_allclose(smoother[middle] / 0.6, ratio[middle], rtol=0.02)
+    mask = get(given, "mask")
+    light = np.ones((16, 32, 3), dtype=np.float32)
+    uniform = given.replace(environment=light, specular=derived_specular(given, light))
+    for target, trust in ((0.2, TRUST_SHARPER), (0.9, TRUST_WIDER)):
+        new = derived_specular(uniform.replace(roughness=constant_map(target, mask)), light)
+        old = get(uniform, "specular")
+        changed, _ = specular_for_roughness(uniform, constant_map(target, mask))
+        middle = (slice(12, 20), slice(12, 20))
+        expected = old * ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust
+        np.testing.assert_allclose(changed[middle], expected[middle], rtol=0.01)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (48, 20), (33, 65)])

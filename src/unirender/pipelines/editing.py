@@ -9,12 +9,13 @@ from jaxtyping import Bool, Float
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
+from unirender.lobes import LOBE_WIDTH
 from unirender.pipelines.derived_light import derived_light, derived_specular
+from unirender.pipelines.revealed_light import revealed_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
-LOBE_WIDTH = (
-    4 * 0.6436
-)  # radians by alpha: where GGX has fallen to half, to both sides; a reflection turns twice as far
+TRUST_SHARPER = 0.5  # of the logarithm of that change where the lobe becomes sharper: the light lacks that detail
+TRUST_WIDER = 0.8  # and where it becomes wider
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
@@ -24,19 +25,22 @@ ANCHOR_FLOOR = 0.02  # radiance added to both: where the old render is dark, the
 def specular_for_roughness(
     before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]
 ) -> tuple[Float[np.ndarray, "h w 3"], float]:
-    """s of a decomposition at a new roughness: the old s times the ratio of the predicted light's lobes.
+    """s of a decomposition at a new roughness: the old s times what the lobes of its light change by.
 
-        s_1 = s_0 * clip(L(environment, r_1) / L(environment, r_0), 1/4, 4)
+        s_1 = s_0 * clip((S(L, r_1) / S(L, r_0))^t, 1/4, 4)
 
-    Shadowing and what the predicted light misses stay in s_0.
+    L is the light that s_0 reveals (`unirender.pipelines.revealed_light`) and S its lobes; t < 1, since L is an
+    estimate. Shadowing and what that light misses stay in s_0.
 
     Returns:
         s_1, and the share of the covered values where the bound held the ratio.
     """
     maps = before.require("normal", "roughness", "specular", "environment", "mask")
-    old = derived_specular(before, maps["environment"])
-    new = derived_specular(before.replace(roughness=roughness), maps["environment"])
-    ratio = (new + LOBE_FLOOR) / (old + LOBE_FLOOR)
+    light = revealed_light(before)
+    old = derived_specular(before, light)
+    new = derived_specular(before.replace(roughness=roughness), light)
+    trust = np.where(roughness < maps["roughness"], np.float32(TRUST_SHARPER), np.float32(TRUST_WIDER))
+    ratio = ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust
     bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
     inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
     held = float((ratio != bounded)[inside].mean()) if inside.any() else 0.0

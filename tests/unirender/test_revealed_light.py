@@ -1,0 +1,102 @@
+"""The light that s reveals: a blurred estimate of a known light comes nearer to it by the s of that light."""
+
+import functools
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from unirender.ggx import facing_normal
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import environment_directions, texel_solid_angles
+from unirender.lobes import grid_lobes, lobe_matrix
+from unirender.pipelines.derived_light import derived_specular
+from unirender.pipelines.revealed_light import revealed_light
+
+SHAPE = (16, 32)
+OLD, WIDER = 0.4, 0.8
+
+
+@functools.cache
+def lamp() -> np.ndarray:
+    """A dim sky with a lamp above and behind the camera."""
+    directions = environment_directions(*SHAPE)
+    lamp = 20 * np.exp(30 * (directions @ np.array([0.36, 0.48, 0.8]) - 1))
+    return (0.3 + lamp[..., None] * np.array([1.0, 0.9, 0.7])).astype(np.float32)
+
+
+def blurred(environment: np.ndarray) -> np.ndarray:
+    return gaussian_filter(environment, (2, 4, 0), mode="nearest").astype(np.float32)
+
+
+@functools.cache
+def ball(height: int = 48, width: int = 48) -> Intrinsics:
+    """A ball under that light."""
+    y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+    radius = 0.45 * min(height, width)
+    x, y = (x - width / 2) / radius, -(y - height / 2) / radius
+    mask = (x**2 + y**2 < 1)[..., None].astype(np.float32)
+    normal = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1) * mask
+    given = Intrinsics(normal=normal, roughness=OLD * mask, mask=mask)
+    return given.replace(specular=derived_specular(given, lamp()), environment=blurred(lamp()))
+
+
+def get(intrinsics: Intrinsics, name: str) -> np.ndarray:
+    return intrinsics.require(name)[name]
+
+
+def distance(environment: np.ndarray, roughness: float) -> float:
+    """Mean distance of a light's s from the true light's."""
+    given = ball().replace(roughness=roughness * get(ball(), "mask"))
+    return float(np.abs(derived_specular(given, environment) - derived_specular(given, lamp())).mean())
+
+
+@pytest.mark.parametrize("roughness", [OLD, WIDER])
+def test_it_is_nearer_to_the_true_light_also_for_lobes_it_was_not_fitted_to(roughness: float) -> None:
+    found = revealed_light(ball())
+    assert found.shape == (*SHAPE, 3)
+    assert found.dtype == np.float32
+    assert found.min() >= 0
+    assert distance(found, roughness) < 0.6 * distance(blurred(lamp()), roughness)
+
+
+def test_a_light_that_explains_s_stays() -> None:
+    given = ball().replace(environment=lamp())
+    change = np.abs(revealed_light(given) - lamp()).sum() / lamp().sum()
+    before = np.abs(blurred(lamp()) - lamp()).sum() / lamp().sum()
+    assert change < 0.1 * before
+
+
+def test_what_no_lobe_sees_stays_as_predicted() -> None:
+    dark = ball().replace(specular=np.zeros_like(get(ball(), "specular")))
+    kept = revealed_light(dark) / get(dark, "environment")
+    seen = environment_directions(*SHAPE)[..., 2]
+    assert kept[seen > 0.9].max() < 0.3
+    front = np.zeros_like(get(ball(), "normal"))
+    front[24, 24] = (0, 0, 1)
+    kept = revealed_light(dark.replace(normal=front)) / get(dark, "environment")
+    assert kept[seen < 0].min() > 0.99
+
+
+def test_larger_pictures_and_other_shapes_say_the_same() -> None:
+    small, large = revealed_light(ball()), revealed_light(ball(150, 110))
+    assert np.abs(small - large).mean() < 0.25 * np.abs(small - get(ball(), "environment")).mean()
+
+
+def test_nothing_to_see_leaves_the_prediction() -> None:
+    empty = ball().replace(mask=np.zeros_like(get(ball(), "mask")))
+    assert np.array_equal(revealed_light(empty), get(empty, "environment"))
+
+
+def test_lobe_matrix_times_a_light_is_its_lobes() -> None:
+    rng = np.random.default_rng(0)
+    view = np.tile(np.array([[0], [0], [1]], dtype=np.float32), 5)
+    normal = rng.normal(size=(3, 5)).astype(np.float32) + np.array([[0], [0], [2]], dtype=np.float32)
+    normal = facing_normal(normal / np.linalg.norm(normal, axis=0), view)
+    alpha = np.full(5, 0.3, dtype=np.float32)
+    lobes = lobe_matrix(normal, view, alpha, SHAPE)
+    assert lobes.shape == (5, SHAPE[0] * SHAPE[1])
+    expected = grid_lobes(normal, view, alpha, lamp(), SHAPE, tails=False)
+    np.testing.assert_allclose(lobes @ lamp().reshape(-1, 3), expected, rtol=1e-4)
+    half = lobes / texel_solid_angles(*SHAPE).reshape(-1)
+    assert half.max() > 0
