@@ -72,6 +72,7 @@ class TruthCheck:
     other_objects: tuple[str, ...] = ()
     geometry: tuple[GeometryCheck, ...] = ()
     geometry_twins: Mapping[str, GeometryTest] = field(default_factory=dict)
+    chosen_from: tuple[int, int] = (0, 0)
 
     @property
     def twins_detected(self) -> bool:
@@ -94,6 +95,7 @@ class TruthCheck:
             "scenes": sorted({c.scene.key for c in self.checks}),
             "failed": failed,
             "other_objects": list(self.other_objects),
+            "chosen_from": list(self.chosen_from),
             "worst": f"{worst.name}: {worst.test}",
             "smallest_pass_share": min(c.test.pass_share for c in self.checks),
             "twin": f"roughness {TWIN_FACTOR - 1:.0%} off: {self.twin}",
@@ -143,11 +145,12 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     from unirender_reference.render import Renderer
     from unirender_reference.statistics import FAMILY_ALPHA
 
-    if (count_here := len(scenes_here(suite))) < len(suite.scenes):
+    chosen_from = (len(scenes_here(suite)), len(suite.scenes))
+    if chosen_from[0] < chosen_from[1]:
         where = suite.spec.folder("objects") or "any folder"
         logger.warning(
             "the truth check chooses from %d of %d scenes: the meshes of the others are not in %s (%s)",
-            *(count_here, len(suite.scenes), where, suite.spec.objects_from),
+            *(*chosen_from, where, suite.spec.objects_from),
         )
     checks: list[Check] = []
     others: list[str] = []
@@ -179,7 +182,7 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
         for kind in LIGHTS:
             checks.append(_check_light(suite, renderer, scene, kind, seed, alpha))
             yield checks[-1]
-    yield TruthCheck(tuple(checks), twin, seed, tuple(others), tuple(geometry), geometry_twins)
+    yield TruthCheck(tuple(checks), twin, seed, tuple(others), tuple(geometry), geometry_twins, chosen_from)
 
 
 def member_test(

@@ -117,6 +117,9 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
         f"smallest pass share {check['smallest_pass_share']:.3f}); deliberate errors of roughness, albedo and normal "
         f"{twins}"
     )
+    here, scenes = check.get("chosen_from", (0, 0))  # a check that an earlier version stored has none
+    if here < scenes:
+        lines.append(f"         (chosen from {here} of {scenes} scenes: the meshes of the others are not here)")
     lines += [f"         {line}" for line in check["failed"]]
     if check["failed"] and check["other_objects"]:
         lines.append(

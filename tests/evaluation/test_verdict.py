@@ -18,6 +18,7 @@ CHECK = {
     "twin_detected": True,
     "failed": [],
     "other_objects": [],
+    "chosen_from": [40, 40],
 }
 ALBEDO, RELIT = "albedo.psnr@masked-srgb-raw", "relit.psnr@masked-srgb-raw"
 
@@ -52,6 +53,10 @@ def test_verdict_states_claims_and_failures() -> None:
     assert "FAILS  truth" in text
     assert "x: z-test FAILED" in text
     assert "partial run" in text
+    assert "chosen from" not in text
+    assert "chosen from 30 of 40 scenes" in verdict_text(
+        records, RunInfo("t", "h", 64, ()), CHECK | {"chosen_from": [30, 40]}
+    )
 
 
 def test_a_strangers_row_has_claims_of_its_own() -> None:
