@@ -13,7 +13,7 @@ from unirender.pipelines.derived_light import derived_diffuse, derived_light, de
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, visible_shares
+from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, SeenShadows, visible_shares
 from unirender.symmetries import mirror, quarter_turn
 
 CAMERA = Camera()
@@ -221,6 +221,29 @@ def test_what_is_hardly_covered_has_the_shadow_beside_it(size: int) -> None:
     speck[size // 4 : size // 2, size // 4 : size // 2] = 1
     speck[-1, -1] = 1e-3  # too little to be there at a smaller size
     assert visible_shares(as_maps(normal, speck), sky())["diffuse"][-1, -1].min() > 0.9
+
+
+def test_a_picture_is_looked_at_once_for_all_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And anew for another picture: one value or the camera differs. What is found is what a fresh look finds."""
+    normal, mask, _ = gutter()
+    looks = []
+    of = SelfShadow.of
+    monkeypatch.setattr(SelfShadow, "of", lambda *maps: looks.append(1) or of(*maps))
+    rough, smooth = as_maps(normal, mask, roughness=0.6), as_maps(normal, mask, roughness=0.4)
+    rough = rough.replace(camera=Camera(fov_deg=41.0))
+    smooth = smooth.replace(camera=Camera(fov_deg=41.0))
+    visible_shares(rough, sky())
+    shares = visible_shares(smooth, sky())
+    assert len(looks) == 1
+    fresh = SeenShadows(smooth)
+    assert np.array_equal(shares["specular"], fresh.specular_share(0.4 * mask, sky()))
+    assert np.array_equal(shares["diffuse"], fresh.diffuse_share(sky()))
+    looks.clear()
+    visible_shares(smooth.replace(camera=Camera(fov_deg=42.0)), sky())
+    changed = normal.copy()
+    changed[len(changed) // 2, len(changed) // 2] = (0, 0, 1)
+    visible_shares(smooth.replace(normal=changed), sky())
+    assert len(looks) == 2
 
 
 def test_masks_that_are_empty_or_a_pixel() -> None:

@@ -7,6 +7,8 @@ else 1; D the GGX distribution at the half vector, of a roughness of `LEAST_ROUG
 pixels d is linear in the light; s is only as far as a lobe has one light.
 """
 
+import functools
+import hashlib
 from collections.abc import Callable, Collection
 
 import numpy as np
@@ -21,6 +23,7 @@ from unirender.surface_light import QUADRATURE_SHAPE
 
 SHADOW_SIDE = 128  # pixels along the longer side at which shadows of larger pictures are found
 TRUST = 0.75  # of what seems hidden so much is taken away: depth from normals is a guess where surfaces overlap
+KEPT = 2  # pictures; what is hidden in one takes tens of megabytes and seconds
 LEAST_ROUGHNESS = 0.3  # below it a lobe is narrower than the texels over which shadows are integrated
 
 
@@ -36,12 +39,21 @@ def visible_shares(
         environment: lat-long radiance in camera axes, any resolution.
         names: of specular and diffuse, those that are wanted.
     """
-    seen, shares = SeenShadows(intrinsics), {}
+    seen, shares = seen_shadows(intrinsics), {}
     if "specular" in names:
         shares["specular"] = seen.specular_share(intrinsics.require("roughness")["roughness"], environment)
     if "diffuse" in names:
         shares["diffuse"] = seen.diffuse_share(environment)
     return shares
+
+
+def seen_shadows(intrinsics: Intrinsics) -> "SeenShadows":
+    """What is hidden in a picture. The last pictures' are kept: they are mostly rendered with several materials.
+
+    Args:
+        intrinsics: as for `SeenShadows`.
+    """
+    return _looked_at(_Surface(Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)))
 
 
 class SeenShadows:
@@ -54,7 +66,7 @@ class SeenShadows:
             intrinsics: with normal and mask; the camera gives the pixels' rays.
         """
         surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
-        self._mask = surface.require("mask")["mask"]
+        self._mask = surface.require("mask")["mask"].copy()  # it outlives this call, and the caller's array is his
         self._frame = None
         if max(surface.height, surface.width) > SHADOW_SIDE:
             self._frame = Frame(surface.height, surface.width, SHADOW_SIDE)
@@ -128,3 +140,24 @@ def _distribution(
     n_h = n @ directions + (n * v).sum(axis=1, keepdims=True)  # times the length of the half vector, n.h
     squared = np.square(n_h) / np.maximum(2 + 2 * (v @ directions), 1e-6)
     return 1 / np.square(1 - np.minimum(squared, 1) * (1 - np.square(alpha)))
+
+
+class _Surface:
+    """Normal, mask and camera, equal to others with the same values."""
+
+    def __init__(self, intrinsics: Intrinsics) -> None:
+        self.intrinsics = intrinsics
+        maps = intrinsics.maps.values()
+        digests = ((value.shape, value.dtype.str, hashlib.sha256(value.tobytes()).digest()) for value in maps)
+        self._key = (intrinsics.camera, *digests)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Surface) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+@functools.lru_cache(maxsize=KEPT)
+def _looked_at(surface: _Surface) -> SeenShadows:
+    return SeenShadows(surface.intrinsics)
