@@ -82,6 +82,7 @@ def doubled(psnr_at: Callable[[int], float], target: float, most: int) -> tuple[
 
 def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most: int = MOST_SPP) -> list[EqualQuality]:
     """The model against Mitsuba on one scene, a result for each entry of `GIVEN`."""
+    from unirender.pipelines.shadowed_light import forget_shadows
     from unirender_reference.render import Renderer
 
     # The suite has s for the materials of its edits; scenes take these in turn.
@@ -96,14 +97,18 @@ def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most:
         seed = item_seed(suite.spec.name, scene.key, "speed", spp)
         return renderer.image(environment, roughness, metallic, spp, seed, batches=1).mean[..., :3]
 
+    def model(known: Any) -> Any:
+        forget_shadows()
+        return pipeline.render(known)
+
     def psnr(image: Any) -> float:
         return score_image(image, truth, mask)[metric_key("relit", "psnr", DEFAULT_VARIANT)]
 
     renderer, found = load(), []
     for given, missing in GIVEN.items():
         known = maps.replace(**dict.fromkeys(missing))
-        target = psnr(pipeline.render(known))
-        model_s = timed(lambda known=known: pipeline.render(known), repeats).median
+        target = psnr(model(known))
+        model_s = timed(lambda known=known: model(known), repeats).median
         reached = doubled(lambda spp: psnr(render(renderer, spp)), target, most)
         spp, reached_psnr = reached or (None, None)
         warm = loading = None

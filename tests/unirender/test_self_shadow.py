@@ -13,7 +13,7 @@ from unirender.pipelines.derived_light import derived_diffuse, derived_light, de
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, SeenShadows, visible_shares
+from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, SeenShadows, forget_shadows, visible_shares
 from unirender.symmetries import mirror, quarter_turn
 
 CAMERA = Camera()
@@ -244,6 +244,9 @@ def test_a_picture_is_looked_at_once_for_all_its_materials(monkeypatch: pytest.M
     changed[len(changed) // 2, len(changed) // 2] = (0, 0, 1)
     visible_shares(smooth.replace(normal=changed), sky())
     assert len(looks) == 2
+    forget_shadows()
+    visible_shares(smooth.replace(normal=changed), sky())
+    assert len(looks) == 3
 
 
 def test_masks_that_are_empty_or_a_pixel() -> None:

@@ -48,12 +48,17 @@ def visible_shares(
 
 
 def seen_shadows(intrinsics: Intrinsics) -> "SeenShadows":
-    """What is hidden in a picture. The last pictures' are kept: they are mostly rendered with several materials.
+    """What is hidden in a picture. The last pictures' are kept, since one is mostly rendered with several materials.
 
     Args:
         intrinsics: as for `SeenShadows`.
     """
     return _looked_at(_Surface(Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)))
+
+
+def forget_shadows() -> None:
+    """Forgets the pictures that are kept: what is timed next is timed as on a new picture."""
+    _looked_at.cache_clear()
 
 
 class SeenShadows:
