@@ -17,11 +17,13 @@ from jaxtyping import Float
 
 from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import resample_environment
 from unirender.lobes import LOBE_WIDTH, lobe_matrix
 from unirender.pipelines.framing import Frame
 
 STEPS = 6
 SIDE = 64  # pixels along the longer side at which s is compared: its light has 16 x 32 texels
+MOST_SHAPE = (32, 64)  # rows and columns at which a finer light is looked at; it keeps its own detail
 PRIOR = 0.3  # p, of what the texels' lobes sum to on average
 FLOOR = 0.02  # radiance added to s and to W L, so that dark light does not decide
 
@@ -39,7 +41,8 @@ def revealed_light(intrinsics: Intrinsics) -> Float[np.ndarray, "eh ew 3"]:
         given = Frame(given.height, given.width, SIDE).enter_intrinsics(given)
     maps = given.require("normal", "roughness", "specular", "mask")
     environment = intrinsics.require("environment")["environment"]
-    shape = environment.shape[:2]
+    rows, columns = environment.shape[:2]
+    shape = min(rows, MOST_SHAPE[0]), min(columns, MOST_SHAPE[1])
     there = (maps["mask"][..., 0] > 0.5) & np.any(maps["normal"] != 0, axis=-1)
     if not there.any():
         return environment
@@ -53,8 +56,9 @@ def revealed_light(intrinsics: Intrinsics) -> Float[np.ndarray, "eh ew 3"]:
     specular = maps["specular"][there]
     total = lobes.sum(axis=0)[:, None]
     prior = PRIOR * total.mean()
-    light = environment.reshape(-1, 3)
+    light = resample_environment(environment, shape).reshape(-1, 3)
+    gain = np.ones_like(light)
     for _ in range(STEPS):
-        ratio = (specular + FLOOR) / (lobes @ light + FLOOR)
-        light = light * ((lobes.T @ ratio + prior) / (total + prior))
-    return light.reshape(environment.shape).astype(np.float32)
+        ratio = (specular + FLOOR) / (lobes @ (gain * light) + FLOOR)
+        gain *= (lobes.T @ ratio + prior) / (total + prior)
+    return (environment * resample_environment(gain.reshape(*shape, 3), (rows, columns))).astype(np.float32)
