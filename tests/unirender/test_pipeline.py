@@ -22,11 +22,12 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.derived_light import derived_specular
 from unirender.pipelines.editing import (
     LOBE_FLOOR,
+    ROUGHNESS_ERROR,
     TRUST_SHARPER,
-    TRUST_WIDER,
     anchor,
     constant_map,
     specular_for_roughness,
+    trust,
 )
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -326,13 +327,22 @@ def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_c
     mask = get(given, "mask")
     light = np.ones((16, 32, 3), dtype=np.float32)
     uniform = given.replace(environment=light, specular=derived_specular(given, light))
-    for target, trust in ((0.2, TRUST_SHARPER), (0.9, TRUST_WIDER)):
+    for target in (0.2, 0.9):
         new = derived_specular(uniform.replace(roughness=constant_map(target, mask)), light)
         old = get(uniform, "specular")
         changed, _ = specular_for_roughness(uniform, constant_map(target, mask))
         middle = (slice(12, 20), slice(12, 20))
-        expected = old * ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust
+        expected = old * ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust(roughness, constant_map(target, mask))
         np.testing.assert_allclose(changed[middle], expected[middle], rtol=0.01)
+
+
+def test_trust_grows_with_the_change_of_roughness() -> None:
+    """None without a change, half of the most at the roughness's own error; sharper lobes are believed less."""
+    old = np.full((1, 1, 1), 0.5, dtype=np.float32)
+    assert trust(old, old).item() == 0
+    np.testing.assert_allclose(trust(old, old + ROUGHNESS_ERROR).item(), 0.5)
+    np.testing.assert_allclose(trust(old, old - ROUGHNESS_ERROR).item(), 0.5 * TRUST_SHARPER)
+    assert trust(old, old + 0.5).item() > 0.75
 
 
 @pytest.mark.parametrize("size", [(32, 32), (48, 20), (33, 65)])

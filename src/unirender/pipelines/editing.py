@@ -14,8 +14,8 @@ from unirender.pipelines.derived_light import derived_light, derived_specular
 from unirender.pipelines.revealed_light import revealed_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
-TRUST_SHARPER = 0.5  # of the logarithm of that change where the lobe becomes sharper: the light lacks that detail
-TRUST_WIDER = 0.8  # and where it becomes wider
+TRUST_SHARPER = 0.5  # the most of that change's logarithm, for sharper lobes: the light lacks the detail they show
+ROUGHNESS_ERROR = 0.25  # RMS error of a predicted roughness: a change within it may be none
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
@@ -29,8 +29,11 @@ def specular_for_roughness(
 
         s_1 = s_0 * clip((S(L, r_1) / S(L, r_0))^t, 1/4, 4)
 
-    L is the light that s_0 reveals (`unirender.pipelines.revealed_light`) and S its lobes; t < 1, since L is an
-    estimate. Shadowing and what that light misses stay in s_0.
+        t = t_max (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2)
+
+    L is the light that s_0 reveals (`unirender.pipelines.revealed_light`) and S its lobes. Both L and r_0 are
+    estimates: e is the error of r_0, and t_max is 1 for wider lobes and less for sharper ones. Shadowing and what that
+    light misses stay in s_0.
 
     Returns:
         s_1, and the share of the covered values where the bound held the ratio.
@@ -39,12 +42,17 @@ def specular_for_roughness(
     light = revealed_light(before)
     old = derived_specular(before, light)
     new = derived_specular(before.replace(roughness=roughness), light)
-    trust = np.where(roughness < maps["roughness"], np.float32(TRUST_SHARPER), np.float32(TRUST_WIDER))
-    ratio = ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust
+    ratio = ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust(maps["roughness"], roughness)
     bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
     inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
     held = float((ratio != bounded)[inside].mean()) if inside.any() else 0.0
     return (maps["specular"] * bounded).astype(np.float32), held
+
+
+def trust(old: Float[np.ndarray, "h w 1"], new: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:
+    """t of `specular_for_roughness`: how much of a change of s to believe; 0 where the roughness is the old one."""
+    square = np.square(new - old)
+    return np.where(new < old, np.float32(TRUST_SHARPER), np.float32(1)) * square / (square + ROUGHNESS_ERROR**2)
 
 
 def too_coarse(before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w 1"]:
