@@ -215,20 +215,22 @@ def check_request(config: BenchConfig) -> CheckRequest:
 def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
     """Computes the records that are missing: on a cluster if there is one, else few of them here, many in worker
     processes."""
-    missing = {scene.key: [job for job in here.jobs(scene) if not job.is_done(store.has)] for scene in here.scenes}
-    scenes = [scene for scene in here.scenes if missing[scene.key]]
-    scenes.sort(key=lambda scene: -len(missing[scene.key]))  # those with slow rows first: none is left for the end
+    bar = progress.add_task("methods", total=None)
+    wanted: dict[str, frozenset[str]] = {}  # keys and not jobs, which hold the pictures of their scene
+    for scene in here.scenes:
+        wanted[scene.key] = frozenset(job.key for job in here.jobs(scene) if not job.is_done(store.has))
+    scenes = [scene for scene in here.scenes if wanted[scene.key]]
+    scenes.sort(key=lambda scene: -len(wanted[scene.key]))  # those with slow rows first: none is left for the end
     if not scenes:
+        progress.remove_task(bar)
         return  # a finished run needs no cluster to write its tables again
-    total = sum(map(len, missing.values()))
-    bar = progress.add_task("methods", total=total)
+    total = sum(map(len, wanted.values()))
+    progress.update(bar, total=total)
     if config.cluster is None and (config.jobs == 0 or total <= FEW):
-        for job in (job for scene in scenes for job in missing[scene.key]):
+        for job in (job for scene in scenes for job in here.jobs(scene) if job.key in wanted[scene.key]):
             store.add(job.make())
             progress.update(bar, advance=1, description=job.label)
         return
-    wanted = {scene.key: frozenset(job.key for job in missing[scene.key]) for scene in scenes}
-    missing.clear()  # they hold the pictures of all scenes
     if config.cluster is not None:
         settings = anywhere(config)
         found = run_on_cluster(here, partial(build_rows, settings), settings.suite, wanted, config.cluster)

@@ -5,6 +5,7 @@ The only estimate is one that was measured: where the folder holds records of a 
 times those that are missing. It leaves scoring out (`unirender bench throughput`), and so it is said.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from unirender_evaluation.benchmark import BenchConfig, check_request, prepare, views_jobs
-from unirender_evaluation.engine import Job, Store
+from unirender_evaluation.engine import Store
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.run_check import stored_check
 
@@ -57,12 +58,16 @@ def planned(config: BenchConfig) -> Plan:
         UnirenderError: what would stop the run before it begins: unusable suite, checkpoint, plug-in or predictions.
     """
     here, known = prepare(config), _stored(config.out)
-    jobs = [job for scene in here.scenes for job in here.jobs(scene)] + views_jobs(here, config)
-    labels = dict.fromkeys(job.label for job in jobs)
+    every = itertools.chain(*(here.jobs(scene) for scene in here.scenes), views_jobs(here, config))
+    # Without the jobs themselves, which hold the pictures of their scene.
+    facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in every]
+    labels = dict.fromkeys(label for label, _, _ in facts)
     check = stored_check(check_request(config), here, known.keys())
     return Plan(
         out=config.out,
-        rows=tuple(_planned_row(label, [job for job in jobs if job.label == label], known) for label in labels),
+        rows=tuple(
+            _planned_row(label, [(done, record) for own, done, record in facts if own == label]) for label in labels
+        ),
         check_scenes=config.check_scenes,
         check_date=None if check is None else str(check["date"]),
         jobs=config.jobs,
@@ -70,12 +75,13 @@ def planned(config: BenchConfig) -> Plan:
     )
 
 
-def _planned_row(label: str, jobs: Sequence[Job], known: dict[str, Record]) -> PlannedRow:
-    stored = sum(job.is_done(known.__contains__) for job in jobs)
-    times = [known[job.key].seconds for job in jobs if job.key in known]
+def _planned_row(label: str, facts: Sequence[tuple[bool, Record | None]]) -> PlannedRow:
+    """Of each job whether it is done, and its record if there is one."""
+    stored = sum(done for done, _ in facts)
+    times = [record.seconds for _, record in facts if record is not None]
     measured = [seconds for seconds in times if seconds is not None]
     mean = sum(measured) / len(measured) if measured else None
-    return PlannedRow(label, stored, len(jobs) - stored, mean)
+    return PlannedRow(label, stored, len(facts) - stored, mean)
 
 
 def _stored(folder: Path) -> dict[str, Record]:

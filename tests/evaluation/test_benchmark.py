@@ -2,19 +2,26 @@
 verdict."""
 
 import json
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
-from unirender_evaluation.engine import KEY_PREFIX, Prediction, Store, content_key, score
+from unirender_evaluation.benchmark import BenchConfig, _work
+from unirender_evaluation.dry_run import planned
+from unirender_evaluation.engine import KEY_PREFIX, Job, Prediction, Store, content_key, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
@@ -22,7 +29,7 @@ from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
 from unirender_evaluation.subsets import Subsets
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
@@ -123,6 +130,39 @@ def test_killed_run_resumes_to_the_same_records(suite: Suite, tmp_path: Path) ->
     assert strip(resumed) == strip(whole) == strip(again) == strip(read_records(path))
     assert first == sum(r.method != "noise-ceiling" for r in whole) - 20
     assert len(asked) == first, "a third run asks nothing"
+
+
+class Watched(Run):
+    """A run whose jobs are two stubs a scene; `most` is how many of earlier scenes were alive when a scene began."""
+
+    def jobs(self, scene: Scene) -> Iterator[Job]:
+        self.most = max(getattr(self, "most", 0), sum(ref() is not None for ref in self.made))
+        for number in range(2):
+            key = f"{scene.key} {number}"
+            job = Job(key, "stub", partial(Record, "t", "p", "m", key, "o", {}, key))
+            self.made.append(weakref.ref(job))
+            yield job
+            del job
+
+    made: ClassVar[list[weakref.ref[Job]]] = []
+
+
+def test_jobs_of_one_scene_at_a_time_are_in_memory(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They hold its pictures, and a suite may have thousands of scenes of any size."""
+    scenes = list(suite.scenes)
+    run = Watched(suite, [], scenes, TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
+    config = BenchConfig(out=tmp_path / "run", jobs=0)
+    store = Store.open(tmp_path / "records.jsonl")
+    _work(run, config, store, Progress(disable=True))
+    assert len(store.used) == 2 * len(scenes)
+    monkeypatch.setattr("unirender_evaluation.dry_run.prepare", lambda _: run)
+    assert sum(row.missing for row in planned(replace(config, methods=())).rows) == 2 * len(scenes)
+    assert len(run.made) == 3 * 2 * len(scenes)
+    assert run.most <= 1
+    kept = [job for scene in scenes for job in run.jobs(scene)]  # the twin
+    assert run.most == len(kept) - 2
 
 
 def test_keys_change_with_what_results_depend_on(suite: Suite) -> None:
