@@ -59,7 +59,7 @@ def test_the_page_shows_the_files_and_a_short_class(files: dict[str, str]) -> No
     assert shown_files("```python\n# a.py\nx = 1\n```\n```python\nx = 2\n```\n") == {"a.py": "x = 1\n"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stranger_scores_alike_in_all_ways(files: dict[str, str], tmp_path: Path) -> None:
     """Named by its file, as a folder of predictions, installed: the same records, and other predictions other ones."""
     here, out = tmp_path / "stranger", tmp_path / "results"

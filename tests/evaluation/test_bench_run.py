@@ -117,7 +117,7 @@ class Guess:
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two scenes of the shipped suite, no row of ours, a stranger's; Mitsuba's truth check; the second run computes
     nothing."""

@@ -187,6 +187,7 @@ def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
     assert len(read_records(path)) == len(few)
 
 
+@pytest.mark.long
 def test_workers_give_the_same_numbers(suite: Suite, tmp_path: Path) -> None:
     here = evaluate(suite, trivial_rows(), tmp_path / "here.jsonl")
     whole = Run(suite, (), list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)

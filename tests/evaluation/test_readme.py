@@ -107,6 +107,7 @@ def test_the_results_of_another_shipped_checkpoint_have_a_place_of_their_own(
         readme.main([*options, "--readme", "README.md"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suite", sorted(path.name for path in STORED.iterdir()))
 def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
     own = (STORED.parents[1] / "README.md").read_text()

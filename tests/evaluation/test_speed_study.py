@@ -244,6 +244,7 @@ def test_throughput_is_measured_side_by_side(shards: Path) -> None:
     assert table.notes[1] == "Aim: training / bare >= 0.85: 0.90, met."
 
 
+@pytest.mark.long
 def test_overfitting_gets_better_in_both_directions(shards: Path) -> None:
     pair = one_pair(shards, SIZE)
     assert len(pair["image"]) == 1

@@ -246,7 +246,7 @@ def test_a_part_is_kept_for_the_same_file_lights_turns_and_materials_alone(tmp_p
     assert all(path.is_file() for path in others)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_truth_follows_the_files_that_are_in_the_folder(tmp_path: Path) -> None:
     """A mesh is deleted and another gets a comment: same suite file, same lights, same shapes; but lights, turns and
     materials are dealt out anew, and the file is another."""

@@ -94,7 +94,7 @@ def test_a_function_runs_elsewhere_and_its_error_comes_back(executor: ClusterExe
         executor.submit(int, "x").result(20)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_worker_costs_nothing(scheduler: Any, tmp_path: Path) -> None:
     """SIGKILL in the middle: the data set is that of local processes, byte for byte, each group once."""
     config = DatasetConfig(objects=8, pairs=3, resolution=16, vary="basis", out=tmp_path / "cluster", spp=4)

@@ -58,7 +58,7 @@ def test_rows_have_values_or_maps_in_turn() -> None:
     assert len({spec.light.name for spec in specs}) == 4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sheet_is_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert Sheet(tmp_path / "sheet.png", objects=2, resolution=24, spp=8, background="dark").run() == 0
     assert "2 objects x 9 buffers" in capsys.readouterr().out

@@ -192,6 +192,7 @@ def _psnr(first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:
     return float(-10 * np.log10(error.sum() / (3 * mask.sum())))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not DENOISER, reason="needs mitsuba-oidn")
 def test_denoised_pictures_are_marked_and_nearer_to_the_truth(tmp_path: Path) -> None:
     noisy, clean = (made(tmp_path / str(on), denoise=on, resolution=32, spp=4)[0] for on in (False, True))

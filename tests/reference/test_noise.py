@@ -165,7 +165,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
         render_to_floor(lambda spp, seed: Estimate(render(spp, seed).mean, None), WHOLE, 40, premultiplied=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_64_fold_render_confirms_the_floor() -> None:
     """A sphere under a light with peaks: measured no lower than asked, and within 0.7 dB of what was expected. The
     twin believes half the variance, and falls short."""

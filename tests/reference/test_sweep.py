@@ -131,7 +131,7 @@ def test_values_outside_the_range_are_refused(
         render_sweep(renderer, environment(), roughness, metallic, 16, nodes=nodes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_compares_renders_time_error_and_values() -> None:
     rows = {row.quantity: row for row in SweepMeasure(resolution=16, spp=16, levels=2, batches=4).measure()}
     assert rows["renders"].found == "6 for 4 pairs"

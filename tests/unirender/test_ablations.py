@@ -160,6 +160,7 @@ def test_a_split_model_is_trained_saved_loaded_and_used(tmp_path: Path) -> None:
     assert np.isfinite(rendered).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rule", ["conditional", "algorithm1"])
 def test_a_split_model_learns_under_either_rule(tmp_path: Path, rule: str) -> None:
     config = dataclasses.replace(SPLIT, timestep_rule=rule)

@@ -56,7 +56,7 @@ def test_a_library_import_has_all_of_diffusers() -> None:
     assert {"scipy.optimize", "scipy.stats._stats_py", "torch._dynamo"} <= imported
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_was_left_out_is_there_when_it_is_asked_for() -> None:
     code = """
 import unirender.models.lean_imports as lean

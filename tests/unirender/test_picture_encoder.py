@@ -337,6 +337,7 @@ def test_a_shipped_checkpoint_begins_a_run_of_its_encoder(tmp_path: Path) -> Non
     assert [part["preset"] for part in run.continues if "preset" in part]
 
 
+@pytest.mark.long
 def test_a_resumed_run_of_a_part_ends_as_one_that_was_not_stopped(tmp_path: Path) -> None:
     config, source = dataclasses.replace(ENCODED, trains="inverse"), OneBatch()
     whole, stopped = trainer(tmp_path / "whole", config, steps=4), trainer(tmp_path / "stopped", config, steps=4)

@@ -182,6 +182,7 @@ def test_a_mirrored_and_a_turned_scene_have_mirrored_and_turned_shadows() -> Non
             assert np.abs(share - expected).mean() > 0.03  # the twin: the change is one
 
 
+@pytest.mark.long
 def test_larger_pictures_have_the_shadows_of_small_ones() -> None:
     size = 2 * SHADOW_SIDE
     normal, mask, _ = gutter(size)

@@ -203,7 +203,7 @@ def masked_psnr(a: Tensor, b: Tensor, mask: Tensor) -> float:
     return -10 * math.log10(float(((a - b).square() * mask).sum() / (3 * mask.sum())))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_plain_model_overfits_one_sample(tmp_path: Path) -> None:
     """Both directions, without the prior, in a few seconds on one core."""
     config = dataclasses.replace(

@@ -70,7 +70,7 @@ def test_the_scale_of_linear_pictures_does_not_matter(views: Views):
     assert materials_error(found, twin) > 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_figures_are_those_at_the_exposure_and_files_have_the_scale_of_the_pictures(views: Views, tmp_path: Path):
     start = flat_start(truth().obj)
     optimize(views, None, CONFIG, tmp_path / "one", init=start, threads=1, pictures=False)

@@ -124,7 +124,7 @@ def growing() -> tuple[TexturedScene, np.ndarray, np.ndarray]:
     return scene, move, central_difference(scene, "vertices", move, 0.01, 1024)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_vertices_by_picture(growing: tuple[TexturedScene, np.ndarray, np.ndarray], monkeypatch: Any) -> None:
     """All that a moving vertex changes in direct light: outlines, shading normals, places in the textures.
 
@@ -147,7 +147,7 @@ def test_vertices_by_picture(growing: tuple[TexturedScene, np.ndarray, np.ndarra
     assert not twin, f"without outlines, too: {text}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_vertices_by_mask() -> None:
     truth, views = problems.solution(), problems.blank_views(2)
     scene, vertices, weight = MaskScene(truth.obj, views), truth.obj.vertices, weights(2, 1)

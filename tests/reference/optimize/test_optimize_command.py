@@ -90,7 +90,7 @@ def test_a_folder_with_its_mesh(data: Path, solution: Solution, tmp_path: Path, 
     assert capsys.readouterr().out == said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_folder_without_a_mesh(data: Path, solution: Solution, tmp_path: Path):
     """The reconstruction stands where the object stood, in the units of the poses."""
     out = tmp_path / "out"
