@@ -224,6 +224,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
     if not scenes:
         progress.remove_task(bar)
         return  # a finished run needs no cluster to write its tables again
+    wanted = {scene.key: wanted[scene.key] for scene in scenes}
     total = sum(map(len, wanted.values()))
     progress.update(bar, total=total)
     if config.cluster is None and (config.jobs == 0 or total <= FEW):

@@ -165,6 +165,27 @@ def test_jobs_of_one_scene_at_a_time_are_in_memory(
     assert run.most == len(kept) - 2
 
 
+def test_a_cluster_gets_what_is_missing_most_first(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scenes = list(suite.scenes)
+    run = Watched(suite, [], scenes, TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
+    store = Store.open(tmp_path / "records.jsonl")
+    done = [*run.jobs(scenes[0]), *list(run.jobs(scenes[1]))[:1]]
+    for job in done:
+        store.lay_by(job.make())
+    given: list[dict[str, frozenset[str]]] = []
+    monkeypatch.setattr(
+        "unirender_evaluation.benchmark.run_on_cluster",
+        lambda _run, _build, _suite, wanted, _: given.append(wanted) or [],
+    )
+    _work(run, BenchConfig(out=tmp_path / "run", cluster="tcp://nowhere:1"), store, Progress(disable=True))
+    assert [(key, len(keys)) for key, keys in given[0].items()] == [
+        *((scene.key, 2) for scene in scenes[2:]),
+        (scenes[1].key, 1),
+    ]
+
+
 def test_keys_change_with_what_results_depend_on(suite: Suite) -> None:
     scene = suite.scenes[0]
     base = content_key(suite, scene, "inverse/x", {"a": 1}, "code")
