@@ -25,7 +25,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from unirender.errors import UsageError
 from unirender.files import checkpoint_sha256, replace_file
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, shipped_for
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.engine import Job, Store
@@ -46,6 +46,7 @@ from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
 from unirender_evaluation.subsets import STANDARD, Subsets
+from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
@@ -74,7 +75,7 @@ class BenchConfig:
     Attributes:
         suite: name of a bundled suite, or path of a TOML file.
         out: folder of the run; an earlier run in it is continued.
-        checkpoint: folder of our model, or the name of a shipped one; None = `tiny`.
+        checkpoint: folder of our model, or the name of a shipped one; None = the shipped one for the suite's pictures.
         methods: groups of rows: ours; optimisation (each picture, and the multi-view table); trivial; plugins
             (installed). A stranger's row always brings the trivial ones.
         method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
@@ -109,6 +110,12 @@ class BenchConfig:
     subsets: Subsets = STANDARD
     variants: tuple[Variant, ...] | None = None
 
+    def weights(self) -> Path:
+        """The folder of our model."""
+        if self.checkpoint is None:
+            return shipped_for(read_spec(self.suite).resolution)
+        return checkpoint_folder(self.checkpoint)
+
 
 @dataclass(frozen=True)
 class BenchResult:
@@ -136,7 +143,7 @@ def build_rows(config: BenchConfig) -> list[Row]:
     if "ours" in config.methods:
         from unirender.models.precision import resolve_device
 
-        folder, device = checkpoint_folder(config.checkpoint), str(resolve_device(config.device))
+        folder, device = config.weights(), str(resolve_device(config.device))
         pipeline = LazyPipeline(lambda: _load_pipeline(folder, device))
         rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
     if "optimisation" in config.methods and config.subsets.optimise != 0:
@@ -249,7 +256,7 @@ def anywhere(config: BenchConfig) -> BenchConfig:
     return replace(
         config,
         suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
-        checkpoint=None if config.checkpoint is None else checkpoint_folder(config.checkpoint).resolve(),
+        checkpoint=config.weights().resolve(),
         predictions={name: folder.resolve() for name, folder in config.predictions.items()},
     )
 

@@ -36,7 +36,8 @@ class BenchRun:
     out: Path = Path("results")
     """Folder of the run."""
     checkpoint: Path | None = None
-    """Folder of our model, or a shipped one by its name. None: tiny."""
+    """Folder of our model, or a shipped one by its name. None: the shipped one for pictures of the
+    suite's size."""
     methods: tuple[str, ...] = ("ours", "optimisation", "trivial", "plugins")
     """Groups of rows; optimisation: of each picture, and the multi-view table; plugins: what is installed. The trivial
     rows also run whenever there is a row of yours."""

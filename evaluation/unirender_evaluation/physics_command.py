@@ -20,7 +20,8 @@ class BenchPhysics:
     spp: int = 1024
     """Samples per pixel of Mitsuba's path tracer: its noise is the floor of the tests' values."""
     checkpoint: Path | None = None
-    """Folder of our model, or a shipped one by its name. None: tiny."""
+    """Folder of our model, or a shipped one by its name. None: the shipped one for pictures of the
+    suite's size."""
     device: Device = "cpu"
     """Where our model runs."""
 

@@ -22,7 +22,7 @@ from safetensors import safe_open
 
 from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
-from unirender.shipped import checkpoint_folder, shipped_names
+from unirender.shipped import checkpoint_folder, shipped_names, trained_pixels
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
@@ -105,11 +105,6 @@ def checkpoint_text(folder: Path) -> str:
     )
 
 
-def pixels_of(folder: Path) -> int:
-    """The size that a checkpoint was trained at."""
-    return json.loads((folder / "training.json").read_text())["train"]["model"]["resolution"]
-
-
 def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = SHOWN) -> str:
     """Those tables, masked, as Markdown."""
     chosen = [
@@ -164,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
             slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
             text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")
-            facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=pixels_of)))
+            facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=trained_pixels)))
             arguments.readme.write_text(fill(text, "checkpoint", facts))
         if arguments.stored:
             store(arguments.stored / folder, results, tables)

@@ -13,9 +13,12 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.files import checkpoint_sha256
 from unirender.intrinsics import Intrinsics
+from unirender.shipped import checkpoint_folder
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.claims import OURS
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.metrics import ALL_VARIANTS
 from unirender_evaluation.prediction_check import PredictionError
@@ -36,6 +39,13 @@ def test_row_groups_are_checked(tmp_path: Path) -> None:
         build_rows(BenchConfig(methods=("everything",)))
     with pytest.raises(UnirenderError, match="no checkpoint in"):
         build_rows(BenchConfig(methods=("ours",), checkpoint=tmp_path))
+
+
+@pytest.mark.parametrize(("suite", "name"), [("tiny", "tiny"), ("standard", "small")])
+def test_without_a_checkpoint_ours_is_the_one_for_the_suites_pictures(suite: str, name: str) -> None:
+    rows = build_rows(BenchConfig(suite=suite, methods=("ours",)))
+    found = {row.info.config["weights"] for row in rows if row.info.key == OURS}
+    assert found == {checkpoint_sha256(checkpoint_folder(name))}
 
 
 def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:

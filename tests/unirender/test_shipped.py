@@ -8,7 +8,7 @@ from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
 from unirender.options import ModelOptions
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.shipped import CHECKPOINTS, checkpoint_folder, checkpoint_label, shipped_names
+from unirender.shipped import CHECKPOINTS, checkpoint_folder, checkpoint_label, shipped_for, shipped_names
 
 
 def test_every_shipped_checkpoint_is_found_by_its_name() -> None:
@@ -25,6 +25,13 @@ def test_every_shipped_checkpoint_is_found_by_its_name() -> None:
 def test_a_path_stays_a_path(path: str) -> None:
     assert checkpoint_folder(path) == Path(path)
     assert checkpoint_label(path) == Path(path).name
+
+
+@pytest.mark.parametrize(
+    ("pixels", "name"), [(32, "tiny"), (64, "tiny"), (127, "tiny"), (128, "small"), (512, "small")]
+)
+def test_pictures_of_a_size_have_the_largest_checkpoint_that_is_not_for_larger_ones(pixels: int, name: str) -> None:
+    assert shipped_for(pixels) == CHECKPOINTS / name
 
 
 def test_what_lies_in_the_current_folder_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
