@@ -24,9 +24,11 @@ from unirender.pipelines.editing import (
     LOBE_FLOOR,
     ROUGHNESS_ERROR,
     TRUST_SHARPER,
+    TRUST_WIDER,
     anchor,
     constant_map,
     specular_for_roughness,
+    specular_share,
     trust,
 )
 from unirender.pipelines.framing import Frame
@@ -332,17 +334,39 @@ def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_c
         old = get(uniform, "specular")
         changed, _ = specular_for_roughness(uniform, constant_map(target, mask))
         middle = (slice(12, 20), slice(12, 20))
-        expected = old * ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust(roughness, constant_map(target, mask))
+        believed = trust(roughness, constant_map(target, mask), specular_share(uniform))
+        expected = old * ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** believed
         np.testing.assert_allclose(changed[middle], expected[middle], rtol=0.01)
 
 
-def test_trust_grows_with_the_change_of_roughness() -> None:
+def test_trust_grows_with_the_change_of_roughness_and_with_the_share_of_s() -> None:
     """None without a change, half of the most at the roughness's own error; sharper lobes are believed less."""
     old = np.full((1, 1, 1), 0.5, dtype=np.float32)
-    assert trust(old, old).item() == 0
-    np.testing.assert_allclose(trust(old, old + ROUGHNESS_ERROR).item(), 0.5)
-    np.testing.assert_allclose(trust(old, old - ROUGHNESS_ERROR).item(), 0.5 * TRUST_SHARPER)
-    assert trust(old, old + 0.5).item() > 0.75
+    assert trust(old, old, 1.0).item() == 0
+    assert trust(old, old + 0.5, 0.0).item() == 0
+    for share in (0.2, 0.4):
+        np.testing.assert_allclose(
+            trust(old, old + ROUGHNESS_ERROR, share).item(), 0.5 * TRUST_WIDER * share, rtol=1e-5
+        )
+        np.testing.assert_allclose(
+            trust(old, old - ROUGHNESS_ERROR, share).item(), 0.5 * TRUST_SHARPER * share, rtol=1e-5
+        )
+    assert 0.9 < trust(old, old + 0.5, 1.0).item() <= 1
+
+
+def test_the_share_of_s_is_that_of_the_composite() -> None:
+    one = np.ones((2, 2, 1), dtype=np.float32)
+    gray = Intrinsics(
+        albedo=0.5 * np.ones((2, 2, 3), np.float32),
+        metallic=0.2 * one,
+        specular=np.full((2, 2, 3), 2, np.float32),
+        diffuse=np.ones((2, 2, 3), np.float32),
+        mask=one,
+    )
+    lit, reflected = 0.8 * 0.5 * 1, (0.04 * 0.8 + 0.5 * 0.2) * 2
+    np.testing.assert_allclose(specular_share(gray), reflected / (lit + reflected), rtol=1e-5)
+    assert specular_share(gray.replace(metallic=one)) == 1
+    assert specular_share(gray.replace(albedo=0 * gray.require("albedo")["albedo"], metallic=one)) == 0
 
 
 @pytest.mark.parametrize("size", [(32, 32), (48, 20), (33, 65)])

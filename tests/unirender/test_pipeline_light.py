@@ -10,7 +10,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
 from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
-from unirender.pipelines.editing import specular_for_roughness, trust, under_light
+from unirender.pipelines.editing import specular_for_roughness, specular_share, trust, under_light
 from unirender.pipelines.inputs import ready_to_render
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
@@ -160,12 +160,13 @@ def test_edits_relighting_and_rendering_use_it() -> None:
     for maps in (shadowed, ready_to_render(lit).require("specular", "diffuse")):
         np.testing.assert_allclose(maps["specular"], s * shares["specular"], rtol=1e-6)
         np.testing.assert_allclose(maps["diffuse"], d * shares["diffuse"], rtol=1e-6)
-    before = given.replace(environment=environment, specular=s)
+    paint = {"albedo": np.full(s.shape, 0.5, dtype=np.float32), "metallic": 0.5 * mask}
+    before = given.replace(environment=environment, specular=s, diffuse=d, **paint)
     edited, held = specular_for_roughness(before, 0.4 * mask)
     old, new = (every_pixel(given.replace(roughness=r * mask), environment)[0] for r in (0.6, 0.4))
     inside = interior(given)
     assert held == 0
-    expected = old * ((new + 0.02) / (old + 0.02)) ** trust(0.6 * mask, 0.4 * mask)
+    expected = old * ((new + 0.02) / (old + 0.02)) ** trust(0.6 * mask, 0.4 * mask, specular_share(before))
     np.testing.assert_allclose(edited[inside], expected[inside], rtol=2 * TOLERANCE)
     assert not np.allclose(edited[inside], old[inside], rtol=4 * TOLERANCE)  # the twin: something changes
     same, _ = specular_for_roughness(before, given.require("roughness")["roughness"])

@@ -6,6 +6,7 @@ Notation: s specular light, I the input, R_0 and R_1 the renders of the decompos
 import numpy as np
 from jaxtyping import Bool, Float
 
+from unirender.composite import composite_image
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
@@ -14,8 +15,8 @@ from unirender.pipelines.derived_light import derived_light, derived_specular
 from unirender.pipelines.revealed_light import revealed_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
-TRUST_SHARPER = 0.5  # the most of that change's logarithm, for sharper lobes: the light lacks the detail they show
-ROUGHNESS_ERROR = 0.25  # RMS error of a predicted roughness: a change within it may be none
+TRUST_WIDER, TRUST_SHARPER = 1.7, 0.5  # of that change's logarithm, per share of the picture that s makes
+ROUGHNESS_ERROR = 0.1  # a change of roughness within it may be none
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
@@ -29,30 +30,48 @@ def specular_for_roughness(
 
         s_1 = s_0 * clip((S(L, r_1) / S(L, r_0))^t, 1/4, 4)
 
-        t = t_max (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2)
-
     L is the light that s_0 reveals (`unirender.pipelines.revealed_light`) and S its lobes. Both L and r_0 are
-    estimates: e is the error of r_0, and t_max is 1 for wider lobes and less for sharper ones. Shadowing and what that
-    light misses stay in s_0.
+    estimates, so that the change is believed in part (`trust`). Shadowing and what that light misses stay in s_0.
 
     Returns:
         s_1, and the share of the covered values where the bound held the ratio.
+
+    Raises:
+        UnirenderError: a map is unknown.
     """
     maps = before.require("normal", "roughness", "specular", "environment", "mask")
     light = revealed_light(before)
     old = derived_specular(before, light)
     new = derived_specular(before.replace(roughness=roughness), light)
-    ratio = ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust(maps["roughness"], roughness)
+    ratio = ((new + LOBE_FLOOR) / (old + LOBE_FLOOR)) ** trust(maps["roughness"], roughness, specular_share(before))
     bounded = np.clip(ratio, 1 / LOBE_RATIO, LOBE_RATIO)
     inside = np.broadcast_to(maps["mask"] > 0, ratio.shape)
     held = float((ratio != bounded)[inside].mean()) if inside.any() else 0.0
     return (maps["specular"] * bounded).astype(np.float32), held
 
 
-def trust(old: Float[np.ndarray, "h w 1"], new: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:
-    """t of `specular_for_roughness`: how much of a change of s to believe; 0 where the roughness is the old one."""
+def trust(old: Float[np.ndarray, "h w 1"], new: Float[np.ndarray, "h w 1"], share: float) -> Float[np.ndarray, "h w 1"]:
+    """t of `specular_for_roughness`: how much of a change of s to believe; 0 where the roughness is the old one.
+
+        t = min(c q, 1) (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2)
+
+    q is the share of the picture that s makes: the less of it shows, the less is known of it. c is smaller for sharper
+    lobes, which show detail that the light lacks; e is the error of r_0.
+    """
     square = np.square(new - old)
-    return np.where(new < old, np.float32(TRUST_SHARPER), np.float32(1)) * square / (square + ROUGHNESS_ERROR**2)
+    most = np.minimum(np.where(new < old, np.float32(TRUST_SHARPER), np.float32(TRUST_WIDER)) * np.float32(share), 1)
+    return most * square / (square + ROUGHNESS_ERROR**2)
+
+
+def specular_share(intrinsics: Intrinsics) -> float:
+    """The share of an object's radiance that is its specular light's, by the composite; 0 where all is black.
+
+    Raises:
+        UnirenderError: one of albedo, metallic, specular, diffuse or mask is unknown.
+    """
+    whole = composite_image(intrinsics).sum()
+    without = composite_image(intrinsics.replace(specular=np.zeros_like(intrinsics.require("specular")["specular"])))
+    return float(1 - without.sum() / whole) if whole > 0 else 0.0
 
 
 def too_coarse(before: Intrinsics, roughness: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w 1"]:
