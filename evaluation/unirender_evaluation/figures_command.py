@@ -37,7 +37,8 @@ class Figures:
     out: Path = Path("figures")
     """Folder of the pictures, one PNG for each of `--kinds`."""
     checkpoint: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
-    """Folder of a checkpoint of ours, or a shipped one by name; repeatable. None: tiny, unless there is a --method."""
+    """Folder of a checkpoint of ours, or a shipped one by name; repeatable. None: the shipped one for
+    pictures of the suite's size, unless there is a --method."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Somebody else's method: module:Class or path/to/file.py:Class, as in `unirender bench run`; repeatable."""
     suite: str = "tiny"
@@ -157,15 +158,17 @@ class Figures:
         from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
-        from unirender.shipped import checkpoint_folder
+        from unirender.shipped import checkpoint_folder, shipped_for
         from unirender_evaluation.figures_panels import Subject
         from unirender_evaluation.pipeline_method import PipelineMethod
         from unirender_evaluation.plugins import named_plugin
         from unirender_evaluation.rows import make_row, plugin_rows
+        from unirender_evaluation.suite_spec import read_spec
 
         found, device = [], str(resolve_device(self.device))
-        named = self.checkpoint or (() if self.method else (None,))
-        folders = tuple(map(checkpoint_folder, named))
+        folders = tuple(map(checkpoint_folder, self.checkpoint))
+        if not folders and not self.method:
+            folders = (shipped_for(read_spec(self.suite).resolution),)
         for folder, label in zip(folders, labels(folders), strict=True):
             pipeline = ModelOptions(folder, self.device, "float32", progress=False).load()
             weights = checkpoint_sha256(folder)

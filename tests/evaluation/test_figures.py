@@ -245,6 +245,12 @@ def test_the_command_draws_a_strangers_method_without_our_model(tmp_path: Path, 
     assert not subject.can("edit")
 
 
+def test_where_none_is_named_the_checkpoint_is_the_one_for_the_suites_pictures() -> None:
+    for suite, name in (("tiny", "tiny"), ("standard", "small")):
+        (subject,) = Figures(suite=suite).subjects()
+        assert subject.label == name
+
+
 def test_the_command_is_light_to_import() -> None:
     code = "import sys, unirender_evaluation.figures_command; print({'torch', 'mitsuba', 'PIL'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
