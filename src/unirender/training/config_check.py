@@ -87,7 +87,13 @@ def check_config(config: TrainConfig) -> None:
             f"training config: pictures of {config.model.resolution} pixels, expected one of {sizes}: the picture "
             f"encoder sees them at {ENCODER_SIDE}"
         )
-    if config.trains != "all" and (config.p_render or config.timestep_rule != "conditional"):
+    conditional = config.timestep_rule == "conditional"
+    if config.trains == "renderer" and not (config.p_render == 1 and conditional):
+        raise UnirenderError(
+            "training config: trains is 'renderer', which renders alone; expected p_render 1 and the conditional rule "
+            "of timesteps"
+        )
+    if config.trains in ("encoder", "inverse") and (config.p_render or not conditional):
         raise UnirenderError(
             f"training config: trains is {config.trains!r}, which renders nothing; expected p_render 0 and the "
             "conditional rule of timesteps"

@@ -108,7 +108,7 @@ class TrainConfig:
     batch_size: int = 16
     group_size: int = 1  # pictures side by side in a batch that differ in one thing only; 1: they may differ in all
     steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
-    trains: Literal["all", "encoder", "inverse"] = "all"  # which weights; see `unirender.training.trained`
+    trains: Literal["all", "encoder", "inverse", "renderer"] = "all"  # which weights; see `unirender.training.trained`
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
     p_render: float = 0.5  # share of rendering; the paper's p_direction
     p_t: float = 0.5  # share of random t instead of T
@@ -214,6 +214,9 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
+    "small_renderer": dataclasses.replace(
+        _SMALL, trains="renderer", p_render=1.0, augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.5)
+    ),
     "small_vgg": dataclasses.replace(
         _SMALL,
         model=dataclasses.replace(_SMALL.model, picture_features="vgg16"),

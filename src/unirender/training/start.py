@@ -124,7 +124,7 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     if network.config["picture_features"] == "none":
         load_features(model)
     if network.config["physics_prior"] != model.config["physics_prior"]:
-        if trainer.config.trains != "all":
+        if trainer.config.trains not in ("all", "renderer"):
             raise UnirenderError(
                 f"initial weights: their physics prior is {network.config['physics_prior']}, expected "
                 f"{model.config['physics_prior']}: this preset trains nothing that could learn the other one"

@@ -1,11 +1,13 @@
-"""Which weights a run trains: all of them, the picture encoder by itself, or that and the decoder that it serves.
+"""Which weights a run trains: all of them, or those of one direction alone.
 
     all       the whole network
     encoder   the picture encoder, against what its heads should say; no pass through the streams
     inverse   the picture encoder, the attribute stream's decoder, and what comes into it from the image stream
+    renderer  the image stream's decoder, and what comes into it from the attribute stream
 
-No weight of the last two takes part in rendering, which is the same to the bit before and after. Neither stream's
-encoder is among them, nor is the way of ImageNet's features into a network.
+No weight of `encoder` and `inverse` takes part in rendering, and none of `renderer` in inverse rendering: the other
+direction is the same to the bit before and after. Neither stream's encoder is among them, nor is the way of ImageNet's
+features into a network.
 """
 
 from torch import nn
@@ -14,6 +16,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_encoder import PictureEncoder
 
 DECODER = ("up_blocks", "conv_norm_out", "conv_out")
+DIRECTIONS = {"inverse": ("attribute_unet", "image_to_attributes"), "renderer": ("image_unet", "attributes_to_image")}
 
 
 def train_only(model: DualStreamModel, trains: str) -> None:
@@ -22,12 +25,13 @@ def train_only(model: DualStreamModel, trains: str) -> None:
         return
     nn.Module.requires_grad_(model, requires_grad=False)
     for part in model.modules():
-        if isinstance(part, PictureEncoder):
+        if isinstance(part, PictureEncoder) and trains != "renderer":
             part.requires_grad_()
-        if trains == "inverse" and isinstance(part, DualStreamModel):
-            part.image_to_attributes.requires_grad_()
+        if trains in DIRECTIONS and isinstance(part, DualStreamModel):
+            unet, bridge = (getattr(part, name) for name in DIRECTIONS[trains])
+            bridge.requires_grad_()
             for name in DECODER:
-                layers = getattr(part.attribute_unet, name, None)  # a network that only renders has none
+                layers = getattr(unet, name, None)  # a network of the other direction has none
                 if layers is not None:
                     layers.requires_grad_()
 
