@@ -7,6 +7,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender_evaluation import lpips
+from unirender_evaluation.benchmark import BenchConfig, build_rows
 from unirender_evaluation.versions import (
     LPIPS,
     MODEL,
@@ -102,6 +103,14 @@ def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
     assert any(fnmatch(path, pattern) for pattern in PARTS["core"].without)
     patterns = [p for part in PARTS.values() for p in part.files.get("unirender_evaluation", ()) if p != "*.py"]
     assert not [pattern for pattern in patterns if fnmatch(f"{name}.py", pattern)]
+
+
+def test_a_record_follows_the_weights_and_not_where_they_lie() -> None:
+    assert any(fnmatch("unirender/shipped.py", pattern) for pattern in PARTS["core"].without)
+    rows = [build_rows(BenchConfig(methods=("ours",), checkpoint=Path(name))) for name in ("tiny", "small")]
+    for one, other in zip(*rows, strict=True):
+        assert one.info.key == other.info.key
+        assert one.config != other.config
 
 
 @pytest.mark.parametrize(("name", "part"), [("adapters_marigold", MODEL), ("mitsuba_method", REFERENCE)])
