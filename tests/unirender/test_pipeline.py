@@ -22,7 +22,7 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.derived_light import derived_specular
 from unirender.pipelines.editing import (
     LOBE_FLOOR,
-    ROUGHNESS_ERROR,
+    SMALL_CHANGE,
     TRUST_SHARPER,
     TRUST_WIDER,
     anchor,
@@ -340,17 +340,13 @@ def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_c
 
 
 def test_trust_grows_with_the_change_of_roughness_and_with_the_share_of_s() -> None:
-    """None without a change, half of the most at the roughness's own error; sharper lobes are believed less."""
+    """None without a change, half of the most at a small one; sharper lobes are believed less."""
     old = np.full((1, 1, 1), 0.5, dtype=np.float32)
     assert trust(old, old, 1.0).item() == 0
     assert trust(old, old + 0.5, 0.0).item() == 0
     for share in (0.2, 0.4):
-        np.testing.assert_allclose(
-            trust(old, old + ROUGHNESS_ERROR, share).item(), 0.5 * TRUST_WIDER * share, rtol=1e-5
-        )
-        np.testing.assert_allclose(
-            trust(old, old - ROUGHNESS_ERROR, share).item(), 0.5 * TRUST_SHARPER * share, rtol=1e-5
-        )
+        np.testing.assert_allclose(trust(old, old + SMALL_CHANGE, share).item(), 0.5 * TRUST_WIDER * share, rtol=1e-5)
+        np.testing.assert_allclose(trust(old, old - SMALL_CHANGE, share).item(), 0.5 * TRUST_SHARPER * share, rtol=1e-5)
     assert 0.9 < trust(old, old + 0.5, 1.0).item() <= 1
 
 

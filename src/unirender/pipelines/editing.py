@@ -16,7 +16,7 @@ from unirender.pipelines.revealed_light import revealed_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
 TRUST_WIDER, TRUST_SHARPER = 1.7, 0.5  # of that change's logarithm, per share of the picture that s makes
-ROUGHNESS_ERROR = 0.1  # a change of roughness within it may be none
+SMALL_CHANGE = 0.1  # of roughness: made by half, since the old one is a guess
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
 ANCHOR_GAIN = 2.0  # bound on the input over its own re-rendering, either way
@@ -37,7 +37,7 @@ def specular_for_roughness(
         s_1, and the share of the covered values where the bound held the ratio.
 
     Raises:
-        UnirenderError: a map is unknown.
+        UnirenderError: a map is unknown; albedo, metallic and diffuse are needed too (`specular_share`).
     """
     maps = before.require("normal", "roughness", "specular", "environment", "mask")
     light = revealed_light(before)
@@ -56,11 +56,11 @@ def trust(old: Float[np.ndarray, "h w 1"], new: Float[np.ndarray, "h w 1"], shar
         t = min(c q, 1) (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2)
 
     q is the share of the picture that s makes: the less of it shows, the less is known of it. c is smaller for sharper
-    lobes, which show detail that the light lacks; e is the error of r_0.
+    lobes, which show detail that the light lacks; a change of e is made by half of that.
     """
     square = np.square(new - old)
     most = np.minimum(np.where(new < old, np.float32(TRUST_SHARPER), np.float32(TRUST_WIDER)) * np.float32(share), 1)
-    return most * square / (square + ROUGHNESS_ERROR**2)
+    return most * square / (square + SMALL_CHANGE**2)
 
 
 def specular_share(intrinsics: Intrinsics) -> float:
