@@ -6,8 +6,8 @@
 facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`.
 The stored folder (`evaluation/results` of a checkout, which the documentation reads) gets a folder by the name of the
 suite, with every value (`results.json.gz`) and one Markdown file per table; from that file the command makes both anew.
-With `--of` that of a shipped checkpoint which is not the default gets a folder SUITE-CHECKPOINT instead, and the README
-nothing. A partial run (`--limit`) is refused.
+Its rows of ours must be those of the shipped checkpoint that the suite takes by itself. With `--of` those of another
+get a folder SUITE-CHECKPOINT instead, and the README nothing. A partial run (`--limit`) is refused.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from safetensors import safe_open
 
 from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
-from unirender.shipped import checkpoint_folder, shipped_names, trained_pixels
+from unirender.shipped import checkpoint_folder, shipped_for, shipped_names, trained_pixels
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
@@ -68,20 +68,27 @@ def fill(readme: str, name: str, text: str) -> str:
 
 
 def place(results: Results, checkpoint: str | None) -> str:
-    """The stored folder's name: the suite's, or for a shipped checkpoint that is not the default SUITE-CHECKPOINT.
+    """The stored folder's name: the suite's, or SUITE-CHECKPOINT for a shipped one that the suite does not take itself.
+
+    Args:
+        results: of the run; rows that have no weights count for nothing.
+        checkpoint: name of that one; None: the run has the checkpoint that the suite takes.
 
     Raises:
         UnirenderError: the run has other weights than that checkpoint.
     """
-    if checkpoint is None:
-        return results.run.suite
-    expected = checkpoint_sha256(checkpoint_folder(checkpoint))
-    got = {info.config["weights"] for info in results.run.methods if "weights" in info.config}
-    if got != {expected}:
+    run = results.run
+    got = {info.config["weights"] for info in run.methods if "weights" in info.config}
+    folder, name, way = shipped_for(run.resolution), run.suite, "without --checkpoint, or name the run's by --of"
+    if checkpoint is not None:
+        folder, name = checkpoint_folder(checkpoint), f"{run.suite}-{checkpoint}"
+        way = f"with --checkpoint {checkpoint}"
+    expected = checkpoint_sha256(folder)
+    if got - {expected} or (checkpoint and not got):
         names = ", ".join(sorted(weights[:12] for weights in got)) or "no weights"
-        wanted = f"expected {expected[:12]}, those of {checkpoint}"
-        raise UnirenderError(f"weights: got {names}, {wanted}; run the benchmark with --checkpoint {checkpoint}")
-    return f"{results.run.suite}-{checkpoint}"
+        wanted = f"expected {expected[:12]}, those of {folder.name}"
+        raise UnirenderError(f"weights: got {names}, {wanted}; run the benchmark {way}")
+    return name
 
 
 def checkpoint_text(folder: Path) -> str:

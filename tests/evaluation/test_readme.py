@@ -107,6 +107,19 @@ def test_the_results_of_another_shipped_checkpoint_have_a_place_of_their_own(
         readme.main([*options, "--readme", "README.md"])
 
 
+def test_another_checkpoint_does_not_take_the_place_of_that_which_the_suite_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, stored = write_example(tmp_path / "run", suite="large"), tmp_path / "stored"
+    for name, code in (("small", 1), ("tiny", 0)):
+        methods = (MethodInfo("mine", "Mine", "ours", config={"weights": checkpoint_sha256(checkpoint_folder(name))}),)
+        write_run(run / "run.json", RunInfo("large", "0" * 64, 64, methods, date="2026-11-21"))
+        assert readme.main([str(run), "--stored", str(stored)]) == code
+        assert stored.exists() == (code == 0)
+    assert "those of tiny; run the benchmark without --checkpoint, or name the run's" in capsys.readouterr().err
+    assert (stored / "large" / "results.json.gz").is_file()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("suite", sorted(path.name for path in STORED.iterdir()))
 def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: str, tmp_path: Path) -> None:
