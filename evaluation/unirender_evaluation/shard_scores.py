@@ -1,10 +1,10 @@
-"""How well a model takes apart the pictures of a data set, where a suite has too few of a kind, or none.
+"""How well a model takes apart, and renders, the pictures of a data set, where a suite has too few of a kind, or none.
 
 Of folders that `unirender dataset` wrote: scores on objects that a model was trained on beside those on objects that it
 never saw say whether more objects or more training are wanted. Stored pairs as they are, nothing mixed or turned.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from unirender.color import image_srgb, unpremultiply
+from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
+from unirender.pipelines.inputs import ready_to_render
 from unirender.training.data import GroupDataset
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.scoring import score_maps
+from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.statistics import bootstrap_mean
 from unirender_evaluation.table_text import TextTable
 
@@ -26,6 +28,11 @@ COLUMNS = {  # header -> metric of `score_maps`, decimals
     "metallic MSE ↓": (metric_key("metallic", "mse_object"), 4),
     "s (dB) ↑": (metric_key("specular", "psnr"), 2),
     "d (dB) ↑": (metric_key("diffuse", "psnr"), 2),
+}
+RENDERS = {  # the same of pictures rendered from the true maps; closed form: what our network begins with
+    "given (dB) ↑": (metric_key("given", "psnr"), 2),
+    "given light (dB) ↑": (metric_key("given-light", "psnr"), 2),
+    "closed form, given light (dB) ↑": (metric_key("closed-form", "psnr"), 2),
 }
 
 
@@ -46,7 +53,7 @@ class Scored:
     scores: dict[str, float]
 
 
-def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int) -> Iterator[Scored]:
+def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int, renders: bool = False) -> Iterator[Scored]:
     """Decomposes pictures of a folder, one step each, as the benchmark's row *Ours (mean)*, and scores their maps.
 
     Args:
@@ -55,6 +62,7 @@ def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int) -> 
         objects: drawn from it; fewer where it has fewer.
         pairs: drawn of each.
         seed: of both draws.
+        renders: whether the pictures are rendered from their true maps as well (`RENDERS`).
 
     Raises:
         UnirenderError: no usable shards.
@@ -69,7 +77,22 @@ def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int) -> 
             seen = (np.round(display * 255) / 255).astype(np.float32)
             found: Intrinsics = pipeline.decompose(seen, mask=truth.mask).intrinsics
             values = score_maps(found.replace(mask=None), truth)
+            if renders:
+                values |= _render_scores(pipeline, image, truth)
             yield Scored(str(folder), data.keys[group], stored[index].metallic, values)
+
+
+def _render_scores(pipeline: Any, image: np.ndarray, truth: Intrinsics) -> dict[str, float]:
+    """Of a picture rendered from its true maps, and from those but s and d, which its light has to say."""
+    assert truth.mask is not None
+    light = truth.replace(specular=None, diffuse=None)
+    drawn = {
+        "given": pipeline.render(truth),
+        "given-light": pipeline.render(light),
+        "closed-form": split_sum_image(ready_to_render(light, shadows=True)),
+    }
+    scores = [score_image(picture, image, truth.mask, quantity=name) for name, picture in drawn.items()]
+    return {key: value for one in scores for key, value in one.items()}
 
 
 def shard_table(found: Sequence[Scored], what: str) -> TextTable:
@@ -79,23 +102,29 @@ def shard_table(found: Sequence[Scored], what: str) -> TextTable:
         found: at least one.
         what: was scored, and how, for the note.
     """
-    sections = []
+    rendered = {name: column for name, column in RENDERS.items() if any(column[0] in one.scores for one in found)}
+    columns, sections = COLUMNS | rendered, []
     for folder in dict.fromkeys(one.folder for one in found):
         of_folder = [one for one in found if one.folder == folder]
-        rows = [_row(f"{folder}: all", of_folder)]
+        rows = [_row(f"{folder}: all", of_folder, columns)]
         for metallic in sorted({one.metallic for one in of_folder if one.metallic is not None}):
-            rows.append(_row(f"metallic {metallic:g}", [one for one in of_folder if one.metallic == metallic]))
+            rows.append(_row(f"metallic {metallic:g}", [one for one in of_folder if one.metallic == metallic], columns))
         sections.append(tuple(rows))
     note = (
         f"{what} Pictures as they are stored, at 8 bits; masked, sRGB, raw; ± half of the 95% bootstrap interval over "
         "objects. Roughness and metallic: mean over the object against its number."
     )
-    return TextTable("Pictures of data sets", ("data", "objects", "pictures", *COLUMNS), tuple(sections), (note,))
+    if rendered:
+        note += (
+            " Given: rendered from the true maps; given light: from those but s and d, which the light says; "
+            "closed form: what the renderer begins with there."
+        )
+    return TextTable("Pictures of data sets", ("data", "objects", "pictures", *columns), tuple(sections), (note,))
 
 
-def _row(name: str, found: Sequence[Scored]) -> tuple[str, ...]:
+def _row(name: str, found: Sequence[Scored], columns: Mapping[str, tuple[str, int]]) -> tuple[str, ...]:
     cells = []
-    for key, decimals in COLUMNS.values():
+    for key, decimals in columns.values():
         with_value = [one for one in found if key in one.scores]
         if not with_value:
             cells.append("-")

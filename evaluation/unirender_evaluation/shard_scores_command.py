@@ -25,6 +25,8 @@ class BenchShards:
     """Pictures drawn of each object."""
     seed: int = 0
     """Of what is drawn."""
+    renders: bool = False
+    """Render the pictures as well: from their true maps, and from those but s and d."""
     out: Path | None = None
     """Markdown file for the table; None: it is printed only."""
     device: Device = "cpu"
@@ -57,7 +59,7 @@ class BenchShards:
         pipeline = ModelOptions(checkpoint, self.device, "float32", progress=False).load()
         found = []
         for folder in self.data:
-            pictures = scored(pipeline, folder, self.objects, self.pairs, self.seed)
+            pictures = scored(pipeline, folder, self.objects, self.pairs, self.seed, self.renders)
             found += list(track(pictures, description=str(folder), console=errors, transient=True))
         what = f"Checkpoint {checkpoint_sha256(checkpoint)[:12]}, one step, closed."
         table = shard_table(found, f"{what} Up to {self.objects} objects a folder, {self.pairs} pictures each.")

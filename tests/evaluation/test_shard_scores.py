@@ -8,10 +8,11 @@ import pytest
 from synthetic_shards import write_dataset
 
 from unirender.cli import main
+from unirender.composite import composite_image
 from unirender.errors import UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.shard_scores import COLUMNS, scored, shard_table
+from unirender_evaluation.shard_scores import COLUMNS, RENDERS, scored, shard_table
 from unirender_evaluation.shard_scores_command import BenchShards
 
 SIZE = 16
@@ -73,9 +74,37 @@ def test_the_table_has_a_row_for_each_folder_and_metallic(folder: Path) -> None:
     assert int(rows[0][2]) == sum(int(row[2]) for row in rows[1:])
 
 
+class Painter(Halves):
+    """Renders the composite of what it is given, or black where s and d are left to it; remembers which."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.given: list[bool] = []
+
+    def render(self, intrinsics: Intrinsics) -> np.ndarray:
+        self.given.append(intrinsics.specular is not None)
+        assert (intrinsics.specular is None) == (intrinsics.diffuse is None)
+        assert intrinsics.environment is not None
+        return composite_image(intrinsics) if self.given[-1] else np.zeros_like(intrinsics.require("albedo")["albedo"])
+
+
+def test_renders_are_scored_where_they_are_asked_for(folder: Path) -> None:
+    method = Painter()
+    found = list(scored(method, folder, objects=1, pairs=2, seed=0, renders=True))
+    assert method.given == [True, False, True, False]
+    for one in found:
+        given, light, closed = (one.scores[key] for key, _ in RENDERS.values())
+        assert np.isfinite(closed)
+        assert given > light
+    header = shard_table(found, "Painter.").columns
+    assert tuple(RENDERS) == header[-len(RENDERS) :]
+    assert not set(RENDERS) & set(shard_table(list(scored(method, folder, 1, 1, 0)), "Painter.").columns)
+
+
 def test_the_command_scores_the_shipped_model(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert BenchShards(data=(folder,), objects=1, pairs=1, out=tmp_path / "t.md").run() == 0
+    assert BenchShards(data=(folder,), objects=1, pairs=1, renders=True, out=tmp_path / "t.md").run() == 0
     text = (tmp_path / "t.md").read_text()
+    assert set(RENDERS) <= set(map(str.strip, text.split("|")))
     assert "albedo" in capsys.readouterr().out
     assert text.startswith("### Pictures of data sets")
     assert " nan" not in text
