@@ -215,7 +215,10 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
     "small_renderer": dataclasses.replace(
-        _SMALL, trains="renderer", p_render=1.0, augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.5)
+        _SMALL,
+        trains="renderer",
+        p_render=1.0,
+        augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.7, shadowed=0.9),
     ),
     "small_vgg": dataclasses.replace(
         _SMALL,
