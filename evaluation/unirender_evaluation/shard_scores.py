@@ -117,7 +117,7 @@ def shard_table(found: Sequence[Scored], what: str) -> TextTable:
     if rendered:
         note += (
             " Given: rendered from the true maps; given light: from those but s and d, which the light says, "
-            "at the size that models predict (a suite gives it whole); closed form: what the renderer begins with there."
+            "at the size of predictions (whole in a suite); closed form: what the renderer begins with there."
         )
     return TextTable("Pictures of data sets", ("data", "objects", "pictures", *columns), tuple(sections), (note,))
 
