@@ -126,6 +126,20 @@ def test_a_stored_pair_is_what_was_written(dataset: GroupDataset) -> None:
             assert np.unique(roughness[mask > 0]) == np.float32(pair.roughness)
 
 
+def test_the_whole_light_is_that_of_the_tar_in_its_order(tmp_path: Path) -> None:
+    members = group_members("independent", 16, lights=12, roughness=(30,), metallic=(50,), seed=0)
+    write_shard(tmp_path / "shard-000000.tar", {"a": members})
+    dataset = GroupDataset(tmp_path)
+    assert len(dataset.pairs(0)) == 12
+    for pair in dataset.pairs(0):
+        _, intrinsics = dataset.stored(0, pair)
+        normal, mask, diffuse, environment = intrinsics.require("normal", "mask", "diffuse", "environment").values()
+        whole = dataset.whole_light(0, pair)
+        assert whole.shape == (8, 16, 3)
+        np.testing.assert_allclose(turned_environments(whole, (16, 32))[0], environment, atol=1e-6)
+        np.testing.assert_allclose(diffuse_light(normal, whole) * mask, diffuse * mask, atol=4e-3)  # half precision
+
+
 def test_batch_shapes_and_ranges(dataset: GroupDataset) -> None:
     batch = next(BatchReader(dataset, 8, seed=0))
     assert tuple(batch) == BATCH_MAPS

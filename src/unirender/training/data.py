@@ -33,7 +33,16 @@ from unirender.training.augment import (
     permute_channels,
 )
 from unirender.training.derived import DerivedLight, open_derived
-from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed
+from unirender.training.groups import (
+    SCALAR_CHANNELS,
+    Group,
+    Pair,
+    Shard,
+    group_environments,
+    list_shards,
+    open_packed,
+    read_groups,
+)
 from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
 
@@ -94,6 +103,7 @@ class GroupDataset:
                     f"{folder}: shards {', '.join(missing)} are missing, expected all of {', '.join(shards)}"
                 )
             available = {path: sha256 for path, sha256 in available.items() if names[path] in shards}
+        self._paths = tuple(available)
         self.shards: list[Shard] = []
         for path, sha256 in available.items():
             self.shards.append(open_packed(path, sha256, names[path]))
@@ -145,6 +155,20 @@ class GroupDataset:
         rows = {"image": pair.image, "specular": pair.specular, "diffuse": pair.diffuse}
         maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
         return from_maps(maps | {"environment": _trailing(shard.environment[pair.light, 0])})
+
+    def whole_light(self, group: int, pair: Pair) -> Float[np.ndarray, "eh ew 3"]:
+        """The light of a stored pair as its tar has it; `stored` has it at the model's size.
+
+        The lights of one shard are kept in memory: ask in the order of groups.
+        """
+        entry = self._groups[group][1]
+        number = sorted({other.light for other in entry.pairs}).index(pair.light)
+        return self._whole_lights(self._shard_of[group])[entry.key][number]
+
+    @functools.lru_cache(maxsize=1)  # noqa: B019 - a dataset lives as long as what reads it
+    def _whole_lights(self, shard: int) -> dict[str, list[Float[np.ndarray, "eh ew 3"]]]:
+        path = self._paths[shard]
+        return {key: group_environments(members, f"{path}: group {key}") for key, members in read_groups(path)}
 
     def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
         """Sample number `index` of the stream: `[h w c]` float32 maps by the names of a batch."""

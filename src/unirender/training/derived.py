@@ -4,7 +4,7 @@ A renderer that has only ever seen s and d with all their shadows takes those wi
 out. So some of its training pictures come with both (`Augmentation.derived`): in closed form without shadows, or with
 those that the picture shows (`unirender.pipelines.shadowed_light`). A lobe takes long to integrate, a group of 64
 pixels one or two seconds. The lights of a shard are derived once, from its own tar, where they have
-their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v2` holds
+their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v3` holds
 
     unshadowed.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
     shadowed.npy     float16 [m, 3, h, w]   the same with the shadows that the picture shows
@@ -23,16 +23,16 @@ import numpy as np
 from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
-from unirender.exr import HALF_MAX, channels_rgb, read_exr_bytes
+from unirender.exr import HALF_MAX
 from unirender.intrinsics import Intrinsics
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
-from unirender.training.groups import Group, Shard, read_groups
+from unirender.training.groups import Group, Shard, group_environments, read_groups
 
 logger = logging.getLogger(__name__)
 
-DERIVED_VERSION = 2  # part of the cache's path: raise it when what is derived changes
+DERIVED_VERSION = 3  # part of the cache's path: raise it when what is derived changes
 
 _STORED = ("unshadowed", "shadowed")
 
@@ -94,19 +94,13 @@ def _derive(path: Path, shard: Shard) -> None:
     for key, members in read_groups(path):
         if key not in groups:
             raise UnirenderError(f"{path}: group {key} is not in the packed shard; delete it from the cache")
-        for row, light in _of_group(shard, groups[key], _environments(members, f"{path}: group {key}")):
+        for row, light in _of_group(shard, groups[key], group_environments(members, f"{path}: group {key}")):
             rows[row] = len(pixels)
             pixels.append(light)
     with cached_folder(folder) as made:
         for name, maps in zip(_STORED, np.stack(pixels, axis=1), strict=True):
             np.save(made / f"{name}.npy", maps)
         np.save(made / "rows.npy", rows)
-
-
-def _environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarray, "eh ew 3"]]:
-    """A group's lights at their stored resolution, by number."""
-    named = sorted((int(name[1 : name.index(".")]), name) for name in members if name.endswith(".environment.exr"))
-    return [channels_rgb(read_exr_bytes(members[name], name=f"{where}.{name}")[0]) for _, name in named]
 
 
 def _of_group(

@@ -168,6 +168,17 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
         yield key, members
 
 
+def group_environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarray, "eh ew 3"]]:
+    """A group's lights at their stored resolution, in the order of their rows in a packed shard.
+
+    Args:
+        members: as `read_groups` yields them.
+        where: what errors call the group.
+    """
+    names = sorted(name for name in members if name.endswith(".environment.exr"))
+    return [channels_rgb(read_exr_bytes(members[name], name=f"{where}.{name}")[0]) for name in names]
+
+
 def open_packed(path: str | Path, sha256: str | None = None, name: str | None = None) -> Shard:
     """Opens a shard for training, packing it first if that has not been done.
 
