@@ -5,17 +5,16 @@ never saw say whether more objects or more training are wanted. Stored pairs as 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from unirender.color import image_srgb, unpremultiply
-from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.inputs import ready_to_render
 from unirender.training.data import GroupDataset
+from unirender_evaluation.methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.statistics import bootstrap_mean
@@ -29,7 +28,7 @@ COLUMNS = {  # header -> metric of `score_maps`, decimals
     "s (dB) ↑": (metric_key("specular", "psnr"), 2),
     "d (dB) ↑": (metric_key("diffuse", "psnr"), 2),
 }
-RENDERS = {  # the same of pictures rendered from the true maps; closed form: what our network begins with
+RENDERS = {  # of pictures rendered from the true maps; closed form: what our network begins with
     "given (dB) ↑": (metric_key("given", "psnr"), 2),
     "given light (dB) ↑": (metric_key("given-light", "psnr"), 2),
     "closed form, given light (dB) ↑": (metric_key("closed-form", "psnr"), 2),
@@ -78,7 +77,8 @@ def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int, ren
             found: Intrinsics = pipeline.decompose(seen, mask=truth.mask).intrinsics
             values = score_maps(found.replace(mask=None), truth)
             if renders:
-                values |= _render_scores(pipeline, image, truth)
+                whole = truth.replace(environment=data.whole_light(group, stored[index]))
+                values |= _render_scores(pipeline, image, whole)
             yield Scored(str(folder), data.keys[group], stored[index].metallic, values)
 
 
@@ -89,37 +89,53 @@ def _render_scores(pipeline: Any, image: np.ndarray, truth: Intrinsics) -> dict[
     drawn = {
         "given": pipeline.render(truth),
         "given-light": pipeline.render(light),
-        "closed-form": split_sum_image(ready_to_render(light, shadows=True)),
+        "closed-form": ShadowedSplitSum().render(light),
     }
     scores = [score_image(picture, image, truth.mask, quantity=name) for name, picture in drawn.items()]
     return {key: value for one in scores for key, value in one.items()}
 
 
-def shard_table(found: Sequence[Scored], what: str) -> TextTable:
-    """Means by folder and, below each, by metallic, ± half of their intervals over objects.
+def minus(found: Sequence[Scored], base: Sequence[Scored]) -> list[Scored]:
+    """What `found` has more than `base`, another model's scores of the same draw, picture by picture."""
+    pairs = zip(found, base, strict=True)
+    return [
+        replace(one, scores={key: one.scores[key] - other.scores[key] for key in one.scores}) for one, other in pairs
+    ]
+
+
+def shard_tables(found: Sequence[Scored], what: str, titled: str = "") -> list[TextTable]:
+    """Means by folder and, below each, by metallic, ± half of their intervals over objects: of maps and, where there
+    are any, of renderings.
 
     Args:
         found: at least one.
-        what: was scored, and how, for the note.
+        what: was scored, and how, for the notes.
+        titled: ends the titles.
     """
-    rendered = {name: column for name, column in RENDERS.items() if any(column[0] in one.scores for one in found)}
-    columns, sections = COLUMNS | rendered, []
+    read = f"{what} Masked, sRGB, raw; ± half of the 95% bootstrap interval over objects."
+    maps = f"{read} Pictures are seen at 8 bits. Roughness and metallic: mean over the object against its number."
+    tables = [TextTable(f"Pictures of data sets{titled}", *_cells(found, COLUMNS), (maps,))]
+    if any(key in one.scores for one in found for key, _ in RENDERS.values()):
+        renders = (
+            f"{read} Given: rendered from the true maps; given light: from those but s and d, which the whole light "
+            "says; closed form: what the renderer begins with there."
+        )
+        tables.append(TextTable(f"Renderings of data sets{titled}", *_cells(found, RENDERS), (renders,)))
+    return tables
+
+
+def _cells(
+    found: Sequence[Scored], columns: Mapping[str, tuple[str, int]]
+) -> tuple[tuple[str, ...], tuple[tuple[tuple[str, ...], ...], ...]]:
+    """Headers and sections of a table."""
+    sections = []
     for folder in dict.fromkeys(one.folder for one in found):
         of_folder = [one for one in found if one.folder == folder]
         rows = [_row(f"{folder}: all", of_folder, columns)]
         for metallic in sorted({one.metallic for one in of_folder if one.metallic is not None}):
             rows.append(_row(f"metallic {metallic:g}", [one for one in of_folder if one.metallic == metallic], columns))
         sections.append(tuple(rows))
-    note = (
-        f"{what} Pictures as they are stored, at 8 bits; masked, sRGB, raw; ± half of the 95% bootstrap interval over "
-        "objects. Roughness and metallic: mean over the object against its number."
-    )
-    if rendered:
-        note += (
-            " Given: rendered from the true maps; given light: from those but s and d, which the light says, "
-            "at the size of predictions (whole in a suite); closed form: what the renderer begins with there."
-        )
-    return TextTable("Pictures of data sets", ("data", "objects", "pictures", *columns), tuple(sections), (note,))
+    return ("data", "objects", "pictures", *columns), tuple(sections)
 
 
 def _row(name: str, found: Sequence[Scored], columns: Mapping[str, tuple[str, int]]) -> tuple[str, ...]:

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
 from unirender.options import Device, ModelOptions, at_least
+
+if TYPE_CHECKING:
+    from unirender_evaluation.shard_scores import Scored
 
 
 @dataclass(frozen=True)
@@ -19,6 +23,8 @@ class BenchShards:
     """Folders that `unirender dataset` wrote: a row each."""
     checkpoint: Path | None = None
     """Folder of our model, or a shipped one by its name. None: tiny."""
+    against: Path | None = None
+    """Another model, likewise: tables of what ours has more than it, of the same pictures."""
     objects: int = 60
     """Drawn from each folder."""
     pairs: int = 2
@@ -28,7 +34,7 @@ class BenchShards:
     renders: bool = False
     """Render the pictures as well: from their true maps, and from those but s and d."""
     out: Path | None = None
-    """Markdown file for the table; None: it is printed only."""
+    """Markdown file for the tables; None: they are printed only."""
     device: Device = "cpu"
     """Where the model runs. auto: cuda, then mps, then cpu, whichever is there."""
 
@@ -45,25 +51,39 @@ class BenchShards:
             raise UsageError(f"--data {shown}: expected at least one folder, and none of them twice")
 
     def run(self) -> int:
-        """Prints the table; returns the exit status."""
+        """Prints the tables; returns the exit status."""
         self.check()
+        from rich.console import Console
+
+        from unirender.files import replace_file
+        from unirender_evaluation.shard_scores import minus, shard_tables
+
+        console = Console()
+        name, found = self._scored(self.checkpoint)
+        what = f"Up to {self.objects} objects a folder, {self.pairs} pictures each; one step, closed."
+        tables = shard_tables(found, f"Checkpoint {name}. {what}")
+        if self.against is not None:
+            other, base = self._scored(self.against)
+            tables += shard_tables(minus(found, base), f"Checkpoint {name} minus {other}. {what}", ": differences")
+        for table in tables:
+            table.show(console)
+        if self.out is not None:
+            replace_file(self.out, "\n".join(table.markdown() for table in tables))
+        return 0
+
+    def _scored(self, named: Path | None) -> "tuple[str, list[Scored]]":
+        """What a checkpoint is called in a note, and its scores of every folder's pictures."""
         from rich.console import Console
         from rich.progress import track
 
-        from unirender.files import checkpoint_sha256, replace_file
+        from unirender.files import checkpoint_sha256
         from unirender.shipped import checkpoint_folder
-        from unirender_evaluation.shard_scores import scored, shard_table
+        from unirender_evaluation.shard_scores import scored
 
-        console, errors = Console(), Console(stderr=True)
-        checkpoint = checkpoint_folder(self.checkpoint)
+        checkpoint, errors, found = checkpoint_folder(named), Console(stderr=True), []
         pipeline = ModelOptions(checkpoint, self.device, "float32", progress=False).load()
-        found = []
         for folder in self.data:
             pictures = scored(pipeline, folder, self.objects, self.pairs, self.seed, self.renders)
-            found += list(track(pictures, description=str(folder), console=errors, transient=True))
-        what = f"Checkpoint {checkpoint_sha256(checkpoint)[:12]}, one step, closed."
-        table = shard_table(found, f"{what} Up to {self.objects} objects a folder, {self.pairs} pictures each.")
-        table.show(console)
-        if self.out is not None:
-            replace_file(self.out, table.markdown())
-        return 0
+            described = f"{checkpoint.name}: {folder}"
+            found += list(track(pictures, description=described, console=errors, transient=True))
+        return checkpoint_sha256(checkpoint)[:12], found

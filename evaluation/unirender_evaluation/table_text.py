@@ -37,10 +37,10 @@ class TextTable:
         return "\n".join(lines) + "\n"
 
     def show(self, console: Console) -> None:
-        """Prints it to a terminal."""
+        """Prints it to a terminal; where that is narrow, what does not fit goes on below."""
         table = RichTable(title=escape(self.title), box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for index, name in enumerate(self.columns):
-            table.add_column(escape(name), justify="right" if index else "left")
+            table.add_column(escape(name), justify="right" if index else "left", overflow="fold")
         for section in self.sections:
             for row in section:
                 table.add_row(*map(escape, row))

@@ -12,7 +12,7 @@ from unirender.composite import composite_image
 from unirender.errors import UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.shard_scores import COLUMNS, RENDERS, scored, shard_table
+from unirender_evaluation.shard_scores import COLUMNS, RENDERS, minus, scored, shard_tables
 from unirender_evaluation.shard_scores_command import BenchShards
 
 SIZE = 16
@@ -65,7 +65,7 @@ def test_a_draw_is_of_its_seed_and_no_larger_than_asked(folder: Path) -> None:
 
 def test_the_table_has_a_row_for_each_folder_and_metallic(folder: Path) -> None:
     found = list(scored(Halves(), folder, objects=6, pairs=100, seed=0))
-    table = shard_table(found, "Halves.")
+    (table,) = shard_tables(found, "Halves.")
     (rows,) = table.sections
     assert [row[0] for row in rows] == [f"{folder}: all", "metallic 0", "metallic 0.5", "metallic 1"]
     metallic = 3 + list(COLUMNS).index("metallic MSE ↓")
@@ -75,16 +75,19 @@ def test_the_table_has_a_row_for_each_folder_and_metallic(folder: Path) -> None:
 
 
 class Painter(Halves):
-    """Renders the composite of what it is given, or black where s and d are left to it; remembers which."""
+    """Renders the composite of what it is given, or black where s and d are left to it; remembers which, and its
+    lights."""
 
     def __init__(self) -> None:
         super().__init__()
         self.given: list[bool] = []
+        self.lights: list[np.ndarray] = []
 
     def render(self, intrinsics: Intrinsics) -> np.ndarray:
         self.given.append(intrinsics.specular is not None)
         assert (intrinsics.specular is None) == (intrinsics.diffuse is None)
         assert intrinsics.environment is not None
+        self.lights.append(intrinsics.environment)
         return composite_image(intrinsics) if self.given[-1] else np.zeros_like(intrinsics.require("albedo")["albedo"])
 
 
@@ -96,16 +99,58 @@ def test_renders_are_scored_where_they_are_asked_for(folder: Path) -> None:
         given, light, closed = (one.scores[key] for key, _ in RENDERS.values())
         assert np.isfinite(closed)
         assert given > light
-    header = shard_table(found, "Painter.").columns
-    assert tuple(RENDERS) == header[-len(RENDERS) :]
-    assert not set(RENDERS) & set(shard_table(list(scored(method, folder, 1, 1, 0)), "Painter.").columns)
+    assert {light.shape for light in method.lights} == {(8, 16, 3)}  # as the shards have it, not as the model reads it
+    maps, renders = shard_tables(found, "Painter.")
+    assert maps.columns[3:] == tuple(COLUMNS)
+    assert renders.columns[3:] == tuple(RENDERS)
+    assert all("Painter." in table.notes[0] for table in (maps, renders))
+    assert "number" in maps.notes[0]
+    assert "closed form" in renders.notes[0]
+    assert len(shard_tables(list(scored(method, folder, 1, 1, 0)), "Painter.")) == 1
 
 
-def test_the_command_scores_the_shipped_model(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+class Thirds(Halves):
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray) -> Found:
+        third = np.full_like(mask, 1 / 3)
+        return Found(Intrinsics(metallic=third, roughness=third, mask=mask))
+
+
+def test_differences_are_of_the_same_pictures(folder: Path) -> None:
+    halves, thirds = (list(scored(method, folder, objects=4, pairs=2, seed=3)) for method in (Halves(), Thirds()))
+    with pytest.raises(ValueError, match="zip"):
+        minus(thirds, halves[1:])
+    for one in (found := minus(thirds, halves)):
+        assert one.metallic is not None
+        expected = (one.metallic - 1 / 3) ** 2 - (one.metallic - 0.5) ** 2
+        assert one.scores[metric_key("metallic", "mse_object")] == pytest.approx(expected, abs=1e-6)
+    assert [(one.group, one.metallic) for one in found] == [(one.group, one.metallic) for one in halves]
+
+
+def test_the_command_sets_a_model_against_another(folder: Path, tmp_path: Path) -> None:
+    BenchShards(data=(folder,), objects=2, pairs=1, renders=True, against=Path("tiny"), out=tmp_path / "t.md").run()
+    text = (tmp_path / "t.md").read_text()
+    assert text.count("###") == 4
+    maps, renders = (line.split(" | ") for line in text.split(": differences", 1)[1].splitlines() if ": all |" in line)
+    for cells in (maps, renders):
+        assert float(cells[3].split(" ")[0]) == 0  # albedo, and given: tiny against itself
+    assert " minus " in text
+
+
+@pytest.mark.parametrize("columns", [80, 200])
+def test_the_command_scores_the_shipped_model(
+    columns: int,
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
     assert BenchShards(data=(folder,), objects=1, pairs=1, renders=True, out=tmp_path / "t.md").run() == 0
     text = (tmp_path / "t.md").read_text()
     assert set(RENDERS) <= set(map(str.strip, text.split("|")))
-    assert "albedo" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "albedo" in printed
+    assert "…" not in printed  # nothing is cut off on a narrow terminal
     assert text.startswith("### Pictures of data sets")
     assert " nan" not in text
 
