@@ -24,6 +24,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 _CACHE = tempfile.TemporaryDirectory(prefix="unirender-test-cache-")
 os.environ["UNIRENDER_CACHE"] = _CACHE.name
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.pop("COLUMNS", None)  # tables have the width that they have where nobody watches, 80
 if "PYTEST_XDIST_WORKER" in os.environ:  # one core per worker, or the workers fight for them
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
