@@ -86,6 +86,12 @@ def test_every_fact_has_its_line_and_a_missing_fact_has_none(missing: str | None
     assert 'from_pretrained("pipeline")' in card
 
 
+def test_the_title_is_the_name_where_it_says_more_than_that_of_every_run() -> None:
+    assert "# unirender: tiny\n" in card_text("pipeline", FACTS)
+    assert "# unirender: mine\n" in card_text("mine", FACTS)
+    assert "# unirender\n" in card_text("best", {})
+
+
 def test_chosen_weights_say_that_their_scores_flatter_them() -> None:
     card = card_text("best", FACTS, CHOSEN)
     assert "chosen by albedo.psnr on these very scenes: its scores there flatter it" in card

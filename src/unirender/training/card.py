@@ -10,6 +10,7 @@ from typing import Any
 
 CARD_FILE = "README.md"
 TAGS = ("unirender", "diffusers", "inverse-rendering", "neural-rendering", "intrinsic-images", "relighting")
+OF_A_RUN = ("pipeline", "best")  # folders that every run has: the card is titled after the preset
 NO_LOSSES = ("step", "minutes", "samples_per_s", "grad_norm", "lr")  # entries of a line of losses that are none
 
 Facts = Mapping[str, Any]
@@ -19,11 +20,12 @@ def card_text(name: str, facts: Facts, chosen: Facts | None = None) -> str:
     """The card of a pipeline folder.
 
     Args:
-        name: of the folder, for the examples.
+        name: of the folder, for the title and the examples.
         facts: `training.json`: see `unirender.training.facts`; of older versions with fewer entries.
         chosen: `validation.json` of a pipeline that was kept for its scores.
     """
-    title = f"unirender: {facts['preset']}" if "preset" in facts else "unirender"
+    named = facts.get("preset") if name in OF_A_RUN else name
+    title = f"unirender: {named}" if named else "unirender"
     sections = [
         _front_matter(facts),
         f"# {title}\n\nA diffusion model that takes a picture of an object apart (albedo, normal, roughness, "
