@@ -13,7 +13,14 @@ from unirender.pipelines.derived_light import derived_diffuse, derived_light, de
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, TRUST, SeenShadows, forget_shadows, visible_shares
+from unirender.pipelines.shadowed_light import (
+    BEHIND,
+    SHADOW_SIDE,
+    TRUST,
+    SeenShadows,
+    forget_shadows,
+    visible_shares,
+)
 from unirender.symmetries import mirror, quarter_turn
 
 CAMERA = Camera()
@@ -117,13 +124,39 @@ def test_a_gutter_hides_what_its_other_side_stands_before() -> None:
     )
     angles = np.radians(np.arange(-89.5, 90))
     directions = np.stack([np.cos(angles), np.zeros_like(angles), np.sin(angles)])
-    visible = shadow.visible(slice(number, number + 1), directions)[0]
+    (hidden,), (behind,) = shadow.look(slice(number, number + 1), directions)
+    visible = ~hidden
     margin = 2 * math.pi / SECTORS
     assert visible[angles > rim + margin].all()
     assert not visible[(angles > horizon + 3 * margin) & (angles < rim - margin)].any()
+    assert behind[hidden].all()
+    assert not behind[angles > rim + margin].any()
     left = np.stack([-directions[0], directions[1], directions[2]])
     above = angles > -math.pi / 4 + margin  # its own plane rises to the left
-    assert shadow.visible(slice(number, number + 1), left)[0][above & (angles > math.pi / 4 + margin)].all()
+    hidden, behind = shadow.look(slice(number, number + 1), left)
+    assert not (hidden | behind)[0][above & (angles > math.pi / 4 + margin)].any()
+
+
+def test_what_lies_behind_a_thin_surface_may_be_hidden() -> None:
+    """A surface that leans to the right sees past the back of a narrow strip, if that is as thin as it looks."""
+    normal, mask = np.zeros((SIZE, SIZE, 3), np.float32), np.zeros((SIZE, SIZE, 1), np.float32)
+    leaning, strip = np.s_[:, 8:20], np.s_[:, 28:31]
+    normal[leaning], normal[strip] = (0.8, 0, 0.6), (0, 0, 1)
+    mask[leaning] = mask[strip] = 1
+    shadow = SelfShadow.of(normal, mask, CAMERA)
+    rows, columns = np.nonzero(shadow.where)
+    number = int(np.flatnonzero((rows == SIZE // 2) & (columns == 17))[0])
+    angles = np.radians(np.arange(-60.0, 30))  # of directions to the right: below 0 away from the viewer
+    right = np.stack([np.cos(angles), 0 * angles, np.sin(angles)]).astype(np.float32)
+    (hidden,), (behind,) = shadow.look(slice(number, number + 1), right)
+    assert 3 < hidden.sum() < 40
+    assert behind[hidden].all()
+    assert behind[: int(np.argmax(hidden))].all()  # all that is farther from the viewer
+    assert not (hidden | behind)[int(np.flatnonzero(hidden)[-1]) + 1 :].any()
+    dark = np.full((16, 32, 3), 1e-3, np.float32)
+    lamps = environment_directions(16, 32) @ np.array([0.8, 0, -0.6]) > 0.9  # behind the strip, below what it hides
+    share = visible_shares(as_maps(normal, mask), np.where(lamps[..., None], 5, dark).astype(np.float32), ["diffuse"])
+    assert share["diffuse"][SIZE // 2, 17].mean() == pytest.approx(1 - BEHIND, abs=0.12)
 
 
 def test_the_light_of_a_gutter_is_less_where_it_is_hidden() -> None:

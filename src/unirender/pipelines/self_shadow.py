@@ -5,6 +5,9 @@ of directions: of the angle theta between them and the direction v to the viewer
 mask of 64 bits for each half plane says which of its directions are hidden (Therrien et al. 2023, "Screen space
 indirect lighting with visibility bitmask"). Depth comes from the normals (`unirender.pipelines.normal_integration`).
 
+How thick surfaces are no picture says. So a second mask has what they would hide if all behind them were solid: what
+only that one has may be hidden or not.
+
 What the picture does not show hides nothing here: the back of the object, and what lies outside the frame.
 """
 
@@ -25,7 +28,7 @@ STEPS = 24  # along each line, ever longer ones
 NEAREST = 1.5  # pixels: the first step
 FARTHEST = 0.8  # of the frame's longer side: the last one
 CUT = 4.0  # widths of a pixel by which the depths of neighbours differ where one surface ends in front of another
-ROUNDNESS = 1.0  # times its distance from where it ends is as thick as a surface is taken to be there: a rod is round
+ROUNDNESS = 2.0  # times its distance from where it ends is as thick as a surface is taken to be there
 THICKENING = 0.05  # by so much more for each unit of distance: directions between two steps
 LEAST_RISE = 0.05  # sine of the angle above the surface below which it does not hide itself
 COVERED = 0.5  # coverage from which a pixel is a surface that hides others
@@ -39,11 +42,13 @@ class SelfShadow:
     Attributes:
         where: pixels of a surface, covered by half or more; p of them, in the order of the picture.
         hidden: for each of these pixels and each half plane a mask, bit by bit of theta.
+        behind: the same of what lies in or behind what hides.
         ray: the pixels' rays (x, y, -1).
     """
 
     where: Bool[np.ndarray, "h w"]
     hidden: UInt64[np.ndarray, "p a"]
+    behind: UInt64[np.ndarray, "p a"]
     ray: Float[np.ndarray, "p 3"]
 
     @classmethod
@@ -59,20 +64,22 @@ class SelfShadow:
         rays = camera.rays(*surface.shape)
         rays = rays / -rays[..., 2:]
         depth = integrate_normals(normal, surface, camera)
-        hidden = np.zeros((int(surface.sum()), HALF_PLANES), np.uint64)
+        hidden, behind = np.zeros((2, int(surface.sum()), HALF_PLANES), np.uint64)
         if surface.any():
-            hidden = _hidden(normal[surface], rays, depth, surface, camera)
-        return cls(surface, hidden, rays[surface].astype(np.float32))
+            hidden, behind = _hidden(normal[surface], rays, depth, surface, camera)
+        return cls(surface, hidden, behind, rays[surface].astype(np.float32))
 
     def where_hidden(self) -> "SelfShadow":
         """Of the pixels alone from which something is hidden."""
-        some = self.hidden.any(axis=1)
+        some = self.behind.any(axis=1)
         where = np.zeros_like(self.where)
         where[self.where] = some
-        return SelfShadow(where, self.hidden[some], self.ray[some])
+        return SelfShadow(where, self.hidden[some], self.behind[some], self.ray[some])
 
-    def visible(self, part: slice, directions: Float[np.ndarray, "3 m"]) -> Bool[np.ndarray, "q m"]:
-        """Whether nothing stands between pixels and directions.
+    def look(
+        self, part: slice, directions: Float[np.ndarray, "3 m"]
+    ) -> tuple[Bool[np.ndarray, "q m"], Bool[np.ndarray, "q m"]]:
+        """Which directions are hidden from pixels, and which lie behind what hides: these and others.
 
         Args:
             part: of the p pixels.
@@ -85,8 +92,9 @@ class SelfShadow:
         plane = np.round(azimuth * (HALF_PLANES / (2 * math.pi))).astype(np.int64) % HALF_PLANES
         theta = np.arccos(np.clip(view @ directions, -1, 1))
         sector = np.minimum(theta * (SECTORS / math.pi), SECTORS - 1).astype(np.uint64)
-        masks = np.take_along_axis(self.hidden[part], plane, axis=1)
-        return (masks >> sector) & np.uint64(1) == 0
+        masks = (np.take_along_axis(of[part], plane, axis=1) for of in (self.hidden, self.behind))
+        hidden, behind = ((mask >> sector) & np.uint64(1) == 1 for mask in masks)
+        return hidden, behind
 
     def parts(self, directions: int) -> Iterator[slice]:
         """Pixels that fit into memory together with so many directions."""
@@ -100,8 +108,8 @@ def _hidden(
     depth: Float[np.ndarray, "h w"],
     surface: Bool[np.ndarray, "h w"],
     camera: Camera,
-) -> UInt64[np.ndarray, "p a"]:
-    """The masks of the pixels of a surface."""
+) -> UInt64[np.ndarray, "2 p a"]:
+    """The masks of the pixels of a surface: hidden, and behind."""
     height, width = depth.shape
     row, column = (index.astype(np.float32) for index in np.nonzero(surface))
     width_of_pixel = 2 * math.tan(math.radians(camera.fov_deg) / 2) / height  # at distance 1
@@ -110,7 +118,7 @@ def _hidden(
     points = (rays * np.where(surface, depth, 0)[..., None]).astype(np.float32)
     at = points[surface]
     view = -at / np.linalg.norm(at, axis=1, keepdims=True)
-    hidden = np.zeros((len(at), HALF_PLANES), np.uint64)
+    masks = np.zeros((2, len(at), HALF_PLANES), np.uint64)
     for plane in range(HALF_PLANES):
         right, up = math.cos(2 * math.pi * plane / HALF_PLANES), math.sin(2 * math.pi * plane / HALF_PLANES)
         for distance in np.geomspace(NEAREST, max(FARTHEST * max(height, width), 2 * NEAREST), STEPS):
@@ -129,8 +137,9 @@ def _hidden(
             behind = towards + away * deep[:, None]
             first = _sector((towards * view[there]).sum(axis=1) / length)
             last = _sector((behind * view[there]).sum(axis=1) / np.linalg.norm(behind, axis=1))
-            hidden[there, plane] |= _bits(first, last)
-    return hidden
+            masks[0, there, plane] |= _bits(first, last)
+            masks[1, there, plane] |= _bits(first, np.full_like(first, SECTORS))
+    return masks
 
 
 def _distance_to_ends(

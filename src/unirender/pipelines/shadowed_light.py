@@ -2,9 +2,10 @@
 
     d = d_0 (integral of V L n.l) / (integral of L n.l),    s = s_0 (integral of V L D n.l) / (integral of L D n.l)
 
-Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V = 1 - `TRUST` in hidden directions and
-else 1; D the GGX distribution at the half vector, of a roughness of `LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE`
-pixels d is linear in the light; s is only as far as a lobe has one light.
+Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V = 1 - `TRUST` in hidden directions,
+1 - `BEHIND` in others behind what hides, and else 1; D the GGX distribution at the half vector, of a roughness of
+`LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE` pixels d is linear in the light; s is only as far as a lobe has one
+light.
 """
 
 import functools
@@ -12,7 +13,7 @@ import hashlib
 from collections.abc import Callable, Collection
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from unirender.intrinsics import Intrinsics
@@ -22,7 +23,8 @@ from unirender.pipelines.self_shadow import SelfShadow
 from unirender.surface_light import QUADRATURE_SHAPE
 
 SHADOW_SIDE = 128  # pixels along the longer side at which shadows of larger pictures are found
-TRUST = 0.75  # of what seems hidden so much is taken away: depth from normals is a guess where surfaces overlap
+TRUST = 0.85  # of what seems hidden so much is taken away: depth from normals is a guess where surfaces overlap
+BEHIND = 0.35  # of what would be hidden if surfaces were solid behind: how thick they are no picture says
 KEPT = 2  # pictures; what is hidden in one takes tens of megabytes and seconds
 LEAST_ROUGHNESS = 0.3  # below it a lobe is narrower than the texels over which shadows are integrated
 
@@ -85,7 +87,7 @@ class SeenShadows:
         self._view = -shadow.ray / np.linalg.norm(shadow.ray, axis=1, keepdims=True)
         self._directions = texel_directions(QUADRATURE_SHAPE)
         parts = shadow.parts(self._directions.shape[1])
-        self._parts = [(part, ~shadow.visible(part, self._directions)) for part in parts]
+        self._parts = [(part, _percent_lost(*shadow.look(part, self._directions))) for part in parts]
 
     def diffuse_share(self, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
         """What is left of d; [0, 1]."""
@@ -110,9 +112,9 @@ class SeenShadows:
         """What is left where directions count by `lobe` and their cosine."""
         _, radiance = texels(environment, QUADRATURE_SHAPE)
         found = np.ones_like(self._n)
-        for part, hidden in self._parts:
+        for part, percent in self._parts:
             weight = np.maximum(self._n[part] @ self._directions, 0) * lobe(part)
-            total, lost = weight @ radiance, TRUST * ((weight * hidden) @ radiance)
+            total, lost = weight @ radiance, (weight * percent) @ radiance / 100
             found[part] -= np.clip(np.divide(lost, total, out=np.zeros_like(total), where=total > 0), 0, 1)
         share = np.ones(self._size, found.dtype)
         share[self._where] = found
@@ -121,6 +123,11 @@ class SeenShadows:
             return share
         # what is lost, and not what is left: where the small size has no coverage nothing is known to be
         return 1 - self._frame.leave_map(1 - share, self._mask)
+
+
+def _percent_lost(hidden: Bool[np.ndarray, "q m"], behind: Bool[np.ndarray, "q m"]) -> UInt8[np.ndarray, "q m"]:
+    """1 - V of directions in percent: there are many, and a byte is enough."""
+    return np.where(hidden, np.uint8(round(100 * TRUST)), np.where(behind, np.uint8(round(100 * BEHIND)), np.uint8(0)))
 
 
 def _edge(
