@@ -84,6 +84,7 @@ def test_nothing_is_computed_or_written(config: BenchConfig, monkeypatch: pytest
         jobs(config)[0].make()
 
 
+@pytest.mark.long
 def test_one_more_method_is_all_that_is_new(config: BenchConfig, tmp_path: Path) -> None:
     """A row of a stranger beside stored ones."""
     for label in dict.fromkeys(job.label for job in jobs(config)):

@@ -19,6 +19,8 @@ from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.training_study_run import TrainingStudy, run
 from unirender_evaluation.training_study_tables import COLUMNS, cells, table
 
+pytestmark = pytest.mark.long
+
 ROWS = (
     Choice(PLAIN, "", "Plain model", TRAIN),
     Choice("seed", "chance", "another seed", replace(TRAIN, seed=1)),

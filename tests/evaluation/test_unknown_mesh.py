@@ -24,6 +24,8 @@ from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.transport_config import TransportConfig
 
+pytestmark = pytest.mark.long
+
 SETTINGS = MultiviewSettings(seen=4, held_out=1, spp=16, truth_spp=16, buffer_spp=16)
 CONFIG = OptimizeConfig(
     transport=TransportConfig(materials="one", pixels=150, iterations=1, rounds=0),

@@ -48,6 +48,7 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_half_of_the_lights_or_all_or_those_of_another_side(folder: Path, tmp_path: Path) -> None:
     half = [light["provenance"]["kind"] for light, _ in made(tmp_path / "half", folder, pairs=8)]
     assert 0 < half.count("pool") < len(half)

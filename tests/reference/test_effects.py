@@ -114,7 +114,7 @@ def test_total_adds_radiance_and_variance_and_keeps_alpha() -> None:
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-@pytest.mark.parametrize("shape", ["torus", "assembly"])
+@pytest.mark.parametrize("shape", [pytest.param("torus", marks=pytest.mark.long), "assembly"])
 def test_effects_add_up_to_the_full_render(shape: str, material: str, torus: Renderer) -> None:
     roughness, metallic = MATERIALS[material]
     if shape == "assembly":

@@ -199,6 +199,7 @@ def test_tails_of_a_picture() -> None:
     assert tails.mean_srgb == pytest.approx((5 * 0.7354 + 1 + (2 * 0.7354 + 1) / 3 + 12.92e-4) / 8, abs=1e-3)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_gauge_keeps_pictures_between_black_and_white(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
     scenes = list(Exposure(objects=5, lights=3, spp=32, seed=1).scenes())

@@ -235,6 +235,7 @@ def test_the_command_judges_what_it_measured(measured: tuple[float, ...], status
     assert f"min {min(measured):.2f} dB" in lines[0]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_command_measures_images_and_lists_those_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     """Two images at a floor that is easy to reach, and none at one that is not."""

@@ -215,6 +215,7 @@ def test_envmap_parameter_is_what_mitsuba_makes_of_a_bitmap() -> None:
     np.testing.assert_array_equal(np.array(mi.traverse(emitter)["data"]), envmap_data(light))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("buffer", ["image", "diffuse", "specular"])
 def test_stated_variance_is_the_variance_between_seeds(buffer: str) -> None:
     """Chi-square of the spread of 24 estimates against the variance that they state."""

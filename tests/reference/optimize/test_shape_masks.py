@@ -289,6 +289,7 @@ def _torus() -> MeshObject:
     return MeshObject("torus", "torus", vertices @ turn, faces, normals @ turn, None, np.full(3, 0.5, np.float32))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_reconstruction_of_a_torus_from_masks() -> None:
     torus = _torus()
