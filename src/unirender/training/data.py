@@ -33,16 +33,7 @@ from unirender.training.augment import (
     permute_channels,
 )
 from unirender.training.derived import DerivedLight, open_derived
-from unirender.training.groups import (
-    SCALAR_CHANNELS,
-    Group,
-    Pair,
-    Shard,
-    group_environments,
-    list_shards,
-    open_packed,
-    read_groups,
-)
+from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed, read_environments
 from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
 
@@ -167,8 +158,7 @@ class GroupDataset:
 
     @functools.lru_cache(maxsize=1)  # noqa: B019 - a dataset lives as long as what reads it
     def _whole_lights(self, shard: int) -> dict[str, list[Float[np.ndarray, "eh ew 3"]]]:
-        path = self._paths[shard]
-        return {key: group_environments(members, f"{path}: group {key}") for key, members in read_groups(path)}
+        return dict(read_environments(self._paths[shard]))
 
     def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
         """Sample number `index` of the stream: `[h w c]` float32 maps by the names of a batch."""

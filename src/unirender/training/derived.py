@@ -28,7 +28,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
-from unirender.training.groups import Group, Shard, group_environments, read_groups
+from unirender.training.groups import Group, Shard, read_environments
 
 logger = logging.getLogger(__name__)
 
@@ -91,10 +91,10 @@ def _derive(path: Path, shard: Shard) -> None:
     groups = {group.key: group for group in shard.groups}
     pixels: list[Float16[np.ndarray, "2 3 h w"]] = []
     rows = np.full(len(shard.pixels), -1, dtype=np.int32)
-    for key, members in read_groups(path):
+    for key, lights in read_environments(path):
         if key not in groups:
             raise UnirenderError(f"{path}: group {key} is not in the packed shard; delete it from the cache")
-        for row, light in _of_group(shard, groups[key], group_environments(members, f"{path}: group {key}")):
+        for row, light in _of_group(shard, groups[key], lights):
             rows[row] = len(pixels)
             pixels.append(light)
     with cached_folder(folder) as made:

@@ -168,15 +168,16 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
         yield key, members
 
 
-def group_environments(members: dict[str, bytes], where: str) -> list[Float[np.ndarray, "eh ew 3"]]:
-    """A group's lights at their stored resolution, in the order of their rows in a packed shard.
+def read_environments(path: str | Path) -> Iterator[tuple[str, list[Float[np.ndarray, "eh ew 3"]]]]:
+    """Yields (key, lights at their stored resolution, in the order of their rows in the packed shard) of a tar shard.
 
-    Args:
-        members: as `read_groups` yields them.
-        where: what errors call the group.
+    Raises:
+        UnirenderError: as `read_groups`, or a light is no readable EXR.
     """
-    names = sorted(name for name in members if name.endswith(".environment.exr"))
-    return [channels_rgb(read_exr_bytes(members[name], name=f"{where}.{name}")[0]) for name in names]
+    for key, members in read_groups(path):
+        names = sorted(name for name in members if name.endswith(".environment.exr"))
+        files = ((members[name], f"{path}: group {key}.{name}") for name in names)
+        yield key, [channels_rgb(read_exr_bytes(data, name=name)[0]) for data, name in files]
 
 
 def open_packed(path: str | Path, sha256: str | None = None, name: str | None = None) -> Shard:
