@@ -135,6 +135,7 @@ NOT_IN_RECORDS = (
     "sheets",
     "sweep*",
     "versions",
+    "visibility",
     "workers",
 )
 # Commands and files of the optimiser: what it finds does not depend on them.
@@ -156,7 +157,7 @@ PARTS: Mapping[str, Part] = {
     ),
     MODEL: Part(
         {
-            "unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py"),
+            "unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py", "checkpoints/*.safetensors"),
             "unirender_evaluation": tuple(f"{name}.py" for name in ADAPTERS),
         },
         ("torch", "diffusers", "transformers"),

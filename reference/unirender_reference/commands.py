@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 SHOWN_FAILURES = 20
 SHOWN_LIGHTS = 5
-DEFAULT_PAIRS = {"paper": 121, "sweep": 121}
+DEFAULT_PAIRS = {"paper": 121, "sweep": 121, "visibility": 1}
 OTHER_PAIRS, PAIRS_OF_MAPS = 36, 8
 
 _log = logging.getLogger("unirender.dataset")
@@ -29,7 +29,7 @@ class Dataset:
     out: Path
     """Folder for the shards and `manifest.json`; of a recipe, for a folder of each part."""
     recipe: str | None = None
-    """A training set in parts: train-64, train-128, or a TOML file. It takes the place of all options but
+    """A training set in parts: train-64, train-128, visibility, or a TOML file. It takes the place of all options but
     --assets, --workers, --cluster and --verify."""
     assets: Path | None = None
     """Folder of the mesh and light folders that a recipe names."""
@@ -48,9 +48,10 @@ class Dataset:
     with --materials maps."""
     resolution: int = 64
     """Pixels along each side."""
-    vary: Literal["basis", "independent", "one-at-a-time", "paper", "sweep"] | None = None
+    vary: Literal["basis", "independent", "one-at-a-time", "paper", "sweep", "visibility"] | None = None
     """What changes inside a group. paper: metallic x roughness on an 11 x 11 grid, a light each; sweep: the same grid
-    under one light, from 33 renders. None: basis; independent with --materials maps."""
+    under one light, from 33 renders; visibility: no pictures, but which directions objects hide from themselves, for
+    `unirender train-visibility`. None: basis; independent with --materials maps."""
     materials: Literal["scalar", "maps"] = "scalar"
     """scalar: one roughness and metallic per picture, whatever the object has; maps: the object's own maps, each pair
     under another light."""

@@ -11,7 +11,7 @@ from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
 if TYPE_CHECKING:
     from unirender_reference.lights import LightPool
 
-Vary = Literal["basis", "independent", "one-at-a-time", "paper", "sweep"]
+Vary = Literal["basis", "independent", "one-at-a-time", "paper", "sweep", "visibility"]
 Materials = Literal["scalar", "maps"]
 Split = Literal["train", "test"]
 MAX_LIGHTS = 8
@@ -127,6 +127,13 @@ class DatasetConfig:
             )
 
     def _check_noise(self) -> None:
+        if self.vary == "visibility":
+            given = {"noise-floor": self.noise_floor is not None, "denoise": self.denoise, "lights": self.lights}
+            if names := [name for name, value in given.items() if value]:
+                raise UnirenderError(
+                    f"dataset --{names[0]}: got it with --vary visibility, which has no lights and no pictures; "
+                    "expected none"
+                )
         if self.noise_floor is not None and not 0 < self.noise_floor <= MOST_FLOOR_DB:
             raise UnirenderError(
                 f"dataset noise floor: got {self.noise_floor} dB, expected more than 0 and at most {MOST_FLOOR_DB:g}"
@@ -204,6 +211,10 @@ def _check_pairs(vary: str, pairs: int) -> None:
         raise UnirenderError(f"dataset vary: got {vary!r}, expected one of {', '.join(get_args(Vary))}")
     if vary == "basis":
         basis_shape(pairs)
+    if vary == "visibility" and pairs != 1:
+        raise UnirenderError(
+            f"dataset pairs: got {pairs} with --vary visibility, which renders no pictures; leave --pairs out"
+        )
     if vary in ("paper", "sweep") and pairs != len(GRID) ** 2:
         raise UnirenderError(f"dataset pairs: got {pairs}, expected {len(GRID) ** 2} with --vary {vary}")
     if vary == "independent" and pairs > PERCENTS**2:

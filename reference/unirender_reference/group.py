@@ -19,6 +19,7 @@ from unirender_reference.processes import time_limit
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
 from unirender_reference.shards import RenderedGroup
+from unirender_reference.visibility import visibility_members
 
 LOAD_SECONDS = 600.0
 
@@ -38,17 +39,21 @@ def render(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
         with time_limit(LOAD_SECONDS, "loading it"):
             obj = _load(config, plan)
             renderer = Renderer(_turned(obj, plan) if config.turn_objects else obj, resolution=config.resolution)
-        group = GroupMembers(config, plan, renderer)
-        group.render(lights)
+        if config.vary == "visibility":
+            members, floor, negative_pixels = visibility_members(plan, renderer), None, 0
+        else:
+            group = GroupMembers(config, plan, renderer)
+            group.render(lights)
+            members, floor, negative_pixels = group.members, group.floor_count(), group.negative_pixels
     return RenderedGroup(
         key=f"{renderer.obj.name}_g{plan.number}",
-        members=group.members,
+        members=members,
         samples=plan.samples,
         nan_pixels=renderer.counters.nan_pixels,
         render_seconds=renderer.counters.render_seconds,
         seconds=time.perf_counter() - start,
-        floor=group.floor_count(),
-        negative_pixels=group.negative_pixels,
+        floor=floor,
+        negative_pixels=negative_pixels,
         unreadable_lights=tuple(sorted({line for light in lights for line in _skipped(light)})),
     )
 

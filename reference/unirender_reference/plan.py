@@ -10,6 +10,7 @@ Roughness and metallic are whole percents, since they stand in member names.
 | one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's) |
 | paper | 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
 | sweep | the same 121 pairs under one light |
+| visibility | no pictures and no lights: which directions the object hides from itself (`visibility`) |
 
 Every object has equally many groups, so the plan is indexed, not stored: its size does not grow with the data set.
 """
@@ -143,6 +144,8 @@ def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lig
         yield "object", [_light(rng, materials) for _ in range(count)]
     elif config.vary == "sweep":
         yield "object light", [_light(rng, tuple((r, m) for m in GRID for r in GRID))]
+    elif config.vary == "visibility":
+        yield "object", []
     elif config.vary == "independent":
         for pairs in _chunks(_materials(rng, config.pairs), MAX_LIGHTS):
             yield "object", [_light(rng, (pair,)) for pair in pairs]

@@ -29,6 +29,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.models.lean_imports import lean_imports
 from unirender.options import notice
 from unirender.training.run import Train
+from unirender.training.visibility import TrainVisibility
 from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
 from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
@@ -96,6 +97,7 @@ Command = (
     | Annotated[Meshes, tyro.conf.subcommand("meshes")]
     | Annotated[Reference, tyro.conf.subcommand("reference")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[TrainVisibility, tyro.conf.subcommand("train-visibility")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Figures, tyro.conf.subcommand("figures")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
@@ -107,6 +109,7 @@ READER_LEFT = 141  # as a shell reports SIGPIPE
 RESUMABLE = (
     Dataset,
     Train,
+    TrainVisibility,
     BenchRun,
     BenchTruth,
     BenchDerivedLight,

@@ -75,7 +75,7 @@ def test_standard_is_a_third_real_and_its_constant_scores_a_tenth() -> None:
     assert all(first[0] != second[0] for first, second in zip(assigned[::2], assigned[1::2], strict=True))
 
 
-@pytest.mark.parametrize("recipe", ["train-64", "train-128"])
+@pytest.mark.parametrize("recipe", ["train-64", "train-128", "visibility"])
 def test_no_mesh_of_standard_is_in_a_training_recipe(recipe: str, tmp_path: Path) -> None:
     """The suite lists all catalogues at once, a recipe each for itself: both must count alike, at any depth."""
     catalogues = ("BlendSwap-CC-0", "BlendSwap-CC-BY", "KatorLegaz", "Reallusion", "Scopia")

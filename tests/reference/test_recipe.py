@@ -36,7 +36,7 @@ def recipe(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["train-64", "train-128"])
+@pytest.mark.parametrize("name", ["train-64", "train-128", "visibility"])
 def test_the_package_s_recipes_leave_the_test_meshes_out(name: str, tmp_path: Path) -> None:
     made = read_recipe(name)
     catalogues = {str(part["meshes"]) for part in made.parts.values() if "meshes" in part}
@@ -46,7 +46,7 @@ def test_the_package_s_recipes_leave_the_test_meshes_out(name: str, tmp_path: Pa
         (tmp_path / catalogue).mkdir()
     parts = Dataset(out=tmp_path / "out", recipe=name, assets=tmp_path).parts()
     assert all(part.holdout == 8 and part.split == "train" for part in parts.values() if part.meshes is not None)
-    assert {part.resolution for part in parts.values()} == {int(name.removeprefix("train-"))}
+    assert {part.resolution for part in parts.values()} == {64 if name == "train-64" else 128}
 
 
 def test_every_part_is_rendered_into_a_folder_of_its_own(recipe: Path, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_all_parts_are_checked_before_anything_is_rendered(recipe: Path, tmp_pat
     refused(UsageError, r"--resolution: got it beside --recipe", resolution=32)
     refused(UsageError, "needs the folders shapes; pass --assets", assets=None)
     refused(UnirenderError, r"no folder shapes in it.*a shop for meshes", assets=tmp_path / "out")
-    refused(UsageError, "expected one of train-128, train-64", recipe="train-65")
+    refused(UsageError, "expected one of train-128, train-64, visibility", recipe="train-65")
     refused(UsageError, "--assets: got it without --recipe", recipe=None)
     recipe.write_text(RECIPE.replace("pairs = 6", "pairs = 7"))
     refused(UsageError, "part real: dataset pairs: got 7")

@@ -8,7 +8,8 @@ indirect lighting with visibility bitmask"). Depth comes from the normals (`unir
 How thick surfaces are no picture says. So a second mask has what they would hide if all behind them were solid: what
 only that one has may be hidden or not.
 
-What the picture does not show hides nothing here: the back of the object, and what lies outside the frame.
+What the picture does not show is in neither mask: the back of the object, and what lies outside the frame. What the
+masks are worth, and what they miss, a network has learned (`unirender.models.visibility`).
 """
 
 import math
@@ -16,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt64
+from jaxtyping import Bool, Float, UInt8, UInt64
 from scipy.ndimage import distance_transform_edt
 
 from unirender.camera import Camera
@@ -44,12 +45,14 @@ class SelfShadow:
         hidden: for each of these pixels and each half plane a mask, bit by bit of theta.
         behind: the same of what lies in or behind what hides.
         ray: the pixels' rays (x, y, -1).
+        depth: along the view axis, up to a factor; NaN where there is no surface.
     """
 
     where: Bool[np.ndarray, "h w"]
     hidden: UInt64[np.ndarray, "p a"]
     behind: UInt64[np.ndarray, "p a"]
     ray: Float[np.ndarray, "p 3"]
+    depth: Float[np.ndarray, "h w"]
 
     @classmethod
     def of(cls, normal: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], camera: Camera) -> "SelfShadow":
@@ -67,14 +70,7 @@ class SelfShadow:
         hidden, behind = np.zeros((2, int(surface.sum()), HALF_PLANES), np.uint64)
         if surface.any():
             hidden, behind = _hidden(normal[surface], rays, depth, surface, camera)
-        return cls(surface, hidden, behind, rays[surface].astype(np.float32))
-
-    def where_hidden(self) -> "SelfShadow":
-        """Of the pixels alone from which something is hidden."""
-        some = self.behind.any(axis=1)
-        where = np.zeros_like(self.where)
-        where[self.where] = some
-        return SelfShadow(where, self.hidden[some], self.behind[some], self.ray[some])
+        return cls(surface, hidden, behind, rays[surface].astype(np.float32), depth)
 
     def look(
         self, part: slice, directions: Float[np.ndarray, "3 m"]
@@ -95,6 +91,11 @@ class SelfShadow:
         masks = (np.take_along_axis(of[part], plane, axis=1) for of in (self.hidden, self.behind))
         hidden, behind = ((mask >> sector) & np.uint64(1) == 1 for mask in masks)
         return hidden, behind
+
+    def classes(self, part: slice, directions: Float[np.ndarray, "3 m"]) -> UInt8[np.ndarray, "q m"]:
+        """For each direction its number in `unirender.models.visibility.CLASSES`; arguments: `look`."""
+        hidden, behind = self.look(part, directions)
+        return np.where(hidden, np.uint8(0), np.where(behind, np.uint8(1), np.uint8(2)))
 
     def parts(self, directions: int) -> Iterator[slice]:
         """Pixels that fit into memory together with so many directions."""

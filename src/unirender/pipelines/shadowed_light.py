@@ -2,10 +2,10 @@
 
     d = d_0 (integral of V L n.l) / (integral of L n.l),    s = s_0 (integral of V L D n.l) / (integral of L D n.l)
 
-Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V = 1 - `TRUST` in hidden directions,
-1 - `BEHIND` in others behind what hides, and else 1; D the GGX distribution at the half vector, of a roughness of
-`LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE` pixels d is linear in the light; s is only as far as a lobe has one
-light.
+Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V how likely a direction is free, by what
+masks say of it and what a network has learned of them (`unirender.models.visibility`); D the GGX distribution at the
+half vector, of a roughness of `LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE` pixels d is linear in the light; s is only
+as far as a lobe has one light.
 """
 
 import functools
@@ -18,13 +18,12 @@ from scipy.ndimage import distance_transform_edt
 
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions, texels
+from unirender.models.visibility import bin_weights, direction_bins, hidden_chance
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.surface_light import QUADRATURE_SHAPE
 
 SHADOW_SIDE = 128  # pixels along the longer side at which shadows of larger pictures are found
-TRUST = 0.85  # of what seems hidden so much is taken away: depth from normals is a guess where surfaces overlap
-BEHIND = 0.35  # of what would be hidden if surfaces were solid behind: how thick they are no picture says
 KEPT = 2  # pictures; what is hidden in one takes tens of megabytes and seconds
 LEAST_ROUGHNESS = 0.3  # below it a lobe is narrower than the texels over which shadows are integrated
 
@@ -79,15 +78,13 @@ class SeenShadows:
             self._frame = Frame(surface.height, surface.width, SHADOW_SIDE)
             surface = self._frame.enter_intrinsics(surface)
         normal, mask = surface.require("normal", "mask").values()
-        everywhere = SelfShadow.of(normal, mask, surface.camera)
-        self._edge, self._nearest = _edge(everywhere.where, mask[..., 0] > 0)
-        shadow = everywhere.where_hidden()
+        shadow = SelfShadow.of(normal, mask, surface.camera)
+        self._edge, self._nearest = _edge(shadow.where, mask[..., 0] > 0)
         self._where, self._size = shadow.where, normal.shape
         self._n = normal[shadow.where]
         self._view = -shadow.ray / np.linalg.norm(shadow.ray, axis=1, keepdims=True)
         self._directions = texel_directions(QUADRATURE_SHAPE)
-        parts = shadow.parts(self._directions.shape[1])
-        self._parts = [(part, _percent_lost(*shadow.look(part, self._directions))) for part in parts]
+        self._parts = _percent_hidden(shadow, normal, self._directions)
 
     def diffuse_share(self, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
         """What is left of d; [0, 1]."""
@@ -125,9 +122,26 @@ class SeenShadows:
         return 1 - self._frame.leave_map(1 - share, self._mask)
 
 
-def _percent_lost(hidden: Bool[np.ndarray, "q m"], behind: Bool[np.ndarray, "q m"]) -> UInt8[np.ndarray, "q m"]:
-    """1 - V of directions in percent: there are many, and a byte is enough."""
-    return np.where(hidden, np.uint8(round(100 * TRUST)), np.where(behind, np.uint8(round(100 * BEHIND)), np.uint8(0)))
+def _percent_hidden(
+    shadow: SelfShadow, normal: Float[np.ndarray, "h w 3"], directions: Float[np.ndarray, "3 m"]
+) -> list[tuple[slice, UInt8[np.ndarray, "q m"]]]:
+    """1 - V of directions in percent, for parts of the pixels: there are many, and a byte is enough."""
+    if not shadow.where.any():
+        return []
+    n = normal[shadow.where]
+    parts = list(shadow.parts(directions.shape[1]))
+    classes = [shadow.classes(part, directions) for part in parts]
+    weight = [
+        bin_weights(np.maximum(n[part] @ directions, 0), of_part, directions)
+        for part, of_part in zip(parts, classes, strict=True)
+    ]
+    chance = hidden_chance(normal, shadow.where, shadow.depth, np.concatenate(weight))
+    percent = np.round(100 * chance).astype(np.uint8)
+    bins = direction_bins(directions)
+    return [
+        (part, percent[part][np.arange(len(of_part))[:, None], of_part, bins])
+        for part, of_part in zip(parts, classes, strict=True)
+    ]
 
 
 def _edge(

@@ -1,0 +1,97 @@
+"""Which directions an object hides from its own surfaces, by traced rays: what a network of its shadows learns from.
+
+A group of `--vary visibility` has no lights and no pictures: `shared.exr` (albedo, normal, mask) and `visible.npy`, for
+each pixel that is covered by half or more, in the order of the picture, one bit for each direction (uint8 [p, 64],
+`numpy.packbits`). The directions are those of a lat-long map of `DIRECTIONS` texels, in camera axes, row by row. One
+ray each, from a point of the surface drawn within the pixel: a bit is 1 where the ray meets nothing. `json` says the
+rest.
+"""
+
+import io
+import json
+import time
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from unirender.exr import exr_bytes, intrinsics_channels
+from unirender.lighting import environment_directions
+from unirender_reference.backend import mitsuba
+from unirender_reference.passes import derive_seed
+from unirender_reference.plan import GroupPlan
+from unirender_reference.render import Renderer, renderer_provenance
+
+DIRECTIONS = (16, 32)
+GEOMETRY_SPP = 25
+COVERED = 0.5
+_RAYS = 1 << 21  # at a time
+
+
+def visibility_members(plan: GroupPlan, renderer: Renderer) -> dict[str, bytes]:
+    """The encoded files of a group by name.
+
+    Args:
+        plan: of the group.
+        renderer: of its object, at the contract's camera.
+    """
+    start = time.perf_counter()
+    geometry = renderer.geometry(GEOMETRY_SPP, derive_seed(plan.render_seed, "shared"))
+    mask = geometry.require("mask")["mask"]
+    visible = trace_visible(renderer, mask[..., 0] >= COVERED, derive_seed(plan.render_seed, "visibility"))
+    renderer.counters.render_seconds += time.perf_counter() - start
+    stored = io.BytesIO()
+    np.save(stored, np.packbits(visible, axis=1))
+    header = {**renderer_provenance(renderer), "spp": str(GEOMETRY_SPP), "seed": str(plan.render_seed)}
+    record = {
+        **header,
+        "family": renderer.obj.family,
+        "vary": "visibility",
+        "camera": {"fov_deg": renderer.camera.fov_deg, "principal": list(renderer.camera.principal)},
+        "coverage": round(float(mask.mean()), 6),
+        "directions": list(DIRECTIONS),
+        "object_provenance": dict(renderer.obj.provenance),
+    }
+    if plan.mesh is not None:
+        record["file"] = plan.mesh.name
+    return {
+        "shared.exr": exr_bytes(intrinsics_channels(geometry), attributes=header),
+        "visible.npy": stored.getvalue(),
+        "json": json.dumps(record, sort_keys=True).encode(),
+    }
+
+
+def trace_visible(renderer: Renderer, surface: Bool[np.ndarray, "h w"], seed: int) -> Bool[np.ndarray, "p m"]:
+    """Which of the directions are free, for each pixel of a surface, in the order of the picture.
+
+    Args:
+        renderer: of the object.
+        surface: pixels to look from.
+        seed: equal seeds draw equal points. A point that misses the object sees everything.
+    """
+    directions = environment_directions(*DIRECTIONS).reshape(-1, 3).astype(np.float32)
+    rows, columns = np.nonzero(surface)
+    rng = np.random.default_rng(seed)
+    found = np.ones((len(rows), len(directions)), bool)
+    step = max(1, _RAYS // len(directions))
+    for start in range(0, len(rows), step):
+        part = slice(start, start + step)
+        corner = np.repeat(np.stack([columns[part], rows[part]]), len(directions), axis=1)
+        position = (corner + rng.random(corner.shape)) / renderer.resolution
+        towards = np.tile(directions.T, (1, corner.shape[1] // len(directions)))
+        found[part] = _free(renderer, position, towards).reshape(-1, len(directions))
+    return found
+
+
+def _free(
+    renderer: Renderer, position: Float[np.ndarray, "2 n"], towards: Float[np.ndarray, "3 n"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether rays from what is seen at positions of the picture, in [0, 1], meet nothing."""
+    mi = mitsuba()
+    scene = renderer.scene.show("principled", {})
+    seen = mi.Point2f(position.astype(np.float32))
+    ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, seen, mi.Point2f(0.5))
+    coherent = True  # rays of one pixel follow each other
+    surface = scene.ray_intersect(ray, mi.RayFlags.All, coherent)
+    valid = surface.is_valid()
+    blocked = scene.ray_test(surface.spawn_ray(mi.Vector3f(towards.astype(np.float32))), valid)
+    return np.array(~(valid & blocked))

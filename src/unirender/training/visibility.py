@@ -1,0 +1,229 @@
+"""`unirender train-visibility`: teaches the network of shadows which directions objects hide from themselves.
+
+The loss of an object is
+
+    mean_w BCE(P, V) + LIGHT_WEIGHT mean_L log(E_L + E_0),
+    E_L = mean_p ((sum_ck L_k (H_pck - W_pck P_pck)) / mean_p(sum_ck L_k W_pck))^2
+
+that is, how likely each direction is hidden, and the squared error of d under random lights L in decibels: what is
+nearly right of a ball that hides nothing should not be paid for with what is gained on a chair. H and W are the
+integrals of the cosine over the hidden and over all directions of class c and bin k, P the network's answer.
+
+A run resumes by running the same command again: the order of objects and all that is random is a function of the seed
+and the step.
+"""
+
+import dataclasses
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unirender.errors import UnirenderError, UsageError
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from unirender.models.visibility import VisibilityNet
+    from unirender.training.visibility_data import VisibilityItem
+
+HELD_OUT = 25  # every so many-th object is for validation
+LIGHT_WEIGHT = 0.1
+LEAST_ERROR = 1e-4  # E_0
+LIGHTS = 4  # of each kind for an object
+SPREAD = 1.5  # standard deviation of the log of the bins' radiance in lights of the first kind
+LAMP, LAMP_SHARE = 40.0, 0.04  # radiance of lamps beside a uniform 1, and the share of bins that have one: the second
+WARMUP = 50  # steps
+FLAT = 0.5  # of the steps, after which the learning rate falls to 0
+EMA_DECAY = 0.995
+MAX_NORM = 1.0
+SAVE_SECONDS = 120.0
+WEIGHTS_FILE, LOG_FILE = "visibility.safetensors", "log.jsonl"
+
+
+@dataclass(frozen=True)
+class TrainVisibility:
+    """Train the network that says which directions an object hides from itself; resumes by running the same command
+    again. It ships trained: `render` uses it wherever a light is given and s and d are not."""
+
+    data: Path
+    """Folder that `unirender dataset --vary visibility` wrote."""
+    out: Path
+    """Run folder: `visibility.safetensors`, `log.jsonl` and the state."""
+    steps: int = 2400
+    """Steps of the optimiser."""
+    batch_size: int = 8
+    """Objects a step."""
+    learning_rate: float = 2e-3
+    """Peak learning rate of AdamW."""
+    halved: float = 0.6
+    """Share of the objects that are seen at half their size."""
+    seed: int = 0
+    """Of the weights, of the order of objects, of the lights."""
+
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        for name in ("steps", "batch_size", "learning_rate"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+        if not 0 <= self.halved <= 1:
+            raise UsageError(f"--halved {self.halved}: expected a share in [0, 1]")
+
+    def run(self) -> int:
+        """Trains, or resumes; returns the exit status."""
+        self.check()
+        if not self.data.is_dir():
+            raise UnirenderError(
+                f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
+            )
+        print(f"{train_visibility(self)}: trained")
+        return 0
+
+
+def train_visibility(options: TrainVisibility) -> Path:
+    """Runs the training; returns the file of the averaged weights.
+
+    Raises:
+        UnirenderError: broken data, or the folder holds a run of other options or data.
+    """
+    import torch
+    from safetensors.torch import save
+
+    from unirender.files import replace_file
+    from unirender.models.visibility import VisibilityNet
+    from unirender.training.checkpoint import load_state, save_state
+    from unirender.training.ema import Ema
+    from unirender.training.stopping import stopping_gently
+    from unirender.training.visibility_data import read_items
+
+    items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
+    own, held_out = split(items)
+    torch.manual_seed(options.seed)
+    last = {"memory_format": torch.channels_last}  # a keyword that the stubs of `to` do not know
+    net = VisibilityNet().to(**last)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=options.learning_rate, betas=(0.9, 0.99))
+    ema = Ema(net, EMA_DECAY)
+    asked = {**dataclasses.asdict(options), "data": shards, "out": None}
+    step = 0
+    if (state := load_state(options.out)) is not None:
+        if state["options"] != asked:
+            raise UnirenderError(f"{options.out}: holds a run of other options or data, expected a new --out")
+        net.load_state_dict(state["net"])
+        optimizer.load_state_dict(state["optimizer"])
+        ema.load_state_dict(state["ema"])
+        step = int(state["step"])
+    log = options.out / LOG_FILE
+    if log.is_file():
+        lines = [line for line in log.read_text().splitlines(keepends=True) if json.loads(line)["step"] <= step]
+        replace_file(log, "".join(lines))
+
+    def keep() -> None:
+        values = {"net": net.state_dict(), "optimizer": optimizer.state_dict(), "ema": ema.state_dict()}
+        save_state(options.out, {**values, "step": step, "options": asked})
+        shown = VisibilityNet().to(**last)
+        ema.copy_to(shown)
+        replace_file(
+            options.out / WEIGHTS_FILE,
+            save({name: value.half().contiguous() for name, value in shown.state_dict().items()}),
+        )
+        scores = validate(shown, held_out, options.seed)
+        line = {"step": step, "objects": step * options.batch_size, **means, **scores}
+        with log.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        print(" ".join(f"{key} {value:.4g}" for key, value in line.items()), flush=True)
+
+    saved, losses = time.monotonic(), []
+    means: dict[str, float] = {}
+    with stopping_gently() as stop:
+        while step < options.steps and not stop.asked:
+            for group in optimizer.param_groups:
+                group["lr"] = options.learning_rate * rate(step / options.steps, step)
+            for index in range(step * options.batch_size, (step + 1) * options.batch_size):
+                item, rng = drawn(own, index, options)
+                bce, error = terms(net, item, rng)
+                ((bce + LIGHT_WEIGHT * error) / options.batch_size).backward()
+                losses.append((bce.item(), error.item()))
+            torch.nn.utils.clip_grad_norm_(net.parameters(), MAX_NORM)
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+            ema.update(net)
+            step += 1
+            if time.monotonic() - saved > SAVE_SECONDS or step == options.steps or stop.asked:
+                means = dict(zip(("bce", "log_error"), map(_mean, zip(*losses, strict=True)), strict=True))
+                keep()
+                saved, losses = time.monotonic(), []
+    if step < options.steps:
+        raise UnirenderError(f"{options.out}: stopped at step {step}; run the same command again to go on")
+    return options.out / WEIGHTS_FILE
+
+
+def split(items: "Sequence[VisibilityItem]") -> "tuple[list[VisibilityItem], list[VisibilityItem]]":
+    """The objects to learn from, and those that are held out (of less than `HELD_OUT`, the last one)."""
+    held_out = [items[i] for i in range(HELD_OUT - 1, len(items), HELD_OUT)] or [items[-1]]
+    own = [item for item in items if not any(item is other for other in held_out)]
+    return own or list(items), held_out
+
+
+def rate(progress: float, step: int) -> float:
+    """Factor of the learning rate."""
+    return min(1, (step + 1) / WARMUP) * min(1, (1 - progress) / (1 - FLAT))
+
+
+def drawn(
+    items: "Sequence[VisibilityItem]", index: int, options: TrainVisibility
+) -> "tuple[VisibilityItem, torch.Generator]":
+    """Object number `index` of the stream as it is seen, and what its lights are drawn with."""
+    import numpy as np
+    import torch
+
+    epoch, place = divmod(index, len(items))
+    item = items[np.random.default_rng([options.seed, 0, epoch]).permutation(len(items))[place]]
+    rng = np.random.default_rng([options.seed, 1, index])
+    if rng.random() < options.halved and not any(size % 2 for size in item.surface.shape):
+        half = item.halved()
+        item = half if half.surface.any() else item
+    item = item.turned(int(rng.integers(4)), bool(rng.integers(2)))
+    return item, torch.Generator().manual_seed(int(rng.integers(1 << 62)))
+
+
+def terms(net: "VisibilityNet", item: "VisibilityItem", rng: "torch.Generator") -> "tuple[Tensor, Tensor]":
+    """The two terms of the loss of an object: BCE, and the mean log error under lights that are drawn."""
+    import numpy as np
+    import torch
+    import torch.nn.functional as F
+
+    from unirender.models.visibility import BINS, CLASSES, at_pixels, net_input
+
+    weight = item.weight.astype(np.float32)
+    hidden = torch.from_numpy(np.minimum(item.hidden, weight))
+    x, window = net_input(item.normal, item.surface, item.depth, weight)
+    y = net(torch.from_numpy(x)[None].contiguous(memory_format=torch.channels_last))[0]
+    y = at_pixels(y, item.surface, window).reshape(-1, len(CLASSES), BINS)
+    w = torch.from_numpy(weight)
+    bce = -(hidden * F.logsigmoid(y) + (w - hidden) * F.logsigmoid(-y)).sum() / w.sum()
+    skies = torch.exp(SPREAD * torch.randn(LIGHTS, BINS, generator=rng))
+    lamps = 1 + LAMP * (torch.rand(LIGHTS, BINS, generator=rng) < LAMP_SHARE)
+    light = torch.cat([skies, lamps]).T
+    error = (hidden - w * y.sigmoid()).sum(dim=1) @ light / (w.sum(dim=1) @ light).mean(dim=0)
+    return bce, torch.log(error.square().mean(dim=0) + LEAST_ERROR).mean()
+
+
+def validate(net: "VisibilityNet", items: "Sequence[VisibilityItem]", seed: int) -> dict[str, float]:
+    """The two terms, means over held-out objects, under the same lights each time."""
+    import torch
+
+    with torch.no_grad():
+        found = [terms(net, item, torch.Generator().manual_seed(seed + i)) for i, item in enumerate(items)]
+    bce, error = zip(*found, strict=True)
+    return {"held_out_bce": _mean(bce), "held_out_log_error": _mean(error)}
+
+
+def _mean(values: "Sequence[Any]") -> float:
+    return sum(float(value) for value in values) / len(values)

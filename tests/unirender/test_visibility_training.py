@@ -1,0 +1,194 @@
+"""What the network of shadows learns from, and its training: sorted rays, other views of them, resumed runs."""
+
+import io
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from seen_shapes import CAMERA, ball, gutter
+from synthetic_shards import write_shard
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.exr import exr_bytes, intrinsics_channels
+from unirender.intrinsics import Intrinsics
+from unirender.lobes import texel_directions
+from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.training.visibility import TrainVisibility, rate, split, terms, train_visibility
+from unirender.training.visibility_data import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
+
+SIZE = 32
+
+
+def rays_of(normal: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """As if each pixel saw all above its own surface but what lies to the right below 45 degrees."""
+    directions = texel_directions(DIRECTIONS)
+    n = normal[mask[..., 0] >= 0.5]
+    wall = (directions[0] > 0.3) & (directions[2] < directions[0])
+    return (n @ directions > 0) & ~wall
+
+
+def item(kind: str = "gutter") -> VisibilityItem:
+    normal, mask, _ = (ball if kind == "ball" else gutter)(SIZE)
+    found = look_at(normal, mask, CAMERA, rays_of(normal, mask))
+    assert found is not None
+    return found
+
+
+def write_rays(folder: Path, kinds: str = "ball gutter gutter ball") -> Path:
+    groups = {}
+    for number, kind in enumerate(kinds.split()):
+        normal, mask, _ = (ball if kind == "ball" else gutter)(SIZE)
+        stored = io.BytesIO()
+        np.save(stored, np.packbits(rays_of(normal, mask), axis=1))
+        channels = intrinsics_channels(Intrinsics(albedo=0 * normal, normal=normal, mask=mask))
+        groups[f"{kind}{number}"] = {
+            "shared.exr": exr_bytes(channels),
+            "visible.npy": stored.getvalue(),
+            "json": json.dumps({"vary": "visibility"}).encode(),
+        }
+    folder.mkdir(parents=True, exist_ok=True)
+    write_shard(folder / "shard-000000.tar", groups)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_rays(tmp_path_factory.mktemp("rays"))
+
+
+def test_rays_are_sorted_by_class_and_bin() -> None:
+    found = item()
+    assert found.weight.shape == found.hidden.shape == (SIZE * SIZE, len(CLASSES), 48)
+    assert (found.hidden <= found.weight).all()
+    directions = texel_directions(DIRECTIONS)
+    n = found.normal[found.surface].astype(np.float32)
+    cosine = np.maximum(n @ directions, 0)
+    every = np.zeros(cosine.shape, np.int64)
+    hidden = bin_weights(np.where(rays_of(n[None], np.ones((1, len(n), 1))), 0, cosine), every, directions)[:, 0]
+    assert np.abs(found.hidden.sum(axis=1) / STEPS - hidden).max() < 0.2  # of texels; rounded
+    assert found.hidden.sum() > 0.1 * found.weight.sum()
+
+
+def test_another_view_of_rays_is_the_view_of_other_rays() -> None:
+    """Turned and mirrored, the bins are those of directions that were turned and mirrored."""
+    found, directions = item(), texel_directions((64, 128))
+    for turns, mirror in ((1, False), (0, True), (3, True)):
+        seen = found.turned(turns, mirror)
+        n = seen.normal[seen.surface]
+        classes = np.zeros((len(n), directions.shape[1]), np.int64)
+        expected = bin_weights(np.maximum(n @ directions, 0), classes, directions)[:, 0]
+        own = seen.weight.sum(axis=1) / STEPS
+        error = np.abs(own / own.sum(axis=1, keepdims=True) - expected / expected.sum(axis=1, keepdims=True)).mean()
+        assert error < 0.004
+        assert seen.hidden.sum() == found.hidden.sum()
+    for seen in (found.turned(4, False), found.turned(2, True).turned(2, True)):
+        np.testing.assert_array_equal(seen.hidden, found.hidden)
+        np.testing.assert_array_equal(seen.normal, found.normal)
+    # what is hidden lies to the right, and after a quarter turn above
+    right, above = (found.turned(turns, False).hidden.sum(axis=(0, 1)).reshape(6, 8).sum(axis=0) for turns in (0, 1))
+    assert right.argmax() in (0, 7)
+    assert above.argmax() in (1, 2)
+
+
+def test_at_half_the_size_there_are_the_same_rays() -> None:
+    found = item("ball")
+    half = found.halved()
+    assert half.surface.shape == (SIZE // 2, SIZE // 2)
+    assert half.surface.sum() == pytest.approx(found.surface.sum() / 4, rel=0.15)
+    assert len(half.weight) == half.surface.sum()
+    np.testing.assert_allclose(np.linalg.norm(half.normal[half.surface], axis=1), 1, rtol=1e-5)
+    per_pixel = [part.hidden.sum(axis=(1, 2)).mean() for part in (half, found)]
+    assert per_pixel[0] == pytest.approx(per_pixel[1], rel=0.1)
+
+
+def test_a_folder_is_looked_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        items, shards = read_items(folder)
+        assert len(items) == 4
+        assert list(shards) == ["shard-000000.tar"]
+        again, _ = read_items(folder)
+    assert sum("looking at the objects" in record.message for record in caplog.records) <= 1
+    for one, other in zip(items, again, strict=True):
+        np.testing.assert_array_equal(one.weight, other.weight)
+    np.testing.assert_array_equal(items[1].hidden, item().hidden)
+
+
+def test_a_folder_of_pictures_is_refused(tmp_path: Path) -> None:
+    write_shard(tmp_path / "shard-000000.tar", {"a": {"shared.exr": b"", "json": b"{}"}})
+    with pytest.raises(UnirenderError, match="--vary visibility"):
+        read_items(tmp_path)
+
+
+def test_the_loss_is_that_of_the_equations() -> None:
+    """At the network's first answer, the same for all pixels, by a loop; and no network is better than the truth."""
+    net, found = VisibilityNet(), item()
+    bce, error = terms(net, found, torch.Generator().manual_seed(0))
+    p = np.array([0.75, 0.45, 0.06])[None, :, None]
+    w, h = found.weight / 1.0, found.hidden / 1.0
+    assert float(bce) == pytest.approx(-(h * np.log(p) + (w - h) * np.log(1 - p)).sum() / w.sum(), rel=1e-4)
+    exact = VisibilityItem(found.normal, found.surface, found.depth, found.weight, (w * p).astype(np.float32))
+    _, least = terms(net, exact, torch.Generator().manual_seed(0))
+    assert float(least) == pytest.approx(np.log(1e-4), abs=0.01)
+    assert float(error) > float(least) + 1
+
+
+def test_it_learns_what_is_hidden(tmp_path: Path, folder: Path) -> None:
+    out = tmp_path / "run"
+    weights = train_visibility(TrainVisibility(folder, out, steps=30, batch_size=2, halved=0.0))
+    lines = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 30
+    net = VisibilityNet()
+    before, _ = terms(net, item(), torch.Generator().manual_seed(0))
+    net.load_state_dict({name: value.float() for name, value in load_file(weights).items()})
+    after, _ = terms(net, item(), torch.Generator().manual_seed(0))
+    assert float(after) < 0.9 * float(before)
+
+
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"steps": 4, "batch_size": 2}
+    whole = train_visibility(TrainVisibility(folder, tmp_path / "whole", **options))
+    from unirender.training import visibility
+
+    calls = []
+
+    def asked_after_two(*arguments: object) -> float:
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return rate(*arguments)  # type: ignore[arg-type] - as it is called
+
+    monkeypatch.setattr(visibility, "SAVE_SECONDS", 0.0)
+    monkeypatch.setattr(visibility, "rate", asked_after_two)
+    with pytest.raises(KeyboardInterrupt):
+        train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
+    monkeypatch.setattr(visibility, "rate", rate)
+    stopped = train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
+    assert stopped.read_bytes() == whole.read_bytes()
+    steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
+    assert steps == [1, 2, 3, 4]
+    with pytest.raises(UnirenderError, match="other options"):
+        train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
+
+
+def test_options_are_checked(tmp_path: Path) -> None:
+    wrong = ({"steps": 0}, "--steps 0"), ({"halved": 1.5}, "--halved 1.5"), ({"batch_size": -1}, "--batch-size -1")
+    for change, named in wrong:
+        with pytest.raises(UsageError, match=named):
+            TrainVisibility(tmp_path, tmp_path, **change).run()  # pyright: ignore[reportArgumentType] - from tests
+    with pytest.raises(UnirenderError, match="no such data folder"):
+        TrainVisibility(tmp_path / "none", tmp_path).run()
+
+
+def test_objects_are_held_out() -> None:
+    items = [item("ball")] * 60
+    own = [VisibilityItem(*vars(one).values()) for one in items]
+    learned, held_out = split(own)
+    assert (len(learned), len(held_out)) == (58, 2)
+    alone = own[:1]
+    assert split(alone) == (alone, alone)
