@@ -76,7 +76,7 @@ def test_what_a_gutter_hides_is_what_its_other_side_covers() -> None:
         expected = meets_the_other(point, directions)
         agree.append((visible[number] == ~expected)[above].mean())
         hidden.append(expected[above].mean())
-    assert np.mean(hidden) > 0.2  # the twin: something is hidden
+    assert np.mean(hidden) > 0.1  # the twin: something is hidden
     assert np.mean(agree) > 0.97, np.mean(agree)
     again = trace_visible(renderer, surface, seed=1)
     assert np.array_equal(visible, again)

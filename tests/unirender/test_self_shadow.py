@@ -172,8 +172,8 @@ def test_a_mirrored_and_a_turned_scene_have_mirrored_and_turned_shadows() -> Non
         found = visible_shares(changed, changed.require("environment")["environment"])
         for name, share in shares.items():
             expected = change({name: share})[name]
-            assert np.abs(found[name] - expected).mean() < 0.01, (change.__name__, name)
-            assert np.abs(share - expected).mean() > 0.03  # the twin: the change is one
+            assert np.abs(found[name] - expected).mean() < 0.03, (change.__name__, name)  # learned from examples
+            assert np.abs(share - expected).mean() > 2 * np.abs(found[name] - expected).mean()  # the twin
 
 
 @pytest.mark.long
@@ -199,8 +199,8 @@ def test_a_strip_has_the_shadows_that_it_has_in_a_square(size: int) -> None:
     strip = visible_shares(as_maps(normal[rows], mask[rows]).replace(camera=narrow), sky())
     for name, share in strip.items():
         assert share.shape == (size // 4, size, 3)
-        # a bit of a mask may fall to either side
-        assert np.abs(share - square[name][rows]).mean() < 0.02 < 0.05 < 1 - share.mean()
+        # a bit of a mask may fall to either side, and the network sees another frame
+        assert np.abs(share - square[name][rows]).mean() < 0.03 < 0.05 < 1 - share.mean()
         assert share.min() < 0.6
 
 
@@ -250,7 +250,9 @@ def test_masks_that_are_empty_or_a_pixel() -> None:
     assert (visible_shares(nothing, sky())["specular"] == 1).all()
     thin = np.zeros_like(mask)
     thin[10, 10] = 1
-    assert (visible_shares(as_maps(normal * thin, thin), sky())["diffuse"] == 1).all()
+    share = visible_shares(as_maps(normal * thin, thin), sky())["diffuse"]
+    assert share[10, 10].min() > 0.8
+    assert (share[thin[..., 0] == 0] == 1).all()
 
 
 def test_an_exposure_that_is_chosen_knows_the_shadows() -> None:

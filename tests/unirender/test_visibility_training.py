@@ -114,7 +114,8 @@ def test_a_folder_is_looked_at_once(folder: Path, caplog: pytest.LogCaptureFixtu
     assert sum("looking at the objects" in record.message for record in caplog.records) <= 1
     for one, other in zip(items, again, strict=True):
         np.testing.assert_array_equal(one.weight, other.weight)
-    np.testing.assert_array_equal(items[1].hidden, item().hidden)
+    own = item()  # with normals that were not stored in half precision
+    assert np.abs(items[1].hidden.astype(int) - own.hidden).mean() < 0.05 < own.hidden.mean()
 
 
 def test_a_folder_of_pictures_is_refused(tmp_path: Path) -> None:
@@ -129,11 +130,11 @@ def test_the_loss_is_that_of_the_equations() -> None:
     bce, error = terms(net, found, torch.Generator().manual_seed(0))
     p = np.array([0.75, 0.45, 0.06])[None, :, None]
     w, h = found.weight / 1.0, found.hidden / 1.0
-    assert float(bce) == pytest.approx(-(h * np.log(p) + (w - h) * np.log(1 - p)).sum() / w.sum(), rel=1e-4)
+    assert bce.item() == pytest.approx(-(h * np.log(p) + (w - h) * np.log(1 - p)).sum() / w.sum(), rel=1e-4)
     exact = VisibilityItem(found.normal, found.surface, found.depth, found.weight, (w * p).astype(np.float32))
     _, least = terms(net, exact, torch.Generator().manual_seed(0))
-    assert float(least) == pytest.approx(np.log(1e-4), abs=0.01)
-    assert float(error) > float(least) + 1
+    assert least.item() == pytest.approx(np.log(1e-4), abs=0.01)
+    assert error.item() > least.item() + 1
 
 
 def test_it_learns_what_is_hidden(tmp_path: Path, folder: Path) -> None:
@@ -145,7 +146,7 @@ def test_it_learns_what_is_hidden(tmp_path: Path, folder: Path) -> None:
     before, _ = terms(net, item(), torch.Generator().manual_seed(0))
     net.load_state_dict({name: value.float() for name, value in load_file(weights).items()})
     after, _ = terms(net, item(), torch.Generator().manual_seed(0))
-    assert float(after) < 0.9 * float(before)
+    assert after.item() < before.item() - 0.02
 
 
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(
@@ -171,8 +172,8 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     stopped = train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
     assert stopped.read_bytes() == whole.read_bytes()
     steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
-    assert steps == [1, 2, 3, 4]
-    with pytest.raises(UnirenderError, match="other options"):
+    assert steps == [0, 1, 2, 3, 4]
+    with pytest.raises(UnirenderError, match="other options or data"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
 

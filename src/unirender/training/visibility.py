@@ -16,7 +16,7 @@ and the step.
 import dataclasses
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -91,77 +91,130 @@ def train_visibility(options: TrainVisibility) -> Path:
     """Runs the training; returns the file of the averaged weights.
 
     Raises:
-        UnirenderError: broken data, or the folder holds a run of other options or data.
+        UnirenderError: broken data, the folder holds a run of other options or data, or the run was asked to stop.
     """
-    import torch
-    from safetensors.torch import save
-
-    from unirender.files import replace_file
-    from unirender.models.visibility import VisibilityNet
-    from unirender.training.checkpoint import load_state, save_state
-    from unirender.training.ema import Ema
     from unirender.training.stopping import stopping_gently
     from unirender.training.visibility_data import read_items
 
     items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
-    own, held_out = split(items)
-    torch.manual_seed(options.seed)
-    last = {"memory_format": torch.channels_last}  # a keyword that the stubs of `to` do not know
-    net = VisibilityNet().to(**last)
-    optimizer = torch.optim.AdamW(net.parameters(), lr=options.learning_rate, betas=(0.9, 0.99))
-    ema = Ema(net, EMA_DECAY)
-    asked = {**dataclasses.asdict(options), "data": shards, "out": None}
-    step = 0
-    if (state := load_state(options.out)) is not None:
-        if state["options"] != asked:
-            raise UnirenderError(f"{options.out}: holds a run of other options or data, expected a new --out")
-        net.load_state_dict(state["net"])
-        optimizer.load_state_dict(state["optimizer"])
-        ema.load_state_dict(state["ema"])
-        step = int(state["step"])
-    log = options.out / LOG_FILE
-    if log.is_file():
-        lines = [line for line in log.read_text().splitlines(keepends=True) if json.loads(line)["step"] <= step]
-        replace_file(log, "".join(lines))
+    run = _Run(options, *split(items), shards)
+    saved = time.monotonic()
+    with stopping_gently() as stop:
+        while run.step < options.steps and not stop.asked:
+            run.train_step()
+            if time.monotonic() - saved > SAVE_SECONDS or run.step == options.steps or stop.asked:
+                run.keep()
+                saved = time.monotonic()
+    if run.step < options.steps:
+        raise UnirenderError(f"{options.out}: stopped at step {run.step}; run the same command again to go on")
+    return options.out / WEIGHTS_FILE
 
-    def keep() -> None:
-        values = {"net": net.state_dict(), "optimizer": optimizer.state_dict(), "ema": ema.state_dict()}
-        save_state(options.out, {**values, "step": step, "options": asked})
-        shown = VisibilityNet().to(**last)
-        ema.copy_to(shown)
-        replace_file(
-            options.out / WEIGHTS_FILE,
-            save({name: value.half().contiguous() for name, value in shown.state_dict().items()}),
-        )
-        scores = validate(shown, held_out, options.seed)
-        line = {"step": step, "objects": step * options.batch_size, **means, **scores}
-        with log.open("a") as file:
+
+class _Run:
+    """A training as far as it has come; one that the folder holds is continued.
+
+    Args:
+        options: of the run.
+        items: objects to learn from.
+        held_out: objects to validate on.
+        shards: sha256 of the data's shards by name.
+
+    Raises:
+        UnirenderError: the folder holds a run of other options or data.
+    """
+
+    def __init__(
+        self,
+        options: TrainVisibility,
+        items: "Sequence[VisibilityItem]",
+        held_out: "Sequence[VisibilityItem]",
+        shards: Mapping[str, str],
+    ) -> None:
+        import torch
+
+        from unirender.models.visibility import VisibilityNet
+        from unirender.training.checkpoint import load_state
+        from unirender.training.ema import Ema
+
+        self.options, self.items, self.held_out = options, items, held_out
+        self.asked = {**dataclasses.asdict(options), "data": dict(shards), "out": None}
+        torch.manual_seed(options.seed)
+        self.net = channels_last(VisibilityNet())
+        self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=options.learning_rate, betas=(0.9, 0.99))
+        self.ema = Ema(self.net, EMA_DECAY)
+        self.step, self.losses = 0, list[tuple[float, float]]()
+        self.log = options.out / LOG_FILE
+        if (state := load_state(options.out)) is not None:
+            self._resume(state)
+        elif self.log.is_file():
+            self.log.unlink()  # of a run that was killed before its first state
+        if not self.step:
+            options.out.mkdir(parents=True, exist_ok=True)
+            self._tell(validate(self.net, held_out, options.seed))  # before anything was learned
+
+    def _resume(self, state: Mapping[str, Any]) -> None:
+        from unirender.files import replace_file
+
+        if state["options"] != self.asked:
+            raise UnirenderError(
+                f"{self.options.out}: holds a run of other options or data, expected a new folder; choose another --out"
+            )
+        self.net.load_state_dict(state["net"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.ema.load_state_dict(state["ema"])
+        self.step = int(state["step"])
+        lines = [line for line in self.log.read_text().splitlines(keepends=True) if line.endswith("\n")]
+        replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
+
+    def train_step(self) -> None:
+        """One step of the optimiser."""
+        import torch
+
+        options = self.options
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.learning_rate * rate(self.step / options.steps, self.step)
+        for index in range(self.step * options.batch_size, (self.step + 1) * options.batch_size):
+            item, rng = drawn(self.items, index, options)
+            bce, error = terms(self.net, item, rng)
+            ((bce + LIGHT_WEIGHT * error) / options.batch_size).backward()
+            self.losses.append((bce.item(), error.item()))
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), MAX_NORM)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.ema.update(self.net)
+        self.step += 1
+
+    def keep(self) -> None:
+        """Saves the state and the averaged weights, and what they score."""
+        from safetensors.torch import save
+
+        from unirender.files import replace_file
+        from unirender.models.visibility import VisibilityNet
+        from unirender.training.checkpoint import save_state
+
+        parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
+        state = {name: part.state_dict() for name, part in parts.items()}
+        save_state(self.options.out, {**state, "step": self.step, "options": self.asked})
+        shown = channels_last(VisibilityNet())
+        self.ema.copy_to(shown)
+        halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
+        replace_file(self.options.out / WEIGHTS_FILE, save(halves))
+        means = dict(zip(("bce", "log_error"), map(_mean, zip(*self.losses, strict=True)), strict=True))
+        self.losses.clear()
+        self._tell(means | validate(shown, self.held_out, self.options.seed))
+
+    def _tell(self, values: Mapping[str, float]) -> None:
+        line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
+        with self.log.open("a") as file:
             file.write(json.dumps(line) + "\n")
         print(" ".join(f"{key} {value:.4g}" for key, value in line.items()), flush=True)
 
-    saved, losses = time.monotonic(), []
-    means: dict[str, float] = {}
-    with stopping_gently() as stop:
-        while step < options.steps and not stop.asked:
-            for group in optimizer.param_groups:
-                group["lr"] = options.learning_rate * rate(step / options.steps, step)
-            for index in range(step * options.batch_size, (step + 1) * options.batch_size):
-                item, rng = drawn(own, index, options)
-                bce, error = terms(net, item, rng)
-                ((bce + LIGHT_WEIGHT * error) / options.batch_size).backward()
-                losses.append((bce.item(), error.item()))
-            torch.nn.utils.clip_grad_norm_(net.parameters(), MAX_NORM)
-            optimizer.step()
-            optimizer.zero_grad(set_to_none=True)
-            ema.update(net)
-            step += 1
-            if time.monotonic() - saved > SAVE_SECONDS or step == options.steps or stop.asked:
-                means = dict(zip(("bce", "log_error"), map(_mean, zip(*losses, strict=True)), strict=True))
-                keep()
-                saved, losses = time.monotonic(), []
-    if step < options.steps:
-        raise UnirenderError(f"{options.out}: stopped at step {step}; run the same command again to go on")
-    return options.out / WEIGHTS_FILE
+
+def channels_last(net: "VisibilityNet") -> "VisibilityNet":
+    """The network with its weights in the layout that convolutions on a CPU are fastest in."""
+    import torch
+
+    return net.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - the stubs lack it
 
 
 def split(items: "Sequence[VisibilityItem]") -> "tuple[list[VisibilityItem], list[VisibilityItem]]":
