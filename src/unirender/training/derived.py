@@ -4,7 +4,7 @@ A renderer that has only ever seen s and d with all their shadows takes those wi
 out. So some of its training pictures come with both (`Augmentation.derived`): in closed form without shadows, or with
 those that the picture shows (`unirender.pipelines.shadowed_light`). A lobe takes long to integrate, a group of 64
 pixels one or two seconds. The lights of a shard are derived once, from its own tar, where they have
-their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v5` holds
+their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/derived/<sha256 of the shard>-v6` holds
 
     unshadowed.npy   float16 [m, 3, h, w]   s and d without shadows, not premultiplied
     shadowed.npy     float16 [m, 3, h, w]   the same with the shadows that the picture shows
@@ -32,7 +32,7 @@ from unirender.training.groups import Group, Shard, read_environments
 
 logger = logging.getLogger(__name__)
 
-DERIVED_VERSION = 5  # part of the cache's path: raise it when what is derived changes
+DERIVED_VERSION = 6  # part of the cache's path: raise it when what is derived changes
 
 _STORED = ("unshadowed", "shadowed")
 
