@@ -49,8 +49,8 @@ class VisibilityNet(nn.Module):
         self.up = nn.ModuleList([_Block(widths[level + 1] + widths[level], widths[level]) for level in levels[:-1]])
         self.conv_out = nn.Conv2d(widths[0], len(CLASSES) * BINS, 1)
         nn.init.zeros_(self.conv_out.weight)
-        with torch.no_grad():
-            self.conv_out.bias.copy_(torch.logit(torch.tensor(BEFORE)).repeat_interleave(BINS))  # pyright: ignore[reportOptionalMemberAccess]
+        before = torch.logit(torch.tensor(BEFORE)).repeat_interleave(BINS)
+        self.conv_out.bias = nn.Parameter(before)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Logits, class by class, of what `net_input` gives; h and w are multiples of 8."""
