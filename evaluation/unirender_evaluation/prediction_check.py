@@ -63,7 +63,7 @@ def questions(suite: Suite) -> dict[str, Question]:
     asked: dict[str, Question] = {}
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, list(suite.scenes)):
-            question = asked.setdefault(task.folder, Question(task.mask, suite.spec.camera))
+            question = asked.setdefault(task.folder, Question(suite.mask(task.scene), suite.spec.camera))
             if task.answer != "intrinsics":
                 question.answers.add(task.answer)
             question.maps |= "decompose" in task.asks

@@ -16,7 +16,7 @@ everywhere. A row that is told more declares it (`rows.Row.told`).
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -41,8 +41,22 @@ PROTOCOLS: tuple[tuple[str, str], ...] = (
 
 
 @dataclass(frozen=True)
+class Asked:
+    """The arrays of a question: what the method is handed (`inputs`), and what the scorer keeps (`truth_*`)."""
+
+    mask: Mask
+    inputs: dict[str, dict[str, Any]]  # by capability
+    truth_image: Image | None = None
+    truth_variance: Image | None = None
+    truth_twin: Image | None = None  # of many times the samples, where the suite has one
+    truth_maps: Intrinsics | None = None
+
+
+@dataclass(frozen=True)
 class Task:
-    """One question: its identity, what the method is handed (`inputs`), and what the scorer keeps (`truth_*`).
+    """One question: its identity, and its arrays (`Asked`), which are read when one of them is wanted.
+
+    Which questions a run has answered already is looked up without them.
 
     `folder` and `answer` name the file of a predictions folder that answers it: `<folder>/<answer>.exr` or `.png`; for
     maps `<folder>/intrinsics.exr` or one PNG per map.
@@ -55,18 +69,42 @@ class Task:
     asks: tuple[Capability, ...]
     folder: str
     answer: str
-    mask: Mask
-    inputs: dict[str, dict[str, Any]] = field(repr=False)  # by capability
+    read: Callable[[], Asked] = field(repr=False)
     geometry: Callable[[], MeshObject] | None = field(default=None, repr=False)  # of the object: for `Row.told` alone
-    truth_image: Image | None = field(default=None, repr=False)
-    truth_variance: Image | None = field(default=None, repr=False)
-    truth_twin: Image | None = field(default=None, repr=False)  # of many times the samples, where the suite has one
-    truth_maps: Intrinsics | None = field(default=None, repr=False)
     quantity: str = "relit"
 
     @property
     def identity(self) -> str:
         return f"{self.table}/{self.protocol}/{self.sample}"
+
+    @cached_property
+    def asked(self) -> Asked:
+        """The arrays, read once."""
+        return self.read()
+
+    @property
+    def mask(self) -> Mask:
+        return self.asked.mask
+
+    @property
+    def inputs(self) -> dict[str, dict[str, Any]]:
+        return self.asked.inputs
+
+    @property
+    def truth_image(self) -> Image | None:
+        return self.asked.truth_image
+
+    @property
+    def truth_variance(self) -> Image | None:
+        return self.asked.truth_variance
+
+    @property
+    def truth_twin(self) -> Image | None:
+        return self.asked.truth_twin
+
+    @property
+    def truth_maps(self) -> Intrinsics | None:
+        return self.asked.truth_maps
 
 
 def edit_quantity(base: Material, target: Material) -> str:
@@ -96,7 +134,7 @@ def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
 
 
 def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Iterator[Task]:
-    """All questions of one protocol, scene by scene, truth included."""
+    """All questions of one protocol, scene by scene."""
     makers = {
         ("rendering", "from-image"): _edits,
         ("rendering", "given"): _renders,
@@ -115,9 +153,7 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Itera
 
 def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
     base = suite.spec.base
-    seen = picture(suite, scene, base)
     for target in suite.spec.edits:
-        change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
         yield Task(
             table="rendering",
             protocol=protocol,
@@ -126,20 +162,26 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             asks=("edit",),
             folder=f"{scene.key}_{material_key(base)}",
             answer=f"edit_{material_key(target)}",
-            mask=suite.mask(scene),
-            inputs={"edit": {**seen, **change}},
+            read=partial(_read_edit, suite, scene, target),
             geometry=partial(known_mesh, suite, scene),
-            truth_image=suite.image(scene, target),
-            truth_variance=suite.image_variance(scene, target),
-            truth_twin=suite.ceiling_image(scene, target),
             quantity=edit_quantity(base, target),
         )
 
 
+def _read_edit(suite: Suite, scene: Scene, target: Material) -> Asked:
+    base = suite.spec.base
+    change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
+    return Asked(
+        suite.mask(scene),
+        {"edit": {**picture(suite, scene, base), **change}},
+        truth_image=suite.image(scene, target),
+        truth_variance=suite.image_variance(scene, target),
+        truth_twin=suite.ceiling_image(scene, target),
+    )
+
+
 def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
     for target in suite.spec.edits:
-        maps = suite.intrinsics(scene, target)
-        maps = maps.replace(environment=None) if protocol == "given" else maps.replace(specular=None, diffuse=None)
         yield Task(
             table="rendering",
             protocol=protocol,
@@ -148,13 +190,21 @@ def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             asks=("render",),
             folder=f"{scene.key}_{material_key(target)}",
             answer=f"render_{protocol}",
-            mask=suite.mask(scene),
-            inputs={"render": {"intrinsics": maps}},
-            truth_image=suite.image(scene, target),
-            truth_variance=suite.image_variance(scene, target),
-            truth_twin=suite.ceiling_image(scene, target),
+            read=partial(_read_render, suite, scene, target, protocol),
             quantity=edit_quantity(suite.spec.base, target),
         )
+
+
+def _read_render(suite: Suite, scene: Scene, target: Material, protocol: str) -> Asked:
+    maps = suite.intrinsics(scene, target)
+    maps = maps.replace(environment=None) if protocol == "given" else maps.replace(specular=None, diffuse=None)
+    return Asked(
+        suite.mask(scene),
+        {"render": {"intrinsics": maps}},
+        truth_image=suite.image(scene, target),
+        truth_variance=suite.image_variance(scene, target),
+        truth_twin=suite.ceiling_image(scene, target),
+    )
 
 
 def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
@@ -168,37 +218,49 @@ def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             asks=("decompose",),
             folder=sample,
             answer="intrinsics",
-            mask=suite.mask(scene),
-            inputs={"decompose": picture(suite, scene, material)},
+            read=partial(_read_inverse, suite, scene, material),
             geometry=partial(known_mesh, suite, scene),
-            truth_maps=suite.intrinsics(scene, material).replace(specular=None, diffuse=None, environment=None),
         )
 
 
+def _read_inverse(suite: Suite, scene: Scene, material: Material) -> Asked:
+    return Asked(
+        suite.mask(scene),
+        {"decompose": picture(suite, scene, material)},
+        truth_maps=suite.intrinsics(scene, material).replace(specular=None, diffuse=None, environment=None),
+    )
+
+
 def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
-    base, target = suite.spec.base, suite.other_light(scene)
-    seen = picture(suite, scene, base)
+    target = suite.other_light(scene)
     given_sd = protocol == "from-image-sd"
-    lit = suite.intrinsics(target, base)
-    light: dict[str, Float[np.ndarray, "h w 3"] | None]
-    light = {"specular": lit.specular, "diffuse": lit.diffuse} if given_sd else {"environment": lit.environment}
-    own = suite.intrinsics(scene, base)
+    light = target.key.rsplit("_", 1)[1]
     yield Task(
         table="relighting",
         protocol=protocol,
-        sample=f"{scene.key}_to_{target.key.rsplit('_', 1)[1]}",
+        sample=f"{scene.key}_to_{light}",
         scene=scene,
         asks=("relight", "decompose") if given_sd else ("relight",),
-        folder=f"{scene.key}_{material_key(base)}",
-        answer=f"relight_{target.key.rsplit('_', 1)[1]}_{'sd' if given_sd else 'hdri'}",
-        mask=suite.mask(scene),
-        inputs={"relight": {**seen, **light}, "decompose": seen},
+        folder=f"{scene.key}_{material_key(suite.spec.base)}",
+        answer=f"relight_{light}_{'sd' if given_sd else 'hdri'}",
+        read=partial(_read_relight, suite, scene, target, given_sd),
         geometry=partial(known_mesh, suite, scene),
+        quantity="relit",
+    )
+
+
+def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> Asked:
+    base = suite.spec.base
+    seen = picture(suite, scene, base)
+    lit, own = suite.intrinsics(target, base), suite.intrinsics(scene, base)
+    light: dict[str, Float[np.ndarray, "h w 3"] | None]
+    light = {"specular": lit.specular, "diffuse": lit.diffuse} if given_sd else {"environment": lit.environment}
+    lights = Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
+    return Asked(
+        suite.mask(scene),
+        {"relight": {**seen, **light}, "decompose": seen},
         truth_image=suite.image(target, base),
         truth_variance=suite.image_variance(target, base),
         truth_twin=suite.ceiling_image(target, base),
-        truth_maps=Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
-        if given_sd
-        else None,
-        quantity="relit",
+        truth_maps=lights if given_sd else None,
     )

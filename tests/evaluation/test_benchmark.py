@@ -165,6 +165,22 @@ def test_jobs_of_one_scene_at_a_time_are_in_memory(
     assert run.most == len(kept) - 2
 
 
+def test_what_is_done_is_looked_up_without_its_pictures(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is continued asks for every key first; decoding a large suite's pictures for that took minutes."""
+    rows = [*trivial_rows(), make_row(Guess(), "external")]
+    run = Run(suite, rows, list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures", Subsets())
+    read: list[str] = []
+    channels = Suite._channels
+    monkeypatch.setattr(Suite, "_channels", lambda self, name: read.append(name) or channels(self, name))
+    jobs = [job for scene in suite.scenes for job in run.jobs(scene)]
+    assert all(job.key for job in jobs)
+    assert not read
+    jobs[0].make()
+    assert read
+
+
 def test_a_cluster_gets_what_is_missing_most_first(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
