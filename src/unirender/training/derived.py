@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import threadpoolctl
 from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
@@ -68,7 +69,7 @@ def open_derived(
         groups = sum(len(shard.groups) for _, shard in missing)
         logger.warning("deriving the light of %d groups of %d shards once, 1 or 2 seconds each", groups, len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _one_thread) as pool:
             for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
                 if progress is not None:
                     progress(done, len(missing))
@@ -83,6 +84,14 @@ def _open(folder: Path) -> DerivedLight:
     mapped = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in _STORED)
     unshadowed, shadowed = (np.asarray(pixels) for pixels in mapped)  # plain views of the memory maps
     return DerivedLight(unshadowed, shadowed, np.load(folder / "rows.npy"))
+
+
+def _one_thread() -> None:
+    """A process to a core: their matrix products would wait for one another's threads."""
+    import torch
+
+    threadpoolctl.threadpool_limits(1)
+    torch.set_num_threads(1)
 
 
 def _derive(path: Path, shard: Shard) -> None:
