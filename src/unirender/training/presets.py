@@ -153,6 +153,12 @@ _TINY_COLOUR = dataclasses.replace(
     augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
     batch_size=24,
 )
+# `small` on many pictures, with more weight on metallic and roughness; `small_renderer` comes after it.
+_SMALL_COLOUR = dataclasses.replace(
+    _SMALL,
+    loss=dataclasses.replace(_SMALL.loss, material=3.0),
+    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
+)
 # `tiny` with a picture encoder: first that alone, then with the decoder that it serves.
 _TINY_ENCODER = dataclasses.replace(
     _TINY_RENDERER,
@@ -214,11 +220,12 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
+    "small_colour": _SMALL_COLOUR,
     "small_renderer": dataclasses.replace(
         _SMALL,
         trains="renderer",
         p_render=1.0,
-        augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.7, shadowed=0.9),
+        augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.5, shadowed=0.9),
     ),
     "small_vgg": dataclasses.replace(
         _SMALL,
