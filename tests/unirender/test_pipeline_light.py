@@ -157,6 +157,7 @@ def test_edits_relighting_and_rendering_use_it() -> None:
         assert np.array_equal(maps["diffuse"], d)
     shares = visible_shares(given, environment)
     shadowed = under_light(given, environment, "keep", shadows=True).require("specular", "diffuse")
+    assert lit.albedo is None  # nothing is known of what the surface reflects
     for maps in (shadowed, ready_to_render(lit).require("specular", "diffuse")):
         np.testing.assert_allclose(maps["specular"], s * shares["specular"], rtol=1e-6)
         np.testing.assert_allclose(maps["diffuse"], d * shares["diffuse"], rtol=1e-6)

@@ -1,0 +1,96 @@
+"""What a hidden direction shows instead of the light."""
+
+import numpy as np
+import pytest
+from seen_shapes import SIZE, as_maps, ball, gutter
+
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.bounced_light import REFLECTED, bounced_light
+from unirender.pipelines.derived_light import derived_diffuse, derived_light
+from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.shadowed_light import visible_shares
+
+LIGHT = ("specular", "diffuse")
+SKY = np.ones((16, 32, 3), np.float32)
+MIDDLE = slice(SIZE // 4, -SIZE // 4)
+
+
+def painted(normal: np.ndarray, mask: np.ndarray, albedo: float = 0.8, metallic: float = 0.0) -> Intrinsics:
+    colour = (albedo * mask * np.array([1, 0.5, 0.25])).astype(np.float32)
+    return as_maps(normal, mask).replace(albedo=colour, metallic=(metallic * mask).astype(np.float32))
+
+
+def lit(maps: Intrinsics) -> Intrinsics:
+    return maps.replace(specular=np.ones_like(maps.normal), diffuse=np.ones_like(maps.normal))
+
+
+def test_a_corner_shows_its_own_colour_where_it_hides_the_sky() -> None:
+    normal, mask, _ = gutter()
+    maps = lit(painted(normal, mask))
+    found = bounced_light(maps, LIGHT)
+    hidden = {name: 1 - share for name, share in visible_shares(maps, SKY, LIGHT).items()}
+    for name in LIGHT:
+        assert found[name].min() >= 0
+        assert found[name][MIDDLE, MIDDLE].mean() > 0.02, name
+        # of a picture of one radiance the mean around every pixel is that radiance
+        grey = bounced_light(maps.replace(albedo=0 * maps.albedo, specular=0.5 * maps.specular), [name])[name]
+        ratio = grey[MIDDLE, MIDDLE] / hidden[name][MIDDLE, MIDDLE] / REFLECTED
+        assert ratio.max() < 0.06, name  # what a black one sends out: its gloss alone
+    red, green, blue = found["diffuse"][MIDDLE, MIDDLE].mean(axis=(0, 1))
+    assert red > 1.5 * green > 2 * blue
+
+
+def test_b_is_the_mean_around_a_pixel() -> None:
+    normal, mask, _ = gutter()
+    even = lit(painted(normal, mask, albedo=0.5, metallic=1.0))  # a metal sends out F s: nearly albedo where s is 1
+    found = bounced_light(even, ["specular"])["specular"]
+    hidden = 1 - visible_shares(even, SKY, ("specular",))["specular"]
+    radiance = found[MIDDLE, MIDDLE] / hidden[MIDDLE, MIDDLE] / REFLECTED
+    assert radiance[..., 0].mean() == pytest.approx(0.5, abs=0.1)
+    assert radiance[..., 2].mean() == pytest.approx(0.125, abs=0.1)
+    # the left half black: less and less of the right one's light towards the left edge
+    half = even.replace(specular=even.specular * (np.arange(SIZE) >= SIZE // 2)[:, None].astype(np.float32))
+    beside = bounced_light(half, ["specular"])["specular"] / found
+    assert beside[SIZE // 2, SIZE // 2 - 12, 0] < beside[SIZE // 2, SIZE // 2, 0] < beside[SIZE // 2, SIZE // 2 + 12, 0]
+
+
+def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:
+    normal, mask, _ = ball()
+    found = bounced_light(lit(painted(normal, mask)), LIGHT)
+    inside = mask[..., 0] > 0
+    for name in LIGHT:
+        assert np.abs(found[name][~inside]).max() == 0
+        assert found[name][inside].mean() < 0.02, name
+    maps = painted(*gutter()[:2])
+    shadowed = derived_diffuse(maps, SKY) * visible_shares(maps, SKY, ["diffuse"])["diffuse"]
+    for name in ("albedo", "metallic", "roughness"):
+        (alone,) = derived_light(maps.replace(**{name: None}), SKY, ["diffuse"]).values()
+        np.testing.assert_allclose(alone, shadowed, rtol=1e-6)
+    assert derived_light(maps, SKY, []) == {}
+
+
+def test_rendering_adds_it_to_what_is_derived_and_to_nothing_that_is_given() -> None:
+    maps = painted(*gutter()[:2])
+    shadowed = derived_light(as_maps(*gutter()[:2]), SKY, LIGHT)  # no albedo: nothing bounces
+    ready = ready_to_render(maps.replace(environment=SKY)).require(*LIGHT)
+    bounced = bounced_light(maps.replace(**shadowed), LIGHT)
+    for name in LIGHT:
+        np.testing.assert_allclose(ready[name], shadowed[name] + bounced[name], rtol=1e-5, atol=1e-6)
+        assert bounced[name].max() > 0.02
+    without = ready_to_render(maps.replace(environment=SKY), shadows=False).require(*LIGHT)
+    plain = derived_light(maps, SKY, LIGHT, shadows=False)
+    assert all(np.array_equal(without[name], plain[name]) for name in LIGHT)
+    given = ready_to_render(maps.replace(environment=SKY, specular=shadowed["specular"])).require(*LIGHT)
+    assert np.array_equal(given["specular"], shadowed["specular"])
+    assert np.array_equal(given["diffuse"], ready["diffuse"])
+    doubled = ready_to_render(maps.replace(environment=2 * SKY)).require(*LIGHT)
+    for name in LIGHT:
+        np.testing.assert_allclose(doubled[name], 2 * ready[name], rtol=1e-4, atol=1e-5)
+
+
+def test_a_larger_picture_has_the_same() -> None:
+    small, large = (bounced_light(lit(painted(*gutter(size)[:2])), LIGHT) for size in (SIZE, 160))
+    for name in LIGHT:
+        few, many = small[name][MIDDLE, MIDDLE], large[name][40:-40, 40:-40]
+        assert many.shape == (80, 80, 3)
+        assert many.mean() == pytest.approx(few.mean(), rel=0.15), name
