@@ -1,11 +1,14 @@
 """s and d as derived from a light, in training and in use: what is stored, what a network is told, what it sees."""
 
 import dataclasses
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import threadpoolctl
 import torch
 from synthetic_shards import group_members, maps_members, sphere, write_dataset, write_shard
 from tiny_models import SIZE, make_batch, make_model, make_pipeline
@@ -21,6 +24,7 @@ from unirender.pipelines.editing import under_light
 from unirender.pipelines.inputs import told_derived
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
+from unirender.training import derived
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.data import BATCH_MAPS, DERIVED_FLAGS, DERIVED_MAPS, GroupDataset
 from unirender.training.derived import DerivedLight
@@ -288,3 +292,11 @@ def test_a_relit_picture_is_rendered_with_light_that_was_derived() -> None:
     derived = under_light(found.intrinsics, light, "keep", mirrors=False)
     maps = derived.require(*LIGHT)
     assert not np.allclose(relit(), relit(**maps), atol=1e-6)  # the same numbers, but as if they had shadows
+
+
+def test_a_worker_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    with ProcessPoolExecutor(1, get_context("spawn"), derived._one_thread) as pool:
+        found = pool.submit(threadpoolctl.threadpool_info).result()
+    assert {"blas", "openmp"} <= {library["user_api"] for library in found}
+    assert {library["num_threads"] for library in found} == {1}
