@@ -111,7 +111,7 @@ def ceiling_jobs(suite: Suite, scene: Scene, key_of: KeyOf, backbones: Sequence[
     info = ceiling_info(suite)
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):
-            if task.asks != ("decompose",):  # a picture is scored
+            if task.scores_picture:
                 key = key_of(task.identity, info, {LPIPS})
                 yield Job(key, info.label, partial(_ceiling_record, suite, task, info, key, backbones))
 
@@ -136,7 +136,7 @@ def reference_prediction(
         return None, None
     image = images.get(f"{suite.other_light(task.scene).key}.{material_key(base)}")
     specular, diffuse = (images.get(f"{task.scene.key}.{kind}") for kind in ("specular", "diffuse"))
-    if specular is None or diffuse is None or task.truth_maps is None:
+    if specular is None or diffuse is None or task.truth_maps is None:  # the truth last: it has to be read
         return image, None
     inside = task.mask > 0
     maps = Intrinsics(

@@ -77,9 +77,18 @@ class Task:
     def identity(self) -> str:
         return f"{self.table}/{self.protocol}/{self.sample}"
 
+    @property
+    def scores_picture(self) -> bool:
+        """Whether the answer, or a part of it, is a picture."""
+        return self.asks != ("decompose",)
+
     @cached_property
     def asked(self) -> Asked:
-        """The arrays, read once."""
+        """The arrays, read once; not to be written into.
+
+        Raises:
+            UnirenderError: the suite's truth lacks one of them.
+        """
         return self.read()
 
     @property
@@ -252,15 +261,18 @@ def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
 def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> Asked:
     base = suite.spec.base
     seen = picture(suite, scene, base)
-    lit, own = suite.intrinsics(target, base), suite.intrinsics(scene, base)
+    lit = suite.intrinsics(target, base)
     light: dict[str, Float[np.ndarray, "h w 3"] | None]
     light = {"specular": lit.specular, "diffuse": lit.diffuse} if given_sd else {"environment": lit.environment}
-    lights = Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
+    own_light = None
+    if given_sd:
+        own = suite.intrinsics(scene, base)
+        own_light = Intrinsics(specular=own.specular, diffuse=own.diffuse, mask=own.mask, camera=own.camera)
     return Asked(
         suite.mask(scene),
         {"relight": {**seen, **light}, "decompose": seen},
         truth_image=suite.image(target, base),
         truth_variance=suite.image_variance(target, base),
         truth_twin=suite.ceiling_image(target, base),
-        truth_maps=lights if given_sd else None,
+        truth_maps=own_light,
     )

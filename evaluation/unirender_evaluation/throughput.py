@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import wraps
+from functools import partial, wraps
 from statistics import median
 from typing import Any
 
@@ -22,7 +22,7 @@ from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation import lpips, metrics
 from unirender_evaluation.engine import Prediction, score
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import Task, tasks
+from unirender_evaluation.tasks import Asked, Task, tasks
 
 LEAST = lpips.KEPT_TRUTHS + 1  # pictures of a pass: with fewer, LPIPS would find features kept from the last one
 QUESTIONS = {"picture": ("rendering", "from-image"), "maps": ("inverse", "single-image")}
@@ -127,10 +127,15 @@ def _answers(suite: Suite, question: str, resolution: int, images: int) -> Itera
         maps = None if task.truth_maps is None else _enlarged_maps(task.truth_maps, resolution // own)
         answered = None if maps is None or maps.albedo is None else maps.replace(albedo=0.8 * maps.albedo)
         mask = _enlarged(task.mask, resolution // own)
+        asked = replace(task.asked, mask=mask, truth_image=image, truth_maps=maps)
         yield (
-            replace(task, mask=mask, truth_image=image, truth_maps=maps),
+            replace(task, read=partial(_as_it_is, asked)),
             Prediction(None if image is None else 0.8 * image, answered),
         )
+
+
+def _as_it_is(asked: Asked) -> Asked:
+    return asked
 
 
 def _enlarged(x: Float[np.ndarray, "h w c"], factor: int) -> Float[np.ndarray, "hh ww c"]:

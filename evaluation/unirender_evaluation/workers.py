@@ -97,10 +97,10 @@ def _start(
 
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
-    threadpoolctl.threadpool_limits(1)  # nor do numpy's products, which shadows are made of
     set_threads(1)  # nor do renders of 64 px
     loaded = load_suite(suite)
     run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
+    threadpoolctl.threadpool_limits(1)  # nor do numpy's products, and those of what a row has imported
     _here = run, known
 
 

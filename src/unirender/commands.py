@@ -144,7 +144,7 @@ class Render:
     """Stops to add to that light as it is in its file. None: it is scaled by the rule of the training data."""
     shadows: bool = True
     """Where s and d are derived from a light, the surfaces of the picture cast shadows on one another, as far as their
-    normals say where they are."""
+    normals say where they are, and reflect what they hide."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self, read_light: ReadLight) -> int:
@@ -171,7 +171,8 @@ class Render:
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
             pipeline = self.model.load()
-            ready = ready_to_render(intrinsics, self.shadows)  # here, so that it is done once
+            added = () if self.environment is None else of_light  # they are there, as direct light
+            ready = ready_to_render(intrinsics, self.shadows, added)  # here, so that it is done once
             image = pipeline.render(ready, derived=told_derived(of_light, self.shadows), **self.model.sampling())
             meta |= {**self.model.provenance(pipeline), **overflow(pipeline, ready)}
             write_result(folder, intrinsics, meta, image)

@@ -21,7 +21,7 @@ from unirender.exr import channels_rgb, exr_bytes, intrinsics_channels, read_exr
 from unirender.intrinsics import Intrinsics
 from unirender.models.conditioning import DERIVED_FLAG, TRIPLETS
 from unirender.pipelines.editing import under_light
-from unirender.pipelines.inputs import told_derived
+from unirender.pipelines.inputs import ready_to_render, told_derived
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training import derived
@@ -269,7 +269,7 @@ def test_of_what_has_the_shadows_that_are_seen_d_alone_is_told_to_lack_others(to
     pipeline = make_pipeline(derived_light=told)
     bare = scene().replace(specular=None, diffuse=None)
     light = bare.require("environment")["environment"]
-    lit = under_light(bare, light, "keep", shadows=True)
+    lit = ready_to_render(bare)
     without = under_light(bare, light, "keep").require("diffuse")["diffuse"]
     assert not np.allclose(lit.require("diffuse")["diffuse"], without)
     by_itself = pipeline.render(bare)
@@ -296,7 +296,7 @@ def test_a_relit_picture_is_rendered_with_light_that_was_derived() -> None:
 
 def test_a_worker_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    with ProcessPoolExecutor(1, get_context("spawn"), derived._one_thread) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), derived.one_thread) as pool:
         found = pool.submit(threadpoolctl.threadpool_info).result()
     assert {"blas", "openmp"} <= {library["user_api"] for library in found}
     assert {library["num_threads"] for library in found} == {1}

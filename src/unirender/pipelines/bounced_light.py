@@ -5,7 +5,8 @@
 Notation: V_d, V_s what shadows leave of d and s under a white sky (`unirender.pipelines.shadowed_light`), so that
 1 - V is the share of their lobe that sees the object; B what the object sends out about there, the mean of its
 closed-form image around the pixel. c is less than 1: what is hidden sees the object's insides, which are darker than
-what the picture shows, and B has been lit once only.
+what the picture shows, and B has been lit once only. B is taken to be alike in all directions, also where it is gloss,
+and knows nothing of depth: what is beside a pixel in the picture counts as beside it.
 """
 
 from collections.abc import Collection
@@ -29,7 +30,8 @@ def bounced_light(intrinsics: Intrinsics, names: Collection[str]) -> dict[str, F
     """What is added to s and d that have shadows.
 
     Args:
-        intrinsics: with all that the split-sum image needs, s and d with the shadows that the picture shows.
+        intrinsics: with all that the split-sum image needs; s and d direct light, derived ones with the shadows that
+            the picture shows.
         names: of specular and diffuse, those that are wanted.
     """
     radiance = _mean_radiance(intrinsics.replace(environment=None))
@@ -44,7 +46,7 @@ def _mean_radiance(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
         frame = Frame(intrinsics.height, intrinsics.width, SHADOW_SIDE)
         return frame.leave_map(_mean_radiance(frame.enter_intrinsics(intrinsics)), mask)
     image = split_sum_image(intrinsics)
-    sigma = AROUND * np.sqrt(mask.sum())
+    sigma = AROUND * np.sqrt(np.maximum(mask, 0).sum())
     around = gaussian_filter(np.concatenate([image, mask], axis=-1), (sigma, sigma, 0), mode="constant")
     covered = around[..., 3:]
     return np.divide(around[..., :3], covered, out=np.zeros_like(image), where=(covered > 0) & (mask > 0))

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.framing import Frame, unit_normal
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
@@ -86,24 +85,17 @@ def derived_light(
         environment: lat-long radiance in camera axes, any resolution.
         names: of specular and diffuse, those that are wanted.
         mirrors: as for `derived_specular`.
-        shadows: whether the picture's own surfaces hide the light (`unirender.pipelines.shadowed_light`), and reflect
-            it where albedo and metallic are known (`unirender.pipelines.bounced_light`).
+        shadows: whether the picture's own surfaces hide the light (`unirender.pipelines.shadowed_light`).
     """
-    reflects = shadows and {"albedo", "metallic", "roughness"} <= set(intrinsics.present)
-    wanted = ("specular", "diffuse") if reflects and names else names  # what reflects is lit by both
     light = {}
-    if "specular" in wanted:
+    if "specular" in names:
         light["specular"] = derived_specular(intrinsics, environment, mirrors)
-    if "diffuse" in wanted:
+    if "diffuse" in names:
         light["diffuse"] = derived_diffuse(intrinsics, environment)
     if not shadows or not light:
         return light
     shares = visible_shares(intrinsics, environment, light)
-    light = {name: value * shares[name] for name, value in light.items()}
-    if not reflects:
-        return light
-    bounced = bounced_light(intrinsics.replace(**light), names)
-    return {name: light[name] + value for name, value in bounced.items()}
+    return {name: value * shares[name] for name, value in light.items()}
 
 
 def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | bool = False) -> np.ndarray:

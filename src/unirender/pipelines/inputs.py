@@ -10,6 +10,7 @@ from PIL import Image
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import coverage, display_values
+from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
@@ -92,12 +93,17 @@ def told_derived(names: Collection[str], shadows: bool) -> frozenset[str]:
     return frozenset(names) - {"specular"} if shadows else frozenset(names)
 
 
-def ready_to_render(intrinsics: Intrinsics, shadows: bool = True) -> Intrinsics:
+def ready_to_render(intrinsics: Intrinsics, shadows: bool = True, derived: Collection[str] = ()) -> Intrinsics:
     """Intrinsics that the renderer can use: with a mask, and with s and d derived where a light is given.
+
+    What is derived is direct light, and what the object itself reflects where it hides that
+    (`unirender.pipelines.bounced_light`), if its albedo is known. It is meant for this one rendering: with another
+    material it is another.
 
     Args:
         intrinsics: to be rendered.
-        shadows: whether what is derived has the shadows that the picture's own surfaces cast.
+        shadows: whether what is derived has the shadows that the picture's own surfaces cast, and what they reflect.
+        derived: which of its s and d were derived from its light as direct light, with shadows if `shadows`.
 
     Raises:
         UnirenderError: normal, roughness or metallic is missing; leading axes; a bad size.
@@ -112,7 +118,13 @@ def ready_to_render(intrinsics: Intrinsics, shadows: bool = True) -> Intrinsics:
     if intrinsics.environment is None:
         return intrinsics
     light = as_environment(intrinsics.environment)
-    return intrinsics.replace(**derived_light(intrinsics, light, to_derive(intrinsics), shadows=shadows))
+    names = to_derive(intrinsics)
+    direct = intrinsics.replace(**derived_light(intrinsics, light, names, shadows=shadows))
+    names = names.union(derived)
+    if not shadows or not names or direct.albedo is None:
+        return direct
+    bounced = bounced_light(direct, names)
+    return direct.replace(**{name: getattr(direct, name) + value for name, value in bounced.items()})
 
 
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:

@@ -38,7 +38,7 @@ def render_any_size(
         watch: is told which HDR maps exceed the network's range.
         derived: which of specular and diffuse were derived from the light, without shadows.
         shadows: whether what is derived here, since the intrinsics lack it, has the shadows that the picture's own
-            surfaces cast.
+            surfaces cast, and what they reflect.
     """
     without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
     ready = [ready_to_render(scene, shadows) for scene in scenes]

@@ -246,7 +246,8 @@ class UniRenderPipeline(DiffusionPipeline):
             derived: which of the intrinsics' specular and diffuse lack shadows, since they were derived from a light:
                 by `unirender.pipelines.editing.under_light` both, or with its `shadows` d alone.
             shadows: whether s and d that are derived here have the shadows that the surfaces of the picture cast on one
-                another (`unirender.pipelines.self_shadow`); False: none, which the network is told.
+                another (`unirender.pipelines.self_shadow`), and what these reflect where they hide the light
+                (`unirender.pipelines.bounced_light`); False: neither, which the network is told.
 
         Returns:
             Premultiplied linear image at the intrinsics' size, in [0, 1].

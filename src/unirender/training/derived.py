@@ -1,4 +1,4 @@
-"""s and d of stored groups as a renderer derives them that is given the light alone.
+"""s and d of stored groups as a renderer derives them that is given the light alone, but for what the object reflects.
 
 A renderer that has only ever seen s and d with all their shadows takes those without for such, and leaves the shadows
 out. So some of its training pictures come with both (`Augmentation.derived`): in closed form without shadows, or with
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import threadpoolctl
+import torch
 from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
@@ -69,7 +70,7 @@ def open_derived(
         groups = sum(len(shard.groups) for _, shard in missing)
         logger.warning("deriving the light of %d groups of %d shards once, 1 or 2 seconds each", groups, len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _one_thread) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
             for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
                 if progress is not None:
                     progress(done, len(missing))
@@ -86,10 +87,8 @@ def _open(folder: Path) -> DerivedLight:
     return DerivedLight(unshadowed, shadowed, np.load(folder / "rows.npy"))
 
 
-def _one_thread() -> None:
+def one_thread() -> None:
     """A process to a core: their matrix products would wait for one another's threads."""
-    import torch
-
     threadpoolctl.threadpool_limits(1)
     torch.set_num_threads(1)
 

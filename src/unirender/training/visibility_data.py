@@ -28,6 +28,7 @@ from unirender.lobes import texel_directions
 from unirender.models.visibility import AZIMUTHS, BANDS, bin_weights
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow
+from unirender.training.derived import one_thread
 from unirender.training.groups import list_shards, read_groups
 
 VERSION = 1  # part of the cache's path: raise it when the masks or the bins change
@@ -109,7 +110,7 @@ def read_items(
     if missing:
         logger.warning("looking at the objects of %d shards once, about a second each", len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
             for done, _ in enumerate(pool.map(_prepare, *zip(*missing, strict=True)), start=1):
                 if progress is not None:
                     progress(done, len(missing))
