@@ -123,9 +123,10 @@ def test_what_was_encoded_stands_for_its_rows_in_another_call(unified: bool) -> 
     def again(condition: Tensor | Encoded) -> Tensor:
         return model(given[0], condition, *given[1:], extra[1:], image_rows=None).attributes
 
-    assert torch.equal(again(first.encoded_image), again(i[1:]))
+    # not to the bit: some processors have another kernel for two rows than for two of three
+    torch.testing.assert_close(again(first.encoded_image), again(i[1:]), rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(again(first.encoded_image), first.attributes)
-    assert not torch.equal(again(i[:2]), again(i[1:]))  # the twin
+    assert not torch.allclose(again(i[:2]), again(i[1:]), rtol=1e-2)  # the twin
 
 
 @torch.no_grad()
