@@ -11,12 +11,15 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
+from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light
-from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
+from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
+from unirender.pipelines.editing import under_light
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
@@ -111,6 +114,23 @@ def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path
     means = [np.array(Image.open(tmp_path / name / "image.png"))[inside, :3].mean() for name in lights]
     assert means[0] < 0.7 * means[1]
     assert (read_result(tmp_path / "dim").require("mask")["mask"] == 1).all()  # the whole frame
+
+
+def test_render_draws_what_the_object_reflects_and_keeps_direct_light(tmp_path: Path) -> None:
+    normal, mask, _ = gutter()
+    maps = as_maps(normal, mask).replace(albedo=np.full(normal.shape, 0.8, np.float32), metallic=0 * mask)
+    light = np.ones((16, 32, 3), np.float32)
+    write_exr(tmp_path / "maps.exr", intrinsics_channels(maps), half=False)
+    write_exr(tmp_path / "light.exr", image_channels(light), half=False)
+    arguments = ("--environment", tmp_path / "light.exr", "--exposure", "0", "--dtype", "float32")
+    assert run("render", tmp_path / "maps.exr", *arguments, "--output", tmp_path / "out") == 0
+    kept, direct = read_result(tmp_path / "out"), under_light(maps, light, "keep", shadows=True)
+    for name in ("specular", "diffuse"):
+        np.testing.assert_allclose(getattr(kept, name), getattr(direct, name), rtol=2e-3, atol=1e-3)
+    drawn = channels_rgb(read_exr(tmp_path / "out" / "image.exr")[0])
+    pipeline = UniRenderPipeline.from_pretrained()
+    whole, black = pipeline.render(maps.replace(environment=light)), pipeline.render(direct, derived=["diffuse"])
+    assert np.abs(drawn - whole).mean() < 0.05 * np.abs(drawn - black).mean()
 
 
 def test_what_lies_outside_the_models_range_is_reported(
