@@ -28,7 +28,7 @@ from unirender.training.augment import (
 )
 from unirender.training.data import BATCH_MAPS, GroupDataset
 from unirender.training.environments import turned_environments
-from unirender.training.groups import list_shards, read_groups
+from unirender.training.groups import Pair, list_shards, read_groups
 from unirender.training.presets import Augmentation
 from unirender.training.reader import BatchReader
 
@@ -66,9 +66,9 @@ class Counting(GroupDataset):
 
     made = 0
 
-    def sample(self, index: int, seed: int, augmentation: Augmentation) -> dict[str, np.ndarray]:
+    def augmented(self, group: int, pair: Pair | None, drawn: Draw) -> dict[str, np.ndarray]:
         self.made += 1
-        return super().sample(index, seed, augmentation)
+        return super().augmented(group, pair, drawn)
 
 
 def test_batches_are_read_ahead_when_that_is_asked_for(folder: Path) -> None:

@@ -6,6 +6,7 @@ and `quarter_turn` of `unirender.symmetries`, where `Maps` is explained). tests/
 against a Mitsuba render of the augmented scene.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from unirender.symmetries import LIGHT_MAPS, Maps
 from unirender.symmetries import mirror as mirror
 from unirender.symmetries import quarter_turn as quarter_turn
 from unirender.symmetries import turn_rotation as turn_rotation
+from unirender.training.moving import ROLL_DEG, SHIFT, ZOOM, Move
 from unirender.training.presets import Augmentation
 
 COLOUR_MAPS = ("image", "albedo", "specular", "diffuse", "environment")
@@ -71,9 +73,14 @@ def interpolate_metallic(
         raise UnirenderError(
             f"metallic: got {len(nodes)} pictures and the value {metallic}, expected {METALLIC_NODES} and [0, 1]"
         )
-    m = metallic
-    low, middle, high = (2 * m - 1) * (m - 1), 4 * m * (1 - m), m * (2 * m - 1)
+    low, middle, high = metallic_weights(metallic)
     return nodes[0] * np.float32(low) + nodes[1] * np.float32(middle) + nodes[2] * np.float32(high)
+
+
+def metallic_weights(metallic: float) -> Float[np.ndarray, " 3"]:
+    """Lagrange's weights of the pictures at `METALLIC_NODES`."""
+    m = metallic
+    return np.array([(2 * m - 1) * (m - 1), 4 * m * (1 - m), m * (2 * m - 1)])
 
 
 def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
@@ -104,6 +111,7 @@ class Draw:
     derived: bool = False  # whether s and d come as they are derived from the light, too
     shadowed: bool = False  # whether those have the shadows that the picture shows
     paint: int | None = None  # number of the group whose mean colour the object takes on; None: it keeps its own
+    move: Move | None = None  # to another place in the frame, done last, with the batch; None: it stays
 
 
 def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesses: int, groups: int = 1) -> Draw:
@@ -128,6 +136,7 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
     shadowed = derived and bool(config.shadowed) and bool(rng.random() < config.shadowed)
     painted = bool(config.repaint) and bool(rng.random() < config.repaint)
     paint = int(rng.integers(groups)) if painted else None
+    move = _draw_move(rng) if config.move and rng.random() < config.move else None
     return Draw(
         lights=chosen,
         weights=(share * tint).astype(np.float32),
@@ -140,7 +149,13 @@ def draw(rng: np.random.Generator, config: Augmentation, lights: int, roughnesse
         derived=derived,
         shadowed=shadowed,
         paint=paint,
+        move=move,
     )
+
+
+def _draw_move(rng: np.random.Generator) -> Move:
+    roll, zoom, right, down = rng.uniform(-1, 1, 4)
+    return Move(math.radians(ROLL_DEG) * roll, math.exp(ZOOM * zoom), (SHIFT * right, SHIFT * down))
 
 
 _PERMUTATIONS = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))

@@ -61,7 +61,7 @@ RANGES: dict[str, Range] = {
     "optimizer.final_lr": _SHARE,
     **{
         f"augmentation.{name}": _SHARE
-        for name in ("mix", "permute", "mirror", "turn", "derived", "shadowed", "repaint")
+        for name in ("mix", "permute", "mirror", "turn", "derived", "shadowed", "repaint", "move")
     },
 }
 

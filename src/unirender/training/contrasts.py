@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Int
 
 from unirender.errors import UnirenderError
-from unirender.symmetries import Maps
-from unirender.training.augment import draw
+from unirender.training.augment import Draw, draw
 from unirender.training.data import GroupDataset
-from unirender.training.groups import Group
+from unirender.training.groups import Group, Pair
 from unirender.training.presets import Augmentation
 
 Member = tuple[int, int]  # number of a group, number of a pair in it
@@ -68,11 +67,11 @@ class ContrastDataset(GroupDataset):
         """Samples of an epoch: those of whole runs."""
         return self._length
 
-    def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
+    def drawn(self, index: int, seed: int, augmentation: Augmentation) -> tuple[int, Pair | None, Draw]:
         epoch, place = divmod(index, len(self))
         group, pair = self._items[self._order(seed, epoch)[place]]
         rng = np.random.default_rng([seed, 1, index // self.run_length])
-        return self.augmented(group, pair, draw(rng, augmentation, 1, 1, len(self._groups)))
+        return group, pair, draw(rng, augmentation, 1, 1, len(self._groups))
 
     @functools.lru_cache(maxsize=4)  # noqa: B019 - a dataset lives as long as the training that reads it
     def _order(self, seed: int, epoch: int) -> Int[np.ndarray, " items"]:

@@ -8,7 +8,7 @@ time, or one pair of any other group.
 
 import functools
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from unirender.training.augment import (
 )
 from unirender.training.derived import DerivedLight, open_derived
 from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed, read_environments
+from unirender.training.moving import moved
 from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
 
@@ -44,7 +45,29 @@ BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", 
 ALL_ROWS = slice(None)
 
 Batch = dict[str, Float[Tensor, "b c h w"]]
-Rows = Sequence[int] | Int[np.ndarray, " l"]  # of a shard's pixels
+
+
+@dataclass(frozen=True)
+class SampleRows:
+    """Which rows of its packed shard a sample is mixed of.
+
+    Attributes:
+        shard: number of the shard.
+        shared: row of albedo, normal and mask.
+        image: rows of the pictures, by light and metallic node; one node for a pair.
+        specular: row by light, and so the others.
+        metallic: of the object; None: its own map.
+        roughness: likewise.
+    """
+
+    shard: int
+    shared: int
+    image: Int[np.ndarray, "l n"]
+    specular: Int[np.ndarray, " l"]
+    diffuse: Int[np.ndarray, " l"]
+    environment: Int[np.ndarray, " l"]
+    metallic: float | None
+    roughness: float | None
 
 
 @dataclass(frozen=True)
@@ -161,51 +184,67 @@ class GroupDataset:
         return dict(read_environments(self._paths[shard]))
 
     def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
-        """Sample number `index` of the stream: `[h w c]` float32 maps by the names of a batch."""
+        """Sample number `index` of the stream: `[h w c]` float32 maps by the names of a batch.
+
+        It is where it was rendered: samples are moved with their batch.
+        """
+        return self.augmented(*self.drawn(index, seed, augmentation))
+
+    def drawn(self, index: int, seed: int, augmentation: Augmentation) -> tuple[int, Pair | None, Draw]:
+        """What sample number `index` of the stream is made of: the arguments of `augmented`."""
         epoch, place = divmod(index, len(self))
         group, pair = self._items[self._order(seed, epoch)[place]]
         rng = np.random.default_rng([seed, 1, index])
         basis = None if pair is not None else self._basis[group]
         lights, roughnesses = (len(basis.diffuse), len(basis.roughness)) if basis else (1, 1)
-        return self.augmented(group, pair, draw(rng, augmentation, lights, roughnesses, len(self._groups)))
+        return group, pair, draw(rng, augmentation, lights, roughnesses, len(self._groups))
 
     def augmented(self, group: int, pair: Pair | None, drawn: Draw) -> Maps:
         """A basis group (`pair` None) or a pair of another group under the augmentation `drawn`.
 
         For a pair, the draw's lights, roughness and metallic do not apply; its weights tint the light.
         """
+        rows = self.rows(group, pair, drawn)
         shard, entry = self._groups[group]
         maps = _shared_maps(shard, entry)
-        if pair is None:
-            basis, lights, r = self._basis[group], list(drawn.lights), drawn.roughness_index
-            metallic, roughness = drawn.metallic, basis.roughness[r]
-            nodes = [_trailing(shard.pixels[basis.image[lights, r, node]]) for node in range(len(METALLIC_NODES))]
-            maps["image"] = interpolate_metallic(np.stack(nodes), metallic)
-            rows = {"specular": basis.specular[lights, r], "diffuse": basis.diffuse[lights]}
-            environment = shard.environment[basis.environment[lights], drawn.turns]
-        else:
-            metallic, roughness = pair.metallic, pair.roughness
-            rows = {"image": [pair.image], "specular": [pair.specular], "diffuse": [pair.diffuse]}
-            environment = shard.environment[pair.light, drawn.turns][None]
-        maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
-        maps = mix_lights(_with_material(maps, metallic, roughness), drawn.weights)
+        nodes = np.stack([_trailing(shard.pixels[of_node]) for of_node in rows.image.T])
+        maps["image"] = nodes[0] if pair is not None else interpolate_metallic(nodes, drawn.metallic)
+        maps |= {"specular": _trailing(shard.pixels[rows.specular]), "diffuse": _trailing(shard.pixels[rows.diffuse])}
+        maps = mix_lights(_with_material(maps, rows.metallic, rows.roughness), drawn.weights)
         if drawn.paint is not None:
-            maps = repaint(maps, recoloured(maps["albedo"], maps["mask"], self._mean_colour(drawn.paint)))
+            maps = repaint(maps, recoloured(maps["albedo"], maps["mask"], self.mean_colour(drawn.paint)))
         maps = quarter_turn(maps, drawn.turns)
-        maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)  # stored under each quarter turn
+        environment = shard.environment[rows.environment, drawn.turns]  # stored under each quarter turn
+        maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
         factor = 1.0
         if drawn.exposure_target is not None:
             factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
-        light = self._derived_light(group, rows, drawn) if drawn.derived else None
+        light = self._derived_light(rows, drawn) if drawn.derived else None
         return scale_light(maps, factor) | self._named_derived(light, drawn.shadowed, factor, maps["diffuse"])
 
+    def rows(self, group: int, pair: Pair | None, drawn: Draw) -> SampleRows:
+        """What `augmented` mixes, for the same arguments."""
+        shared, number = self._groups[group][1].shared, self._shard_of[group]
+        if pair is not None:
+            s, d, light, image = (np.array([row]) for row in (pair.specular, pair.diffuse, pair.light, pair.image))
+            return SampleRows(number, shared, image[None], s, d, light, pair.metallic, pair.roughness)
+        basis, on, r = self._basis[group], list(drawn.lights), drawn.roughness_index
+        s, d, light = basis.specular[on, r], basis.diffuse[on], basis.environment[on]
+        return SampleRows(number, shared, basis.image[on, r], s, d, light, drawn.metallic, basis.roughness[r])
+
     @functools.cache  # noqa: B019 - a dataset lives as long as the training that reads it
-    def _mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
+    def mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
+        """Of a group's object, as `unirender.training.repaint` has it."""
         maps = _shared_maps(*self._groups[group])
         return mean_colour(maps["albedo"], maps["mask"])
 
-    def _derived_light(self, group: int, rows: Mapping[str, Rows], drawn: Draw) -> Maps:
+    @property
+    def derived(self) -> list[DerivedLight] | None:
+        """Of each shard; None: the folder was opened without."""
+        return self._derived
+
+    def _derived_light(self, rows: SampleRows, drawn: Draw) -> Maps:
         """s and d as derived for what stands in `rows`, under the same augmentation but for the exposure.
 
         Raises:
@@ -213,8 +252,8 @@ class GroupDataset:
         """
         if self._derived is None:
             raise UnirenderError("derived light was drawn, but the data was opened without it; pass derived=True")
-        stored = self._derived[self._shard_of[group]]
-        own = {name: stored.of(rows[name], drawn.shadowed) for name in ("specular", "diffuse")}
+        stored = self._derived[rows.shard]
+        own = {name: stored.of(getattr(rows, name), drawn.shadowed) for name in ("specular", "diffuse")}
         maps = mix_lights({name: _trailing(pixels) for name, pixels in own.items()}, drawn.weights)
         maps = quarter_turn(maps, drawn.turns)
         return permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
@@ -237,7 +276,8 @@ def make_batch(
     dataset: GroupDataset, first: int, size: int, seed: int, augmentation: Augmentation, rows: slice = ALL_ROWS
 ) -> Batch:
     """Samples `first` to `first + size` of the stream as float32 tensors; `rows`: these of them only."""
-    samples = [dataset.sample(index, seed, augmentation) for index in range(first, first + size)[rows]]
+    drawn = [dataset.drawn(index, seed, augmentation) for index in range(first, first + size)[rows]]
+    samples = [dataset.augmented(*each) for each in drawn]
     batch: Batch = {}
     derived = (*DERIVED_MAPS, *DERIVED_FLAGS) if "derived" in samples[0] else ()
     for name in (*BATCH_MAPS, *derived):
@@ -246,7 +286,7 @@ def make_batch(
         for i, sample in enumerate(samples):
             stacked[i] = np.moveaxis(sample[name], -1, 0)
         batch[name] = torch.from_numpy(stacked)
-    return batch
+    return moved(batch, [draw.move for _, _, draw in drawn])
 
 
 def _basis(group: Group) -> _Basis:

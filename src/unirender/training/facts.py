@@ -12,6 +12,7 @@ import diffusers
 import torch
 
 import unirender
+from unirender.training.device_data import DeviceSource
 from unirender.training.source import BatchSource, ShardSource
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def training_facts(trainer: "Trainer") -> dict[str, Any]:
 
 def data_facts(source: BatchSource | None) -> dict[str, Any] | None:
     """Name, fingerprint and size of an open data folder; None for a source that is none."""
+    if isinstance(source, DeviceSource):
+        source = source.source
     if not isinstance(source, ShardSource) or source.dataset is None:
         return None
     dataset = source.dataset

@@ -150,8 +150,15 @@ def _decibels(
 
 
 def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
-    """Gaussian noise drawn on the CPU, so that a seed means the same on every device."""
-    return torch.randn(x.shape, generator=generator).to(x)
+    """Gaussian noise from a CPU generator.
+
+    On CUDA, where a batch's would keep the CPU busy for longer than its step takes, a generator of the device draws it,
+    whose seed comes from this one: a seed then means the same on every GPU, but another stream than on a CPU.
+    """
+    if x.device.type != "cuda":
+        return torch.randn(x.shape, generator=generator).to(x)
+    own = torch.Generator(x.device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
+    return torch.randn(x.shape, generator=own, device=x.device, dtype=torch.float32).to(x)
 
 
 def _by_row(error: Float[Tensor, "b c h w"], rows: Float[Tensor, " b"] | None) -> Float[Tensor, "b c h w"]:

@@ -95,6 +95,9 @@ class Augmentation:
     derived: float = 0.0  # probability that a renderer sees s and d derived from the light
     shadowed: float = 0.0  # share of these that has the shadows that the picture shows, and not none
     repaint: float = 0.0  # probability that an object takes on another's mean colour; close, not exact
+    move: float = (
+        0.0  # probability of a roll, a zoom and a shift of the picture; close; see `unirender.training.moving`
+    )
 
 
 @dataclass(frozen=True)
@@ -153,12 +156,6 @@ _TINY_COLOUR = dataclasses.replace(
     augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
     batch_size=24,
 )
-# `small` on many pictures, with more weight on metallic and roughness; `small_renderer` comes after it.
-_SMALL_COLOUR = dataclasses.replace(
-    _SMALL,
-    loss=dataclasses.replace(_SMALL.loss, material=3.0),
-    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
-)
 # `tiny` with a picture encoder: first that alone, then with the decoder that it serves.
 _TINY_ENCODER = dataclasses.replace(
     _TINY_RENDERER,
@@ -169,6 +166,21 @@ _TINY_ENCODER = dataclasses.replace(
     batch_size=96,
     trains="encoder",
     p_render=0.0,
+)
+# What `small` ships as: its network wider below the finest level, and with attention at the level above the lowest, on
+# pictures moved in the frame, with more weight on materials and normals.
+_SMALL_WIDE = dataclasses.replace(
+    _SMALL,
+    model=dataclasses.replace(_SMALL.model, block_out_channels=(64, 96, 128, 192), attention_levels=(2, 3)),
+    loss=dataclasses.replace(_SMALL.loss, material=2.0, normal=3.0),
+    augmentation=dataclasses.replace(_SMALL.augmentation, turn=0.0, move=0.5),
+    optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3, warmup_steps=50),
+)
+# The same on many pictures whose light need not be derived; `small_renderer` comes after it.
+_SMALL_COLOUR = dataclasses.replace(
+    _SMALL,
+    loss=dataclasses.replace(_SMALL.loss, material=3.0),
+    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
 )
 _SD_MODEL = ModelConfig(
     resolution=512,
@@ -220,6 +232,7 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
+    "small_wide": _SMALL_WIDE,
     "small_colour": _SMALL_COLOUR,
     "small_renderer": dataclasses.replace(
         _SMALL,

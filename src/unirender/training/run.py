@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, DType, usage
@@ -18,6 +18,7 @@ from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 if TYPE_CHECKING:
     from unirender.training.validation import Validate
 
+Batches = Literal["auto", "cpu", "device"]
 MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
 ScoreNames = Callable[[], Sequence[str]]  # names of the scores that such a function gives
 
@@ -33,7 +34,7 @@ class Train:
     ablations of tiny by name."""
     init: Path | None = None
     """Begin with the weights of this pipeline folder, or of a shipped one by its name, instead of random ones; its
-    network must be the preset's."""
+    network must be the preset's, or a narrower form of it."""
     init_from: Path | None = None
     """Begin with the weights of this Stable Diffusion folder (version 1 or 2, diffusers format) and work on the latents
     of its autoencoder; for the presets sd15, sd21 and paper."""
@@ -51,6 +52,9 @@ class Train:
     """Instead of the preset's."""
     device: Device = "auto"
     """auto: cuda, then mps, then cpu, whichever is there."""
+    batches: Batches = "auto"
+    """Where batches are mixed and augmented. device: on the GPU, in whose memory the packed data then lie. auto: there,
+    where they take no more than a third of what is free; else on the CPU."""
     dtype: DType = "auto"
     """Of the autocast; weights stay float32. auto: bfloat16 only on hardware that computes in it."""
     seed: int = 0
@@ -173,6 +177,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
 
     from unirender.models.precision import resolve_device, resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
+    from unirender.training.device_data import DeviceSource, fits
     from unirender.training.export import export_pipeline
     from unirender.training.groups import list_shards
     from unirender.training.live import live_report
@@ -218,13 +223,17 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         rows=trainer.split.own,
         group_size=config.group_size,
     )
-    source.open()
+    dataset = source.open()
+    on_device = options.batches == "device" or (options.batches == "auto" and fits(dataset, device))
+    if on_device:
+        source = DeviceSource(source, device)
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
     place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""
     say = functools.partial(Console().print, soft_wrap=True, highlight=False, markup=False)
     at_once = trainer.split.at_once
     passes = "one pass at a time" if at_once == 1 else f"{at_once} passes side by side"
-    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}")
+    made = f", batches made on {device}" if on_device else ""
+    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}{made}")
     if processes.is_main:
         say(f"memory: {training_bytes(trainer.model, config.optimizer.kind)}")
     resumed = (out / STATE_FILE).is_file()

@@ -22,6 +22,7 @@ from unirender.shipped import checkpoint_folder
 from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
+from unirender.training.widening import can_widen, widened
 
 FEATURES_PREFIXES = ("vgg.", "inverse.vgg.", "encoder.", "inverse.encoder.")  # of the entries of a picture's features
 _KINDS = {True: "one network for both directions (unified)", False: "a network for each direction (unified=False)"}
@@ -98,18 +99,21 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
 def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:
     """Gives a trainer, and its average, the weights of another network.
 
+    A wider form of the network begins near it (`unirender.training.widening`).
     With another physics prior than the network's the image stream's last convolution starts at zero again. Features of
     a clean picture that the network has not are added.
 
     Args:
         trainer: that has not begun.
-        network: of the same shape.
+        network: of the same shape, or a narrower form of the trainer's.
         history: what `unirender.training.export.read_history` says of it.
 
     Raises:
         UnirenderError: the networks differ.
     """
     model = trainer.model
+    if can_widen(model, network):
+        network = widened(trainer.config.model, network)
     own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
     if network.config["picture_features"] == "none":  # what they add begins at zero
         own = {k: v for k, v in own.items() if not k.startswith(FEATURES_PREFIXES)}

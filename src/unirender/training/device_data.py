@@ -1,0 +1,291 @@
+"""Batches made on the device: a GPU trains faster than a few cores can mix its pictures.
+
+The rows of the packed shards lie on the device in half precision, and a whole batch is augmented there at once. What a
+sample is, `GroupDataset.drawn` says as ever, from (seed, index); the operations are twins of those of
+`unirender.training.augment`, `.repaint` and `unirender.symmetries`, so that the batches are those of a `ShardSource` to
+rounding (tests/unirender/test_device_data.py).
+
+What is linear in the light is a weighted sum of rows. A sample with fewer lights or metallic nodes than others of its
+batch has rows of weight 0 in their place:
+
+    image = sum over lights l and nodes n of  weight[l] node[n] pixels[row[l, n]]
+
+Notation: b samples, l lights, n nodes.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from unirender.camera import Camera
+from unirender.color import LUMINANCE_REC709
+from unirender.errors import UnirenderError
+from unirender.exposure import MASK_THRESHOLD, PERCENTILE
+from unirender.models.priors import PRIORS
+from unirender.symmetries import LIGHT_MAPS
+from unirender.training.augment import COLOUR_MAPS, Draw, metallic_weights
+from unirender.training.data import DERIVED_MAPS, Batch, GroupDataset, SampleRows
+from unirender.training.groups import SCALAR_CHANNELS, Pair
+from unirender.training.moving import moved
+from unirender.training.repaint import CHANNEL_RANGE, POWER_RANGE
+from unirender.training.source import ShardSource
+
+SHARE = 1 / 3  # of a GPU's free memory that data may take of themselves: a training needs the rest
+
+Drawn = tuple[int, Pair | None, Draw]
+
+
+class DeviceSource:
+    """The batches of a `ShardSource`, made on a device where its groups lie.
+
+    Its place in the stream is the other's: a run goes on with either.
+
+    Args:
+        source: that nothing has been read from; of this process's rows.
+        device: has room for all packed pictures, 2 bytes a value.
+    """
+
+    def __init__(self, source: ShardSource, device: torch.device) -> None:
+        self.source, self.device = source, device
+        self._groups: DeviceGroups | None = None
+
+    @property
+    def dataset(self) -> GroupDataset | None:
+        """What the batches are made of; None before it is opened."""
+        return self.source.dataset
+
+    def next(self) -> Batch:
+        own = self.source
+        dataset = own.open()
+        if self._groups is None or self._groups.dataset is not dataset:
+            self._groups = DeviceGroups(dataset, self.device)
+        indices = range(own.consumed, own.consumed + own.batch_size)[own.rows]
+        batch = self._groups.batch([dataset.drawn(index, own.seed, own.augmentation) for index in indices])
+        own.consumed += own.batch_size
+        return batch
+
+    def read_ahead(self) -> None:
+        """There is nothing to read: all lies on the device."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.source.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.source.load_state_dict(state)
+
+    def refresh(self) -> str | None:
+        return self.source.refresh()
+
+    def close(self) -> None:
+        """Frees the device's memory."""
+        self._groups = None
+        self.source.close()
+
+
+def fits(dataset: GroupDataset, device: torch.device) -> bool:
+    """Whether a GPU holds a data set beside a training: in `SHARE` of the memory that is free."""
+    if device.type != "cuda":
+        return False
+    free, _ = torch.cuda.mem_get_info(device)
+    return packed_bytes(dataset) <= SHARE * free
+
+
+def packed_bytes(dataset: GroupDataset) -> int:
+    """Of the groups on a device."""
+    arrays = [array for shard in dataset.shards for array in (shard.pixels, shard.shared, shard.environment)]
+    derived = [array for own in dataset.derived or () for array in (own.unshadowed, own.shadowed)]
+    return sum(array.nbytes for array in (*arrays, *derived))
+
+
+class DeviceGroups:
+    """The groups of a data set on a device."""
+
+    def __init__(self, dataset: GroupDataset, device: torch.device) -> None:
+        self.dataset, self.device = dataset, device
+        shards = dataset.shards
+        self.pixels = _joined([shard.pixels for shard in shards], device)
+        self.shared = _joined([_nine_channels(shard.shared) for shard in shards], device)
+        self.environment = _joined([shard.environment for shard in shards], device)
+        self.first = {
+            name: _starts([len(getattr(s, name)) for s in shards]) for name in ("pixels", "shared", "environment")
+        }
+        self.derived: tuple[Tensor, Tensor] | None = None  # without and with shadows
+        if dataset.derived is not None:
+            kinds = [[getattr(own, kind) for own in dataset.derived] for kind in ("unshadowed", "shadowed")]
+            self.derived = _joined(kinds[0], device), _joined(kinds[1], device)
+            self.first["derived"] = _starts([len(own.unshadowed) for own in dataset.derived])
+
+    def batch(self, drawn: Sequence[Drawn]) -> Batch:
+        """Float32 maps [b c h w] by the names of a batch, as `unirender.training.data.make_batch` gives them.
+
+        Args:
+            drawn: what each sample is made of, as `GroupDataset.drawn` says it.
+        """
+        draws = [draw for _, _, draw in drawn]
+        rows = [self.dataset.rows(*each) for each in drawn]
+        lights = max(len(own.diffuse) for own in rows)
+        weight = self._tensor([_padded(draw.weights, lights) for draw in draws])
+        maps = self._shared(rows)
+        maps["image"] = self._pictures(rows, draws, weight)
+        for name in ("specular", "diffuse"):
+            maps[name] = self._mixed(self.pixels, [self._at("pixels", own, getattr(own, name)) for own in rows], weight)
+        maps = self._repainted(maps, draws)
+        if self.derived is not None:
+            maps |= self._derived_light(rows, draws, weight, self.derived)
+        maps = self._turned(maps, [draw.turns for draw in draws])
+        environment = self.environment.flatten(0, 1)  # stored under each quarter turn
+        at = [
+            4 * self._at("environment", own, own.environment) + draw.turns
+            for own, draw in zip(rows, draws, strict=True)
+        ]
+        maps["environment"] = self._mixed(environment, at, weight)
+        maps = self._mirrored(maps, self._tensor([draw.mirror for draw in draws]))
+        order = self._tensor([draw.order for draw in draws])
+        for name in {*COLOUR_MAPS, *DERIVED_MAPS} & maps.keys():
+            maps[name] = maps[name].gather(1, order[:, :, None, None].expand_as(maps[name]))
+        maps = self._exposed(maps, draws)
+        if self.derived is not None:
+            for name in ("derived", "shadowed"):
+                maps[name] = self._tensor([float(getattr(draw, name)) for draw in draws])[:, None, None, None]
+        return moved(maps, [draw.move for draw in draws])
+
+    def _tensor(self, values: Sequence) -> Tensor:
+        array = np.array(values)
+        return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float64 else array).to(self.device)
+
+    def _at(self, of: str, rows: SampleRows, own: Int[np.ndarray, "..."] | int) -> Int[np.ndarray, "..."]:
+        """Rows of a shard as rows on the device."""
+        return np.asarray(self.first[of][rows.shard] + own)
+
+    def _mixed(
+        self, bank: Float[Tensor, "m 3 h w"], at: Sequence[np.ndarray], weight: Float[Tensor, "b l 3"]
+    ) -> Float[Tensor, "b 3 h w"]:
+        places = self._tensor([_padded(own, weight.shape[1]) for own in at])
+        return torch.einsum("blchw,blc->bchw", bank[places].float(), weight)
+
+    def _pictures(
+        self, rows: Sequence[SampleRows], draws: Sequence[Draw], weight: Float[Tensor, "b l 3"]
+    ) -> Float[Tensor, "b 3 h w"]:
+        nodes = max(own.image.shape[1] for own in rows)
+        at = [_padded(_padded(self._at("pixels", own, own.image), weight.shape[1]).T, nodes).T for own in rows]
+        parts = [
+            metallic_weights(draw.metallic) if own.image.shape[1] > 1 else np.ones(1)
+            for own, draw in zip(rows, draws, strict=True)
+        ]
+        node = self._tensor([_padded(part, nodes) for part in parts])
+        weights = weight[:, :, None] * node[:, None, :, None]
+        return torch.einsum("blnchw,blnc->bchw", self.pixels[self._tensor(at)].float(), weights)
+
+    def _shared(self, rows: Sequence[SampleRows]) -> Batch:
+        """What does not depend on the light."""
+        shared = self.shared[self._tensor([self._at("shared", own, own.shared) for own in rows])].float()
+        maps = {"albedo": shared[:, :3], "normal": shared[:, 3:6], "mask": shared[:, 6:7]}
+        inside = (maps["mask"] > 0).float()
+        for channel, name in enumerate(("roughness", "metallic"), start=SCALAR_CHANNELS):
+            one = [getattr(own, name) for own in rows]
+            value = self._tensor([np.nan if own is None else own for own in one])[:, None, None, None]
+            maps[name] = torch.where(value.isnan(), shared[:, channel : channel + 1], inside * value)
+        return maps
+
+    def _repainted(self, maps: Batch, draws: Sequence[Draw]) -> Batch:
+        """Twin of `unirender.training.repaint`."""
+        rows = [i for i, draw in enumerate(draws) if draw.paint is not None]
+        if not rows:
+            return maps
+        own = {name: value[rows] for name, value in maps.items()}
+        colours = self._tensor([self.dataset.mean_colour(draw.paint) for draw in draws if draw.paint is not None])
+        power = (colours.log() / _mean_colour(own["albedo"], own["mask"]).log()).clamp(*POWER_RANGE)
+        albedo = own["albedo"].clamp(0, 1) ** power[:, :, None, None]
+        closed_form = PRIORS["split_sum"].radiance
+        difference = closed_form(own | {"albedo": albedo}, Camera()) - closed_form(own, Camera())
+        image = (own["image"] + own["mask"] * difference).clamp(min=0)
+        changed = {"image": image, "albedo": albedo * (own["mask"] > 0)}
+        return maps | {name: _replaced(maps[name], rows, value) for name, value in changed.items()}
+
+    def _derived_light(
+        self, rows: Sequence[SampleRows], draws: Sequence[Draw], weight: Tensor, kinds: tuple[Tensor, Tensor]
+    ) -> Batch:
+        """s and d as derived from the light; zeros for samples without."""
+        assert self.dataset.derived is not None
+        maps = {
+            name: self.pixels.new_zeros(len(rows), *self.pixels.shape[1:], dtype=torch.float32) for name in DERIVED_MAPS
+        }
+        for shadowed, bank in enumerate(kinds):
+            some = [i for i, draw in enumerate(draws) if draw.derived and draw.shadowed == bool(shadowed)]
+            for name in ("specular", "diffuse") if some else ():
+                stored = [self.dataset.derived[rows[i].shard].rows[getattr(rows[i], name)] for i in some]
+                at = [self._at("derived", rows[i], own) for i, own in zip(some, stored, strict=True)]
+                maps[f"derived_{name}"][some] = self._mixed(bank, at, weight[some])
+        return maps
+
+    def _turned(self, maps: Batch, turns: Sequence[int]) -> Batch:
+        """Twin of `unirender.symmetries.quarter_turn`; the light has its own."""
+        for count in range(1, 4):
+            rows = [i for i, own in enumerate(turns) if own == count]
+            if not rows:
+                continue
+            turned = {name: torch.rot90(value[rows], count, dims=(2, 3)) for name, value in maps.items()}
+            x, y, z = turned["normal"].unbind(dim=1)
+            for _ in range(count):
+                x, y = -y, x
+            turned["normal"] = torch.stack([x, y, z], dim=1)
+            maps = {name: _replaced(value, rows, turned[name]) for name, value in maps.items()}
+        return maps
+
+    def _mirrored(self, maps: Batch, flip: Bool[Tensor, " b"]) -> Batch:
+        """Twin of `unirender.symmetries.mirror`."""
+        rows = flip[:, None, None, None]
+        flipped = {name: value.flip(-1) for name, value in maps.items()}
+        flipped["normal"] = flipped["normal"] * flipped["normal"].new_tensor([-1, 1, 1])[:, None, None]
+        return {name: torch.where(rows, flipped[name], value) for name, value in maps.items()}
+
+    def _exposed(self, maps: Batch, draws: Sequence[Draw]) -> Batch:
+        """The gauge with the drawn targets: twin of `unirender.exposure.exposure_factor`.
+
+        Raises:
+            UnirenderError: an object receives no light.
+        """
+        target = self._tensor([np.nan if draw.exposure_target is None else draw.exposure_target for draw in draws])
+        luminance = (maps["diffuse"] * self._tensor(list(LUMINANCE_REC709))[:, None, None]).sum(dim=1).flatten(1)
+        inside = (maps["mask"] > MASK_THRESHOLD).flatten(1)
+        level = torch.nanquantile(torch.where(inside, luminance, torch.nan), PERCENTILE / 100, dim=1)
+        if not (level > 0).logical_or(target.isnan()).all():
+            raise UnirenderError("exposure: an object of the batch receives no light; remake the dataset")
+        factor = torch.where(target.isnan(), 1.0, target / level)[:, None, None, None]
+        linear = {*LIGHT_MAPS, *DERIVED_MAPS}
+        return {name: value * factor if name in linear else value for name, value in maps.items()}
+
+
+def _mean_colour(albedo: Float[Tensor, "b 3 h w"], mask: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 3"]:
+    """Twin of `unirender.training.repaint.mean_colour`."""
+    inside = (mask > 0).float()
+    logarithms = albedo.clamp(*CHANNEL_RANGE).log() * inside
+    return (logarithms.sum(dim=(2, 3)) / inside.sum(dim=(2, 3)).clamp(min=1)).exp()
+
+
+def _replaced(values: Float[Tensor, "b c h w"], rows: Sequence[int], by: Tensor) -> Float[Tensor, "b c h w"]:
+    return values.index_copy(0, torch.tensor(rows, device=values.device), by.to(values))
+
+
+def _joined(arrays: Sequence[np.ndarray], device: torch.device) -> Tensor:
+    return torch.cat([torch.from_numpy(np.array(own)).to(device) for own in arrays])
+
+
+def _starts(lengths: Sequence[int]) -> Int[np.ndarray, " shards"]:
+    return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
+
+
+def _nine_channels(shared: np.ndarray) -> np.ndarray:
+    """With places for roughness and metallic, whether it has them or not."""
+    missing = SCALAR_CHANNELS + 2 - shared.shape[1]
+    return np.pad(np.asarray(shared), [(0, 0), (0, missing), (0, 0), (0, 0)])
+
+
+def _padded(values: np.ndarray, length: int) -> np.ndarray:
+    """More along the first axis: weights of 0, and the first row again."""
+    more = [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)]
+    return np.pad(values, more) if np.issubdtype(values.dtype, np.floating) else np.pad(values, more, mode="edge")

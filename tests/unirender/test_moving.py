@@ -1,0 +1,98 @@
+"""Objects moved in the frame: what a quarter turn, a shift by whole pixels and a zoom must give."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from synthetic_shards import own_picture
+from torch import Tensor
+
+from unirender.lighting import rotate_environment
+from unirender.surface_light import diffuse_light
+from unirender.symmetries import quarter_turn
+from unirender.training.augment import to_maps, turn_rotation
+from unirender.training.moving import Move, moved, rolled_environment
+
+STILL = Move(0.0, 1.0, (0.0, 0.0))
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def maps() -> dict[str, np.ndarray]:
+    image, intrinsics = own_picture(3, SIZE)
+    light = np.broadcast_to(np.linspace(2, 0.2, 16, dtype=np.float32)[:, None, None], (16, 32, 3))  # from above
+    d = diffuse_light(intrinsics.require("normal")["normal"], light)
+    return to_maps(image[..., :3], intrinsics) | {"environment": light, "diffuse": d}
+
+
+def batch(maps: dict[str, np.ndarray], count: int = 1) -> dict[str, Tensor]:
+    stacked = {
+        name: np.moveaxis(value, -1, 0).astype(np.float32)[None].repeat(count, 0) for name, value in maps.items()
+    }
+    return {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in stacked.items()}
+
+
+def test_who_stays_is_untouched_and_a_move_of_nothing_changes_nothing(maps: dict[str, np.ndarray]) -> None:
+    before = batch(maps, 3)
+    after = moved(before, [None, STILL, Move(0.3, 1.1, (0.02, 0.0))])
+    for name, value in after.items():
+        assert torch.equal(value[0], before[name][0]), name
+        atol = 1e-4 if name in ("normal", "environment") else 1e-5
+        torch.testing.assert_close(value[1], before[name][1], rtol=1e-4, atol=atol)
+        assert not torch.allclose(value[2], before[name][2], atol=1e-2) or name in ("roughness", "metallic"), name
+    assert moved(before, [None] * 3) is before
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_a_roll_by_quarters_is_the_quarter_turn(maps: dict[str, np.ndarray], turns: int) -> None:
+    rolled = moved(batch(maps), [Move(turns * math.pi / 2, 1.0, (0.0, 0.0))])
+    expected = batch(quarter_turn(maps, turns))
+    for name, value in expected.items():
+        torch.testing.assert_close(
+            rolled[name], value, rtol=1e-3, atol=1e-3, msg=lambda text, name=name: f"{name}: {text}"
+        )
+    wrong = batch(quarter_turn(maps, turns + 1))
+    assert (rolled["albedo"] - wrong["albedo"]).abs().max() > 0.05  # the twin
+
+
+def test_a_shift_by_whole_pixels_moves_pixels(maps: dict[str, np.ndarray]) -> None:
+    before = batch(maps)
+    after = moved(before, [Move(0.0, 1.0, (2 / SIZE, -3 / SIZE))])  # two to the right, three up
+    for name in ("image", "albedo", "mask", "specular", "normal"):
+        torch.testing.assert_close(
+            after[name][..., 3:-3, 2:], before[name].roll((-3, 2), (2, 3))[..., 3:-3, 2:], rtol=1e-4, atol=1e-4
+        )
+    torch.testing.assert_close(after["environment"], before["environment"], rtol=0, atol=1e-4)
+
+
+def test_a_zoom_enlarges_about_the_middle(maps: dict[str, np.ndarray]) -> None:
+    before = batch(maps)
+    larger, smaller = (moved(before, [Move(0.0, zoom, (0.0, 0.0))])["mask"].sum() for zoom in (1.15, 1 / 1.15))
+    own = before["mask"].sum()
+    assert larger / own == pytest.approx(1.15**2, rel=0.06)
+    assert smaller / own == pytest.approx(1 / 1.15**2, rel=0.06)
+
+
+def test_the_light_turns_with_the_object(maps: dict[str, np.ndarray]) -> None:
+    """d of the rolled object is what its rolled normals receive from the rolled light, and not from the old one."""
+    after = moved(batch(maps), [Move(0.6, 1.0, (0.0, 0.0))])
+    normal, light, d, mask = (
+        after[n][0].permute(1, 2, 0).numpy() for n in ("normal", "environment", "diffuse", "mask")
+    )
+    whole = mask[..., 0] == 1
+    error, unturned = (
+        np.abs(diffuse_light(normal, np.ascontiguousarray(lit)) - d)[whole].mean()
+        for lit in (light, maps["environment"])
+    )
+    assert error < 0.02
+    assert unturned > 2 * error
+
+
+@pytest.mark.parametrize("turns", [1, 3])
+def test_lights_turn_as_the_reference_turns_them(turns: int) -> None:
+    light = np.random.default_rng(0).uniform(0, 2, (16, 32, 3)).astype(np.float32)
+    made = rolled_environment(torch.from_numpy(light).permute(2, 0, 1)[None], torch.tensor([turns * math.pi / 2]))
+    expected = rotate_environment(light, turn_rotation(turns))
+    np.testing.assert_allclose(made[0].permute(1, 2, 0).numpy()[1:-1], expected[1:-1], atol=1e-4)
+    assert np.abs(made[0].permute(1, 2, 0).numpy()[1:-1] - light[1:-1]).mean() > 0.1  # the twin
