@@ -95,7 +95,12 @@ def checkpoint_text(folder: Path) -> str:
     """What a shipped checkpoint was trained on, from the files that the training wrote beside its weights."""
     facts = json.loads((folder / "training.json").read_text())
     runs = [*facts.get("continues", []), facts]
-    minutes, steps, samples = (sum(run[name] for run in runs) for name in ("minutes", "steps", "samples"))
+    steps, samples = (sum(run[name] for run in runs) for name in ("steps", "samples"))
+    minutes: dict[str, float] = {}
+    for run in runs:
+        device = run.get("device", facts["device"])
+        minutes[device] = minutes.get(device, 0.0) + run["minutes"]
+    spent = " and ".join(f"{count:.0f} minutes on {device}" for device, count in minutes.items())
     pixels = [run.get("train", facts["train"])["model"]["resolution"] for run in runs]
     parts = f" in {len(runs)} runs, each from the weights of the one before" if len(runs) > 1 else ""
     if len(set(pixels)) > 1:
@@ -107,8 +112,7 @@ def checkpoint_text(folder: Path) -> str:
             parameters += sum(math.prod(weights.get_slice(name).get_shape()) for name in weights.keys())  # noqa: SIM118 - no dict
     return (
         f"- `{folder.name}`, {pixels[-1]} pixels: {parameters / 1e6:.1f} million parameters. It was trained for "
-        f"{minutes:.0f} minutes on {facts['device']} ({facts['autocast']}): {steps:,} steps, {samples:,} samples"
-        f"{parts}."
+        f"{spent} ({facts['autocast']}): {steps:,} steps, {samples:,} samples{parts}."
     )
 
 

@@ -175,6 +175,9 @@ def test_the_figures_of_a_continued_checkpoint_are_those_of_all_its_runs(tmp_pat
     assert "101 minutes on cpu (bfloat16): 6,000 steps, 60,000 samples in 3 runs" in text
     assert text.startswith("- `checkpoint`, 64 pixels: 2.5 million parameters")
     assert text.count("pixels") == 1
+    elsewhere = {"continues": [earlier | {"device": "cuda"}, earlier]}
+    (folder / "training.json").write_text(json.dumps(facts | elsewhere))
+    assert "trained for 20 minutes on cuda and 81 minutes on cpu (bfloat16)" in readme.checkpoint_text(folder)
     larger = {"train": {"model": {"resolution": 128}}, "continues": [earlier | {"train": facts["train"]}]}
     (folder / "training.json").write_text(json.dumps(facts | larger))
     text = readme.checkpoint_text(folder)
