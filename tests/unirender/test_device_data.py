@@ -10,12 +10,16 @@ import torch
 from synthetic_shards import group_members, maps_members, write_dataset, write_shard
 from tiny_models import TRAIN
 
+from unirender.errors import UnirenderError, UsageError
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset, make_batch
-from unirender.training.device_data import DeviceGroups, DeviceSource, fits, packed_bytes
+from unirender.training.device_data import DeviceGroups, DeviceSource, fits, packed_bytes, room
+from unirender.training.facts import training_facts
+from unirender.training.memory import TrainingBytes
 from unirender.training.presets import Augmentation
 from unirender.training.run import Train, train
 from unirender.training.source import ShardSource
+from unirender.training.trainer import RunConfig, Trainer
 
 EVERYTHING = Augmentation(mix=0.7, permute=0.5, turn=0.5, repaint=0.5, derived=0.6, shadowed=0.5, move=0.5)
 ONE_BY_ONE = {
@@ -32,7 +36,8 @@ ONE_BY_ONE = {
     "everything": EVERYTHING,
 }
 CPU = torch.device("cpu")
-CONFIG = dataclasses.replace(TRAIN, augmentation=dataclasses.replace(EVERYTHING, derived=0.0))
+EXACT = dataclasses.replace(EVERYTHING, derived=0.0)
+CONFIG = dataclasses.replace(TRAIN, augmentation=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -108,24 +113,68 @@ def test_a_growing_folder_is_taken_in(folder: Path, tmp_path: Path) -> None:
     assert "new" in source.dataset.keys
 
 
-def test_what_it_holds_is_counted(folder: Path) -> None:
-    dataset = GroupDataset(folder)
+@pytest.mark.parametrize("derived", [False, True])
+def test_what_it_holds_is_counted(folder: Path, derived: bool) -> None:
+    dataset = GroupDataset(folder, derived=derived)
     groups = DeviceGroups(dataset, CPU)
-    held = sum(bank.nbytes for bank in (groups.pixels, groups.environment))
-    assert held < packed_bytes(dataset) <= held + groups.shared.nbytes
-    assert not fits(dataset, CPU)  # a CPU reads from the shards
+    banks = (groups.pixels, groups.shared, groups.environment, *(groups.derived or ()))
+    assert packed_bytes(dataset) == sum(bank.nbytes for bank in banks)
+    assert len(banks) == (5 if derived else 3)
+
+
+def test_a_gpu_takes_what_a_training_leaves() -> None:
+    training = TrainingBytes(weights=7, gradients=100, moments=200, average=7)  # the weights are there already
+    assert room(600, training) == 100
+    assert room(200, training) == 0
+
+
+def test_a_cpu_reads_from_the_shards(folder: Path, tmp_path: Path) -> None:
+    assert not fits(GroupDataset(folder), CPU, TrainingBytes(0, 0, 0, 0))
+    data = write_dataset(tmp_path / "data", shards=1, groups=1, size=32)
+    with pytest.raises(UsageError, match="--batches device: the training is on cpu, expected a CUDA device"):
+        train(Train(data, steps=1, batches="device", device="cpu"), CONFIG, tmp_path / "run")
+
+
+def test_light_that_was_not_derived_is_refused(folder: Path) -> None:
+    dataset = GroupDataset(folder)
+    drawn = [dataset.drawn(0, 0, Augmentation(derived=1.0))]
+    with pytest.raises(UnirenderError, match="opened without it"):
+        DeviceGroups(dataset, CPU).batch(drawn)
+
+
+def test_an_object_without_light_is_named(tmp_path: Path) -> None:
+    write_dataset(tmp_path, shards=1, groups=1)
+    dataset = GroupDataset(tmp_path)
+    groups, drawn = DeviceGroups(dataset, CPU), [dataset.drawn(0, 0, Augmentation())]
+    groups.batch(drawn)
+    groups.pixels.zero_()
+    with pytest.raises(UnirenderError, match="group train-000000_g0 is 0"):
+        groups.batch(drawn)
+    groups.shared.zero_()
+    with pytest.raises(UnirenderError, match="group train-000000_g0 is nan"):
+        groups.batch(drawn)
+
+
+def test_batches_of_one_at_a_time_groups(tmp_path: Path) -> None:
+    write_dataset(tmp_path, "one-at-a-time", shards=1, groups=2, lights=4, roughness=(40,), metallic=(50,))
+    source = ShardSource(tmp_path, 8, 3, augmentation=EXACT, size=16, group_size=4)
+    made, read = DeviceSource(source, CPU).next(), make_batch(source.open(), 0, 8, 3, EXACT)
+    for name, value in read.items():
+        torch.testing.assert_close(made[name], value, rtol=2e-4, atol=2e-4)
 
 
 def test_a_run_with_it_is_the_run_without(tmp_path: Path) -> None:
     """Same samples, hence the same losses to rounding; and the same facts of the data."""
     data = write_dataset(tmp_path / "data", shards=1, groups=2, size=32)
-    lines, facts = {}, {}
-    for batches in ("cpu", "device"):
-        out = tmp_path / batches
-        train(Train(data, out=out, steps=2, log_every=1, dtype="float32", parallel=1, batches=batches), CONFIG, out)
-        lines[batches] = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-        facts[batches] = json.loads((out / "pipeline/training.json").read_text())["data"]
-    assert facts["device"] == facts["cpu"]
-    for read, made in zip(lines["cpu"], lines["device"], strict=True):
+    losses, facts = [], []
+    for kind in ("reader", "device"):
+        run = Trainer(CONFIG, RunConfig(tmp_path / kind, steps=2, log_every=1), CPU, torch.float32)
+        source = ShardSource(data, CONFIG.batch_size, 0, augmentation=CONFIG.augmentation, size=32)
+        run.fit(source if kind == "reader" else DeviceSource(source, CPU))
+        lines = (tmp_path / kind / "log.jsonl").read_text().splitlines()
+        losses.append([json.loads(line) for line in lines])
+        facts.append(training_facts(run)["data"])
+    assert facts[0] == facts[1]
+    for read, made in zip(*losses, strict=True):
         assert made["albedo"] == pytest.approx(read["albedo"], rel=1e-3)
         assert made["image"] == pytest.approx(read["image"], rel=1e-3)

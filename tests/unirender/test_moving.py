@@ -8,6 +8,7 @@ import torch
 from synthetic_shards import own_picture
 from torch import Tensor
 
+from unirender.errors import UnirenderError
 from unirender.lighting import rotate_environment
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
@@ -96,3 +97,9 @@ def test_lights_turn_as_the_reference_turns_them(turns: int) -> None:
     expected = rotate_environment(light, turn_rotation(turns))
     np.testing.assert_allclose(made[0].permute(1, 2, 0).numpy()[1:-1], expected[1:-1], atol=1e-4)
     assert np.abs(made[0].permute(1, 2, 0).numpy()[1:-1] - light[1:-1]).mean() > 0.1  # the twin
+
+
+def test_frames_that_are_not_square_are_refused(maps: dict[str, np.ndarray]) -> None:
+    wide = {name: value[..., :-4, :] for name, value in batch(maps).items() if name != "environment"}
+    with pytest.raises(UnirenderError, match="expected square ones"):
+        moved(wide, [STILL])

@@ -57,6 +57,30 @@ def test_a_wider_network_answers_nearly_the_same() -> None:
     assert (weight.grad.abs().sum(dim=(1, 2, 3)) > 0).all()
 
 
+@pytest.mark.parametrize("block", ["down_blocks.1.resnets.0", "down_blocks.2.resnets.0", "mid_block.resnets.0"])
+def test_the_old_channels_of_a_block_go_on_alone(block: str) -> None:
+    """Of an encoder's residual blocks, whose groups grow alike; by the wrong channels, the twin, all is lost."""
+    other, groups = make_model(**NARROW)[0], 8
+    network = widened(dataclasses.replace(MODEL, **NARROW | WIDE), other).eval()
+    own, old = (model.get_submodule(f"image_unet.{block}") for model in (network, other))
+    norms = [[len(resnet.get_parameter(f"norm{n}.weight")) for resnet in (old, own)] for n in (1, 2)]
+    entering, leaving = (repeated(before, after, groups) for before, after in norms)
+    x, time = torch.randn(2, entering.before, 8, 8), torch.randn(2, 64)
+    with torch.no_grad():
+        expected, made = old(x, time), own(x[:, entering.source], time)
+    wrong = made[:, : expected.shape[1]] if len(leaving.source) > expected.shape[1] else expected.flip(1)
+    assert (made[:, leaving.old] - expected).square().mean() < 0.1 * expected.var()
+    assert (wrong - expected).square().mean() > 0.5 * expected.var()
+
+
+def test_a_part_of_a_network_is_not_widened(tmp_path: Path) -> None:
+    model = dataclasses.replace(MODEL, **NARROW | WIDE)
+    config = dataclasses.replace(TRAIN, model=model, trains="renderer", p_render=1.0)
+    run = Trainer(config, RunConfig(tmp_path, steps=1), torch.device("cpu"), torch.float32)
+    with pytest.raises(UnirenderError, match="trains its renderer alone"):
+        begin_with_network(run, make_model(**NARROW)[0])
+
+
 def test_a_run_begins_with_a_narrower_network(tmp_path: Path) -> None:
     config = dataclasses.replace(TRAIN, model=dataclasses.replace(MODEL, **NARROW | WIDE))
     run = Trainer(config, RunConfig(tmp_path, steps=1), torch.device("cpu"), torch.float32)
@@ -86,11 +110,14 @@ def test_the_preset_of_small_begins_with_the_checkpoint_tiny(tmp_path: Path) -> 
         {"attention_levels": (1,)},
         {"cross_attention_dim": 16},
         {"layers_per_block": 2},
+        {"block_out_channels": (16, 48, 48), "narrow": (16, 32, 48)},  # a trained shortcut would be left over
     ],
     ids=str,
 )
 def test_other_networks_are_refused(changes: dict) -> None:
-    other, network = make_model(**NARROW)[0], make_model(**NARROW | changes)[0]
+    changes = dict(changes)
+    narrow = NARROW | {"block_out_channels": changes.pop("narrow", NARROW["block_out_channels"])}
+    other, network = make_model(**narrow)[0], make_model(**NARROW | changes)[0]
     assert not can_widen(network, other)
     with pytest.raises(UnirenderError, match="no wider form of theirs"):
         widen(network, other)

@@ -1,6 +1,6 @@
 """Batches made on the device: a GPU trains faster than a few cores can mix its pictures.
 
-The rows of the packed shards lie on the device in half precision, and a whole batch is augmented there at once. What a
+The rows of the packed shards lie on the device as they are stored, and a whole batch is augmented there at once. What a
 sample is, `GroupDataset.drawn` says as ever, from (seed, index); the operations are twins of those of
 `unirender.training.augment`, `.repaint` and `unirender.symmetries`, so that the batches are those of a `ShardSource` to
 rounding (tests/unirender/test_device_data.py).
@@ -30,11 +30,13 @@ from unirender.symmetries import LIGHT_MAPS
 from unirender.training.augment import COLOUR_MAPS, Draw, metallic_weights
 from unirender.training.data import DERIVED_MAPS, Batch, GroupDataset, SampleRows
 from unirender.training.groups import SCALAR_CHANNELS, Pair
+from unirender.training.memory import TrainingBytes
 from unirender.training.moving import moved
 from unirender.training.repaint import CHANNEL_RANGE, POWER_RANGE
 from unirender.training.source import ShardSource
 
-SHARE = 1 / 3  # of a GPU's free memory that data may take of themselves: a training needs the rest
+SHARE = 1 / 3  # of a GPU's free memory that data may take of themselves: activations and mixing need the rest
+SHARED_CHANNELS = SCALAR_CHANNELS + 2  # with roughness and metallic maps, whether a group has them or not
 
 Drawn = tuple[int, Pair | None, Draw]
 
@@ -46,7 +48,7 @@ class DeviceSource:
 
     Args:
         source: that nothing has been read from; of this process's rows.
-        device: has room for all packed pictures, 2 bytes a value.
+        device: has room for `packed_bytes` and for what a batch is mixed of.
     """
 
     def __init__(self, source: ShardSource, device: torch.device) -> None:
@@ -62,6 +64,7 @@ class DeviceSource:
         own = self.source
         dataset = own.open()
         if self._groups is None or self._groups.dataset is not dataset:
+            self._groups = None  # a folder that grew: not both at once
             self._groups = DeviceGroups(dataset, self.device)
         indices = range(own.consumed, own.consumed + own.batch_size)[own.rows]
         batch = self._groups.batch([dataset.drawn(index, own.seed, own.augmentation) for index in indices])
@@ -86,19 +89,32 @@ class DeviceSource:
         self.source.close()
 
 
-def fits(dataset: GroupDataset, device: torch.device) -> bool:
-    """Whether a GPU holds a data set beside a training: in `SHARE` of the memory that is free."""
+def fits(dataset: GroupDataset, device: torch.device, training: TrainingBytes) -> bool:
+    """Whether a GPU holds a data set beside a training; never on a device that is none.
+
+    Args:
+        dataset: opened.
+        device: of the training, whose weights are there already.
+        training: what it will hold besides.
+    """
     if device.type != "cuda":
         return False
     free, _ = torch.cuda.mem_get_info(device)
-    return packed_bytes(dataset) <= SHARE * free
+    return packed_bytes(dataset) <= room(free, training)
+
+
+def room(free: int, training: TrainingBytes) -> int:
+    """Bytes that data may take of the free memory of a device: `SHARE` of what gradients and moments leave."""
+    return max(0, int(SHARE * (free - training.gradients - training.moments)))
 
 
 def packed_bytes(dataset: GroupDataset) -> int:
     """Of the groups on a device."""
-    arrays = [array for shard in dataset.shards for array in (shard.pixels, shard.shared, shard.environment)]
-    derived = [array for own in dataset.derived or () for array in (own.unshadowed, own.shadowed)]
-    return sum(array.nbytes for array in (*arrays, *derived))
+    shards, derived = dataset.shards, dataset.derived or ()
+    arrays = [array for shard in shards for array in (shard.pixels, shard.environment)]
+    arrays += [array for own in derived for array in (own.unshadowed, own.shadowed)]
+    shared = sum(shard.shared.nbytes * SHARED_CHANNELS // shard.shared.shape[1] for shard in shards)
+    return shared + sum(array.nbytes for array in arrays)
 
 
 class DeviceGroups:
@@ -108,7 +124,7 @@ class DeviceGroups:
         self.dataset, self.device = dataset, device
         shards = dataset.shards
         self.pixels = _joined([shard.pixels for shard in shards], device)
-        self.shared = _joined([_nine_channels(shard.shared) for shard in shards], device)
+        self.shared = _joined([shard.shared for shard in shards], device, SHARED_CHANNELS)
         self.environment = _joined([shard.environment for shard in shards], device)
         self.first = {
             name: _starts([len(getattr(s, name)) for s in shards]) for name in ("pixels", "shared", "environment")
@@ -124,11 +140,16 @@ class DeviceGroups:
 
         Args:
             drawn: what each sample is made of, as `GroupDataset.drawn` says it.
+
+        Raises:
+            UnirenderError: derived light was drawn, but the data was opened without; an object receives no light.
         """
         draws = [draw for _, _, draw in drawn]
+        if self.derived is None and any(draw.derived for draw in draws):
+            raise UnirenderError("derived light was drawn, but the data was opened without it; pass derived=True")
         rows = [self.dataset.rows(*each) for each in drawn]
         lights = max(len(own.diffuse) for own in rows)
-        weight = self._tensor([_padded(draw.weights, lights) for draw in draws])
+        weight = self._tensor(_filled([draw.weights for draw in draws], (lights, 3)))
         maps = self._shared(rows)
         maps["image"] = self._pictures(rows, draws, weight)
         for name in ("specular", "diffuse"):
@@ -147,14 +168,14 @@ class DeviceGroups:
         order = self._tensor([draw.order for draw in draws])
         for name in {*COLOUR_MAPS, *DERIVED_MAPS} & maps.keys():
             maps[name] = maps[name].gather(1, order[:, :, None, None].expand_as(maps[name]))
-        maps = self._exposed(maps, draws)
+        maps = self._exposed(maps, draws, [self.dataset.keys[group] for group, _, _ in drawn])
         if self.derived is not None:
             for name in ("derived", "shadowed"):
                 maps[name] = self._tensor([float(getattr(draw, name)) for draw in draws])[:, None, None, None]
         return moved(maps, [draw.move for draw in draws])
 
-    def _tensor(self, values: Sequence) -> Tensor:
-        array = np.array(values)
+    def _tensor(self, values: Sequence | np.ndarray) -> Tensor:
+        array = np.asarray(values)
         return torch.from_numpy(array.astype(np.float32) if array.dtype == np.float64 else array).to(self.device)
 
     def _at(self, of: str, rows: SampleRows, own: Int[np.ndarray, "..."] | int) -> Int[np.ndarray, "..."]:
@@ -164,19 +185,19 @@ class DeviceGroups:
     def _mixed(
         self, bank: Float[Tensor, "m 3 h w"], at: Sequence[np.ndarray], weight: Float[Tensor, "b l 3"]
     ) -> Float[Tensor, "b 3 h w"]:
-        places = self._tensor([_padded(own, weight.shape[1]) for own in at])
+        places = self._tensor(_filled(at, (weight.shape[1],)))
         return torch.einsum("blchw,blc->bchw", bank[places].float(), weight)
 
     def _pictures(
         self, rows: Sequence[SampleRows], draws: Sequence[Draw], weight: Float[Tensor, "b l 3"]
     ) -> Float[Tensor, "b 3 h w"]:
         nodes = max(own.image.shape[1] for own in rows)
-        at = [_padded(_padded(self._at("pixels", own, own.image), weight.shape[1]).T, nodes).T for own in rows]
+        at = _filled([self._at("pixels", own, own.image) for own in rows], (weight.shape[1], nodes))
         parts = [
             metallic_weights(draw.metallic) if own.image.shape[1] > 1 else np.ones(1)
             for own, draw in zip(rows, draws, strict=True)
         ]
-        node = self._tensor([_padded(part, nodes) for part in parts])
+        node = self._tensor(_filled(parts, (nodes,)))
         weights = weight[:, :, None] * node[:, None, :, None]
         return torch.einsum("blnchw,blnc->bchw", self.pixels[self._tensor(at)].float(), weights)
 
@@ -243,18 +264,19 @@ class DeviceGroups:
         flipped["normal"] = flipped["normal"] * flipped["normal"].new_tensor([-1, 1, 1])[:, None, None]
         return {name: torch.where(rows, flipped[name], value) for name, value in maps.items()}
 
-    def _exposed(self, maps: Batch, draws: Sequence[Draw]) -> Batch:
-        """The gauge with the drawn targets: twin of `unirender.exposure.exposure_factor`.
-
-        Raises:
-            UnirenderError: an object receives no light.
-        """
+    def _exposed(self, maps: Batch, draws: Sequence[Draw], keys: Sequence[str]) -> Batch:
+        """The gauge with the drawn targets: twin of `unirender.exposure.exposure_factor`."""
         target = self._tensor([np.nan if draw.exposure_target is None else draw.exposure_target for draw in draws])
-        luminance = (maps["diffuse"] * self._tensor(list(LUMINANCE_REC709))[:, None, None]).sum(dim=1).flatten(1)
+        luminance = (maps["diffuse"] * self._tensor(LUMINANCE_REC709)[:, None, None]).sum(dim=1).flatten(1)
         inside = (maps["mask"] > MASK_THRESHOLD).flatten(1)
         level = torch.nanquantile(torch.where(inside, luminance, torch.nan), PERCENTILE / 100, dim=1)
-        if not (level > 0).logical_or(target.isnan()).all():
-            raise UnirenderError("exposure: an object of the batch receives no light; remake the dataset")
+        usable = ((level > 0) & level.isfinite()) | target.isnan()
+        if not usable.all():
+            row = int((~usable).nonzero()[0])
+            raise UnirenderError(
+                f"exposure: the white-diffuse level of group {keys[row]} is {float(level[row]):g}, expected light on "
+                f"an object with pixels of more coverage than {MASK_THRESHOLD}; remake the data set without it"
+            )
         factor = torch.where(target.isnan(), 1.0, target / level)[:, None, None, None]
         linear = {*LIGHT_MAPS, *DERIVED_MAPS}
         return {name: value * factor if name in linear else value for name, value in maps.items()}
@@ -271,21 +293,23 @@ def _replaced(values: Float[Tensor, "b c h w"], rows: Sequence[int], by: Tensor)
     return values.index_copy(0, torch.tensor(rows, device=values.device), by.to(values))
 
 
-def _joined(arrays: Sequence[np.ndarray], device: torch.device) -> Tensor:
-    return torch.cat([torch.from_numpy(np.array(own)).to(device) for own in arrays])
+def _joined(arrays: Sequence[np.ndarray], device: torch.device, channels: int | None = None) -> Tensor:
+    """One after the other, written in place; with zeros where they have fewer than `channels`."""
+    first, rows = arrays[0], sum(map(len, arrays))
+    shape = (rows, channels or first.shape[1], *first.shape[2:])
+    joined = torch.zeros(shape, dtype=torch.from_numpy(first[:0].copy()).dtype, device=device)
+    for start, array in zip(_starts(list(map(len, arrays))), arrays, strict=True):
+        joined[start : start + len(array), : array.shape[1]] = torch.from_numpy(np.array(array)).to(device)
+    return joined
 
 
 def _starts(lengths: Sequence[int]) -> Int[np.ndarray, " shards"]:
     return np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64)
 
 
-def _nine_channels(shared: np.ndarray) -> np.ndarray:
-    """With places for roughness and metallic, whether it has them or not."""
-    missing = SCALAR_CHANNELS + 2 - shared.shape[1]
-    return np.pad(np.asarray(shared), [(0, 0), (0, missing), (0, 0), (0, 0)])
-
-
-def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    """More along the first axis: weights of 0, and the first row again."""
-    more = [(0, length - len(values)), *[(0, 0)] * (values.ndim - 1)]
-    return np.pad(values, more) if np.issubdtype(values.dtype, np.floating) else np.pad(values, more, mode="edge")
+def _filled(values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """Rows or weights of samples in one array; zeros where they have fewer: of row 0 a share of 0."""
+    filled = np.zeros((len(values), *shape), values[0].dtype)
+    for i, own in enumerate(values):
+        filled[(i, *map(slice, own.shape))] = own
+    return filled

@@ -153,7 +153,7 @@ def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
     """Gaussian noise from a CPU generator.
 
     On CUDA, where a batch's would keep the CPU busy for longer than its step takes, a generator of the device draws it,
-    whose seed comes from this one: a seed then means the same on every GPU, but another stream than on a CPU.
+    whose seed comes from this one: a seed then means the same on GPUs of one model, and other noise than on a CPU.
     """
     if x.device.type != "cuda":
         return torch.randn(x.shape, generator=generator).to(x)

@@ -2,8 +2,8 @@
 
 A roll is exact but for the resampling: normals and light turn with the picture. Zoom and shift are close: seen from
 another distance or side, an object would show a little more or less of its flanks, and a pixel's view direction changes
-by at most 3 degrees of the 36 that the camera sees. What they buy: an object of the training data is no longer bound to
-its place, and its outline falls on other pixels each time.
+by up to 6 degrees of the 36 that the camera sees. An object that fills the frame may lose an edge of itself. What they
+buy: an object of the training data is no longer bound to its place, and its outline falls on other pixels each time.
 
 All is resampled once, bilinearly. What is defined on the object alone (everything but image and mask) is averaged over
 those of the four pixels that show it.
@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from unirender.errors import UnirenderError
 from unirender.lighting import environment_directions
 
 ROLL_DEG = 25.0  # at most, either way
@@ -47,7 +48,13 @@ def moved(maps: Maps, moves: Sequence[Move | None]) -> Maps:
     Args:
         maps: with mask; the maps of 1 x 1 pixel (flags) stay, the environment only turns.
         moves: one for each sample.
+
+    Raises:
+        UnirenderError: the frame is not square.
     """
+    height, width = maps["mask"].shape[-2:]
+    if height != width:
+        raise UnirenderError(f"moves: got pictures of {height} x {width}, expected square ones to roll")
     chosen = [(row, move) for row, move in enumerate(moves) if move is not None]
     if not chosen:
         return maps

@@ -14,11 +14,12 @@ from unirender.models.conditioning import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
 
+SHEET_ROWS = 4  # samples of a sheet
 COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "environment")
 
 
 @torch.no_grad()
-def training_sheet(loss: LossFunction, batch: Maps, rows: int = 4) -> UInt8[np.ndarray, "h w 3"]:
+def training_sheet(loss: LossFunction, batch: Maps, rows: int = SHEET_ROWS) -> UInt8[np.ndarray, "h w 3"]:
     """Two lines a sample, truth above prediction: image (rendered from true maps), then the maps (from the image)."""
     batch = {name: value[:rows] for name, value in batch.items()}
     generator = torch.Generator().manual_seed(0)

@@ -179,6 +179,7 @@ _SMALL_WIDE = dataclasses.replace(
 # The same on many pictures whose light need not be derived; `small_renderer` comes after it.
 _SMALL_COLOUR = dataclasses.replace(
     _SMALL,
+    model=_SMALL_WIDE.model,
     loss=dataclasses.replace(_SMALL.loss, material=3.0),
     augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
 )
@@ -236,13 +237,14 @@ PRESETS: dict[str, TrainConfig] = {
     "small_colour": _SMALL_COLOUR,
     "small_renderer": dataclasses.replace(
         _SMALL,
+        model=_SMALL_WIDE.model,
         trains="renderer",
         p_render=1.0,
         augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.5, shadowed=0.9),
     ),
     "small_vgg": dataclasses.replace(
         _SMALL,
-        model=dataclasses.replace(_SMALL.model, picture_features="vgg16"),
+        model=dataclasses.replace(_SMALL_WIDE.model, picture_features="vgg16"),
         loss=dataclasses.replace(_SMALL.loss, material=4.0),
     ),
     "medium": dataclasses.replace(

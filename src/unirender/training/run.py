@@ -30,8 +30,8 @@ class Train:
     data: Path
     """Folder that `unirender dataset` wrote."""
     preset: str = "tiny"
-    """Row of `unirender.training.presets.PRESETS`: tiny, small, medium, sd15, sd21, paper, and
-    ablations of tiny by name."""
+    """Row of `unirender.training.presets.PRESETS`: tiny, small, small_wide (what ships as small), medium, sd15, sd21,
+    paper, and ablations of tiny by name."""
     init: Path | None = None
     """Begin with the weights of this pipeline folder, or of a shipped one by its name, instead of random ones; its
     network must be the preset's, or a narrower form of it."""
@@ -223,8 +223,11 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         rows=trainer.split.own,
         group_size=config.group_size,
     )
-    dataset = source.open()
-    on_device = options.batches == "device" or (options.batches == "auto" and fits(dataset, device))
+    memory = training_bytes(trainer.model, config.optimizer.kind)
+    on_device = options.batches == "device" or (options.batches == "auto" and fits(source.open(), device, memory))
+    if on_device and device.type != "cuda":
+        raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
+    source.open()
     if on_device:
         source = DeviceSource(source, device)
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
@@ -235,7 +238,7 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     made = f", batches made on {device}" if on_device else ""
     say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}{made}")
     if processes.is_main:
-        say(f"memory: {training_bytes(trainer.model, config.optimizer.kind)}")
+        say(f"memory: {memory}")
     resumed = (out / STATE_FILE).is_file()
     with contextlib.closing(source):
         with (

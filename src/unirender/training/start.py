@@ -113,6 +113,11 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     """
     model = trainer.model
     if can_widen(model, network):
+        if trainer.config.trains != "all":
+            raise UnirenderError(
+                f"initial weights: they are of a narrower network, and this preset trains its {trainer.config.trains} "
+                "alone, which could not learn what the others become; begin with weights of its own network"
+            )
         network = widened(trainer.config.model, network)
     own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
     if network.config["picture_features"] == "none":  # what they add begins at zero
@@ -122,7 +127,7 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
         differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
         raise UnirenderError(
             f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
-            "expected the same network; choose the preset that the weights were trained with"
+            f"expected the same network; choose the preset that the weights were trained with{_named(history)}"
         )
     model.load_state_dict(model.state_dict() | network.state_dict())
     if network.config["picture_features"] == "none":
@@ -135,6 +140,11 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
             )
         restart_from_prior(model)  # what it added to the other closed form is no correction of this one
     trainer.begin_anew(history)
+
+
+def _named(history: Sequence[dict[str, Any]]) -> str:
+    preset = history[-1].get("preset") if history else None
+    return f" ({preset})" if preset else ""
 
 
 def load_features(model: DualStreamModel) -> None:

@@ -34,7 +34,7 @@ from unirender.training.live import Report, standing
 from unirender.training.losses import LossFunction
 from unirender.training.muon import make_optimizer
 from unirender.training.passes import BatchGradient, Split, laid_out_like
-from unirender.training.pictures import save_sheet, training_sheet
+from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
@@ -196,7 +196,8 @@ class Trainer:
             while self.progress < 1:
                 clock["step"] = time.monotonic()  # pictures, validation and saves are no training
                 batch = source.next()
-                fixed = batch if fixed is None else fixed
+                if fixed is None:
+                    fixed = {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 now = time.monotonic()
                 seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)

@@ -1,8 +1,10 @@
 """A wider network that begins near a narrower one (after Chen et al. 2016, "Net2Net").
 
 Each new channel repeats an old one of its own normalisation group, so that the group's mean and deviation stay about as
-they were, and what leaves it begins near zero: the old channels go on alone. A little noise on both lets the new ones
-part from those that they repeat. Attention that the narrower network has not begins as the identity.
+they were, and what leaves it is small: the old channels go on nearly alone. (Where a decoder puts a skip beside what
+comes from below, the groups of the two together are others than before; that is what the beginning is off by.) A little
+noise on both lets the new ones part from those that they repeat. Attention that the narrower network has not begins as
+the identity.
 
 The two networks agree in all but `block_out_channels` and `attention_levels` (and the size of pictures), and have the
 size of heads as one number. The finest level keeps its width: what comes in, what goes out and the embedding of time
@@ -75,6 +77,7 @@ def can_widen(network: DualStreamModel, other: DualStreamModel) -> bool:
     if any(own[name] != old.get(name) for name in own.keys() - MAY_DIFFER):
         return False
     widths, narrow, groups = own["block_out_channels"], old["block_out_channels"], own["norm_num_groups"]
+    steps = list(zip(itertools.pairwise(widths), itertools.pairwise(narrow), strict=False))
     return any(own[name] != old[name] for name in GROWS) and (
         own["picture_features"] == "none"  # their ways in have the widths of the levels
         and isinstance(own["attention_head_dim"], int)
@@ -83,6 +86,7 @@ def can_widen(network: DualStreamModel, other: DualStreamModel) -> bool:
         and all(
             new >= before and new % groups == 0 == before % groups for new, before in zip(widths, narrow, strict=True)
         )
+        and all(a != b or old_a == old_b for (a, b), (old_a, old_b) in steps)  # no trained shortcut is left over
         and set(old["attention_levels"]) <= set(own["attention_levels"])
     )
 
@@ -118,7 +122,7 @@ def widen(network: DualStreamModel, other: DualStreamModel, generator: torch.Gen
         )
     widths = zip(other.config["block_out_channels"], network.config["block_out_channels"], strict=True)
     levels = [repeated(old, new, network.config["norm_num_groups"]) for old, new in widths]
-    growth = _Growth(levels, network.config["attention_head_dim"], generator or torch.Generator().manual_seed(0))
+    growth = _Growth(levels, generator or torch.Generator().manual_seed(0))
     pyramid = growth.unet(network.attribute_unet, other.attribute_unet)
     growth.unet(network.image_unet, other.image_unet)
     for name in ("attributes_to_image", "image_to_attributes"):
@@ -139,7 +143,6 @@ def _plain(network: DualStreamModel) -> dict[str, Any]:
 @dataclass(frozen=True)
 class _Growth:
     levels: list[Channels]
-    head: int
     generator: torch.Generator
 
     def unet(self, new: Part, old: Part) -> list[int]:
