@@ -130,9 +130,10 @@ def test_a_gpu_takes_what_a_training_leaves() -> None:
 
 def test_a_cpu_reads_from_the_shards(folder: Path, tmp_path: Path) -> None:
     assert not fits(GroupDataset(folder), CPU, TrainingBytes(0, 0, 0, 0))
-    data = write_dataset(tmp_path / "data", shards=1, groups=1, size=32)
+    options = Train(tmp_path / "no-data", steps=1, batches="device", device="cpu")  # said before anything is read
     with pytest.raises(UsageError, match="--batches device: the training is on cpu, expected a CUDA device"):
-        train(Train(data, steps=1, batches="device", device="cpu"), CONFIG, tmp_path / "run")
+        train(options, CONFIG, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_light_that_was_not_derived_is_refused(folder: Path) -> None:

@@ -95,9 +95,7 @@ class Augmentation:
     derived: float = 0.0  # probability that a renderer sees s and d derived from the light
     shadowed: float = 0.0  # share of these that has the shadows that the picture shows, and not none
     repaint: float = 0.0  # probability that an object takes on another's mean colour; close, not exact
-    move: float = (
-        0.0  # probability of a roll, a zoom and a shift of the picture; close; see `unirender.training.moving`
-    )
+    move: float = 0.0  # probability of a roll, a zoom and a shift; close; see `unirender.training.moving`
 
 
 @dataclass(frozen=True)

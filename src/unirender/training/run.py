@@ -189,6 +189,8 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     from unirender.training.trainer import RunConfig, Trainer
 
     processes, device = join_processes(resolve_device(options.device))
+    if options.batches == "device" and device.type != "cuda":
+        raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
@@ -225,8 +227,6 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     )
     memory = training_bytes(trainer.model, config.optimizer.kind)
     on_device = options.batches == "device" or (options.batches == "auto" and fits(source.open(), device, memory))
-    if on_device and device.type != "cuda":
-        raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
     source.open()
     if on_device:
         source = DeviceSource(source, device)

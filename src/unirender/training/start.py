@@ -118,7 +118,7 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
                 f"initial weights: they are of a narrower network, and this preset trains its {trainer.config.trains} "
                 "alone, which could not learn what the others become; begin with weights of its own network"
             )
-        network = widened(trainer.config.model, network)
+        network = widened(trainer.config.model, network, trainer.vae)
     own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
     if network.config["picture_features"] == "none":  # what they add begins at zero
         own = {k: v for k, v in own.items() if not k.startswith(FEATURES_PREFIXES)}

@@ -91,13 +91,18 @@ def can_widen(network: DualStreamModel, other: DualStreamModel) -> bool:
     )
 
 
-def widened(config: ModelConfig, other: DualStreamModel) -> DualStreamModel:
+def widened(config: ModelConfig, other: DualStreamModel, vae: nn.Module | None = None) -> DualStreamModel:
     """A network of `config` that begins near `other`, which stays as it is.
+
+    Args:
+        config: of the wider network.
+        other: on the CPU.
+        vae: the autoencoder on whose latents both work, if they do.
 
     Raises:
         UnirenderError: `can_widen` says no.
     """
-    network, _ = build_model(config)
+    network, _ = build_model(config, vae)
     widen(network, other)
     return network
 
