@@ -11,7 +11,7 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
 from unirender.pipelines.rendering import render_any_size
-from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics
+from unirender.pipelines.results import Decomposition, MaterialRule, combine, predicted_intrinsics
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
 
@@ -36,7 +36,7 @@ class View:
 
 
 def decompose_views(
-    network: Network, views: Sequence[View], how: Sampling, *, material: str, closed: bool, tile: bool
+    network: Network, views: Sequence[View], how: Sampling, *, material: MaterialRule, closed: bool, tile: bool
 ) -> list[Decomposition]:
     """Inverse rendering.
 
@@ -44,7 +44,7 @@ def decompose_views(
         network: whose size the pictures are brought to.
         views: any sizes and cameras.
         how: steps, samples and noise.
-        material: `scalar` or `map`.
+        material: how metallic and roughness are read.
         closed: whether albedo, s and d are changed so that their rendering is the picture; one more batch.
         tile: whether pictures larger than the network's square get the detail of tiles; a batch for every few tiles.
     """

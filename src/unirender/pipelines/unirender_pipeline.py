@@ -9,7 +9,7 @@ of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` componen
 
 import logging
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -34,7 +34,7 @@ from unirender.pipelines.editing import anchor, constant_map, specular_for_rough
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, told_derived, unit_value
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
-from unirender.pipelines.results import Decomposition, EditResult
+from unirender.pipelines.results import Decomposition, EditResult, MaterialRule, check_calibration
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.shipped import checkpoint_folder, shipped_names
 
@@ -51,6 +51,7 @@ class UniRenderPipeline(DiffusionPipeline):
         scheduler: with zero terminal SNR and `prediction_type="sample"`, without noise of its own: DDIM or UniPC.
         vae: for models with the KL codec.
         material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
+        calibration: slope and offset of roughness, of metallic, or of both, by name (`unirender calibrate`).
     """
 
     model_cpu_offload_seq = "dual_stream"
@@ -62,10 +63,11 @@ class UniRenderPipeline(DiffusionPipeline):
         scheduler: SchedulerMixin,
         vae: AutoencoderKL | None = None,
         material: str = "scalar",
+        calibration: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         super().__init__()
         self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
-        self.register_to_config(material=material)
+        self.register_to_config(material=material, calibration=check_calibration(calibration))
         self.dual_stream: DualStreamModel
         self.scheduler: SchedulerMixin
         codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
@@ -216,7 +218,8 @@ class UniRenderPipeline(DiffusionPipeline):
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
             picture, cover = as_picture(image, mask)
             views.append(View(srgb_decode(picture) * cover, cover, camera))
-        return decompose_views(network, views, how, material=material, closed=closed, tile=tile)
+        rule = MaterialRule(material, self.config["calibration"] or {})
+        return decompose_views(network, views, how, material=rule, closed=closed, tile=tile)
 
     def render(
         self,
