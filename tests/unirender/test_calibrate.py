@@ -1,6 +1,7 @@
 """How sure a checkpoint is of materials: the line, what reads by it, and the command that fits it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_predictions_are_read_by_the_lines(kind: str) -> None:
 def test_a_pipeline_decomposes_by_its_calibration(checkpoint: Path, tmp_path: Path) -> None:
     image, mask = picture()
     before = UniRenderPipeline.from_pretrained(checkpoint).decompose(image, mask)
-    write_calibrated(checkpoint, tmp_path / "lined", {"roughness": [0.5, 0.2]})
+    write_calibrated(checkpoint, tmp_path / "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
     pipeline = UniRenderPipeline.from_pretrained(tmp_path / "lined")
     after = pipeline.decompose(image, mask)
     assert after.roughness == pytest.approx(0.5 * before.roughness + 0.2, abs=1e-5)
@@ -131,3 +132,22 @@ def test_wrong_calls_are_refused(data: Path, checkpoint: Path, tmp_path: Path) -
 def test_what_ships_has_lines_that_a_pipeline_takes() -> None:
     pipeline = UniRenderPipeline.from_pretrained(checkpoint_folder("small"))
     assert check_calibration(pipeline.config["calibration"]) == pipeline.config["calibration"]
+
+
+def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path) -> None:
+    shutil.copytree(checkpoint, tmp_path / "trained")
+    (tmp_path / "trained" / "training.json").write_text(json.dumps({"preset": "tiny", "steps": 5}))
+    data = {"folder": "new", "fingerprint": "ab" * 32, "shards": 2, "groups": 10, "pairs": 60}
+    about = {"data": data, "pictures": 3, "seed": 0}
+    line = Line(0.75, 0.125, 0.0526, 0.05, 0.0012)
+    write_calibrated(tmp_path / "trained", tmp_path / "mine", {"roughness": line}, about)
+    facts = json.loads((tmp_path / "mine" / "training.json").read_text())
+    assert (facts["preset"], facts["calibration"]["lines"]["roughness"]["slope"]) == ("tiny", 0.75)
+    card = (tmp_path / "mine" / "README.md").read_text()
+    assert "# unirender: mine" in card
+    assert "roughness: 0.750 x predicted + 0.125, mean squared error 0.0526 → 0.0500 ± 0.0012" in card
+    assert "3 pictures of each object of `new`: 2 shards, 10 groups" in card
+    write_calibrated(tmp_path / "mine", tmp_path / "none", {}, about)
+    assert json.loads((tmp_path / "none" / "model_index.json").read_text())["calibration"] is None
+    assert "calibration" not in json.loads((tmp_path / "none" / "training.json").read_text())
+    assert "are read by" not in (tmp_path / "none" / "README.md").read_text()

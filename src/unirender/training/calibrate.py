@@ -12,10 +12,10 @@ configuration of the checkpoint's pipeline, whose weights stay as they are.
 
 import json
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError, UsageError
 
@@ -91,6 +91,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
     from unirender.training.data import GroupDataset
+    from unirender.training.facts import dataset_facts
 
     checkpoint = checkpoint_folder(options.checkpoint)
     pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None)
@@ -109,7 +110,8 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
         )
         if line.better:
             kept[name] = line
-    write_calibrated(checkpoint, options.out, {name: [line.slope, line.offset] for name, line in kept.items()})
+    about = {"data": dataset_facts(options.data, data), "pictures": options.pictures, "seed": options.seed}
+    write_calibrated(checkpoint, options.out, kept, about)
     return kept
 
 
@@ -175,17 +177,43 @@ def _line(found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]') ->
     return slope, float(truth.mean() - slope * found.mean())
 
 
-def write_calibrated(checkpoint: Path, out: Path, lines: dict[str, list[float]]) -> None:
-    """A copy of a pipeline folder with these lines in its configuration; it appears when it is complete."""
+def write_calibrated(checkpoint: Path, out: Path, lines: Mapping[str, Line], about: Mapping[str, Any]) -> None:
+    """A copy of a pipeline folder with these lines in its configuration, and in the account of its training, if it has
+    one; it appears when it is complete.
+
+    Args:
+        checkpoint: to be copied.
+        out: the copy.
+        lines: by name; none: a calibration that it has is taken out.
+        about: data, pictures and seed, for the account.
+    """
     from unirender.training.checkpoint import replace_folder
+    from unirender.training.export import TRAINING_FILE
 
     partial = out.with_name(f"{out.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     shutil.copytree(checkpoint, partial)
     index = json.loads((partial / INDEX).read_text())
-    index["calibration"] = {name: [round(value, 4) for value in line] for name, line in lines.items()} or None
+    rounded = {name: [round(line.slope, 4), round(line.offset, 4)] for name, line in lines.items()}
+    index["calibration"] = rounded or None
     (partial / INDEX).write_text(json.dumps(index, indent=2, sort_keys=True) + "\n")
+    if (partial / TRAINING_FILE).is_file():
+        _write_account(partial, out.name, {"lines": {n: asdict(line) for n, line in lines.items()}, **about})
     replace_folder(out, partial)
+
+
+def _write_account(folder: Path, name: str, calibration: Mapping[str, Any]) -> None:
+    """Adds a calibration to `training.json`, and writes the model card anew."""
+    from unirender.training.card import CARD_FILE, card_text
+    from unirender.training.export import SCORES_FILE, TRAINING_FILE
+
+    facts = json.loads((folder / TRAINING_FILE).read_text()) | {"calibration": calibration}
+    if not calibration["lines"]:
+        del facts["calibration"]
+    chosen = folder / SCORES_FILE
+    (folder / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+    card = card_text(name, facts, json.loads(chosen.read_text()) if chosen.is_file() else None)
+    (folder / CARD_FILE).write_text(card, encoding="utf-8")
 
 
 def _tell(done: int, total: int) -> None:

@@ -92,7 +92,19 @@ def _training_rows(facts: Facts) -> dict[str, str | None]:
         "weights stored as": facts.get("stored_as"),
         "weights averaged": ", ".join(f"{share:g} of {run}" for run, share in facts.get("averaged", {}).items())
         or None,
+        "materials are read by": _calibration(facts.get("calibration")),
     }
+
+
+def _calibration(fitted: Facts | None) -> str | None:
+    if fitted is None:
+        return None
+    lines = [
+        f"{name}: {line['slope']:.3f} x predicted + {line['offset']:.3f}, mean squared error {line['before']:.4f} → "
+        f"{line['after']:.4f} ± {line['chance']:.4f} (each part of the objects by the line of the others)"
+        for name, line in fitted["lines"].items()
+    ]
+    return "; ".join([*lines, f"{fitted['pictures']} pictures of each object of {_data(fitted['data'])}"])
 
 
 def _data(data: Facts | None) -> str | None:

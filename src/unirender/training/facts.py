@@ -16,6 +16,7 @@ from unirender.training.device_data import DeviceSource
 from unirender.training.source import BatchSource, ShardSource
 
 if TYPE_CHECKING:
+    from unirender.training.data import GroupDataset
     from unirender.training.trainer import Trainer
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -58,9 +59,13 @@ def data_facts(source: BatchSource | None) -> dict[str, Any] | None:
         source = source.source
     if not isinstance(source, ShardSource) or source.dataset is None:
         return None
-    dataset = source.dataset
+    return dataset_facts(source.folder, source.dataset)
+
+
+def dataset_facts(folder: Path, dataset: "GroupDataset") -> dict[str, Any]:
+    """Name, fingerprint and size of a data folder."""
     return {
-        "folder": source.folder.resolve().name,
+        "folder": folder.resolve().name,
         "fingerprint": dataset.fingerprint,
         "shards": len(dataset.shard_names),
         "groups": len(dataset.keys),
