@@ -6,15 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_shards import write_dataset
-from tiny_models import SIZE, make_pipeline
+from synthetic_shards import group_members, write_dataset, write_shard
+from tiny_models import MODEL, SIZE, make_pipeline
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.pipelines.results import MaterialRule, check_calibration
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.calibration import calibrated, check_lines
+from unirender.pipelines.editing import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.calibrate import Calibrate, Line, fit, readings, write_calibrated
+from unirender.training.calibrate import Calibrate, Line, fit, object_of, readings, write_calibrated
 from unirender.training.data import GroupDataset
+from unirender.training.start import read_start
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +29,15 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("groups") / "data", size=SIZE, shards=2, groups=5, roughness=(80, 95))
+    """Rough objects: an untrained network says about 0.5 of all."""
+    return write_dataset(
+        tmp_path_factory.mktemp("groups") / "data",
+        size=SIZE,
+        shards=2,
+        groups=5,
+        roughness=(80, 95),
+        metallic=(0, 50, 100),
+    )
 
 
 def picture() -> tuple[np.ndarray, np.ndarray]:
@@ -44,12 +55,14 @@ def test_who_is_too_sure_gets_a_slope_below_one() -> None:
     assert line.offset == pytest.approx(0.25, abs=0.02)
     assert line.before == pytest.approx(np.square(found - truth).mean())
     assert line.after < 0.05 * line.before
+    assert line.better
     right = fit(objects, truth, truth)
     assert (right.slope, right.offset) == pytest.approx((1, 0), abs=1e-9)
+    assert not right.better
 
 
 def test_a_line_is_scored_on_objects_that_it_does_not_know() -> None:
-    """Where nothing can be learned, it is no better than what was predicted; with its own objects it would be."""
+    """Where there is nothing to learn it is no better than what was predicted; at its own objects it would be."""
     rng = np.random.default_rng(1)
     objects = np.arange(20)
     found, truth = rng.uniform(0.4, 0.6, 20), rng.uniform(0.4, 0.6, 20)
@@ -57,81 +70,162 @@ def test_a_line_is_scored_on_objects_that_it_does_not_know() -> None:
     line = fit(objects, found, truth)
     own = np.square(np.clip(line.slope * found + line.offset, 0, 1) - truth).mean()
     assert own < line.after
-    assert fit(objects, np.full(20, 0.5), truth).slope == 0
+    assert fit(objects, 0.5 + 1e-6 * found, truth).slope == 0  # one number, in effect
     assert fit(objects, found, 1 - found).slope == 0  # more is never read as less
 
 
-@pytest.mark.parametrize("kind", ["scalar", "map"])
-def test_predictions_are_read_by_the_lines(kind: str) -> None:
+def test_every_object_counts_the_same() -> None:
+    """However many pictures there are of it, and whatever its number is."""
+    rng = np.random.default_rng(2)
+    objects = np.arange(30)
+    found, truth = rng.uniform(0, 1, 30), rng.uniform(0, 1, 30)
+    once = fit(objects, found, truth)
+    times = rng.integers(1, 6, 30)
+    often = fit(np.repeat(objects, times), np.repeat(found, times), np.repeat(truth, times))
+    for name in ("slope", "offset", "before", "after", "chance"):
+        assert getattr(often, name) == pytest.approx(getattr(once, name), rel=1e-9), name
+    assert fit(5 * objects, found, truth).after == pytest.approx(once.after, rel=1e-9)
+    assert [object_of(key) for key in ("train-5_g0", "a_g1_g12", "plain")] == ["train-5", "a_g1", "plain"]
+
+
+def test_a_prediction_is_moved_as_a_whole() -> None:
+    """To where the line has its mean; pixels and samples keep their distances, and metallic its value."""
     mask = np.ones((2, 2, 1), np.float32)
     mask[0, 0] = 0
-    value = np.array([[0.9, 0.2], [0.4, 1.6]], np.float32)[..., None]
-    plain, lined = MaterialRule(kind), MaterialRule(kind, {"roughness": [0.5, 0.3]})
-    np.testing.assert_array_equal(lined.read("metallic", value, mask), plain.read("metallic", value, mask))
-    expected = 0.5 * plain.read("roughness", value, mask) + 0.3
-    expected[0, 0] = 0
-    np.testing.assert_allclose(lined.read("roughness", value, mask), expected, rtol=1e-6)
-    steep = MaterialRule(kind, {"roughness": [9, -1]})
-    assert 0 <= steep.read("roughness", value, mask).min() <= steep.read("roughness", value, mask).max() <= 1
+    value = np.array([[0.0, 0.5], [0.6, 0.7]], np.float32)[..., None]
+    one = Intrinsics(roughness=value, metallic=value, mask=mask)
+    two = one.replace(roughness=value * 0.5)
+    (alone,) = calibrated([one], {"roughness": [0.5, 0.1]})
+    assert masked_mean(alone.require("roughness")["roughness"], mask) == pytest.approx(0.5 * 0.6 + 0.1, abs=1e-6)
+    first, second = (own.require("roughness")["roughness"] for own in calibrated([one, two], {"roughness": [0.5, 0.1]}))
+    step = 0.5 * 0.45 + 0.1 - 0.45
+    inside = mask > 0
+    np.testing.assert_allclose(first[inside], value[inside] + step, atol=1e-6)
+    np.testing.assert_allclose(second[inside], 0.5 * value[inside] + step, atol=1e-6)
+    assert first[0, 0] == second[0, 0] == 0
+    np.testing.assert_array_equal(alone.require("metallic")["metallic"], value)
+    (steep,) = calibrated([one], {"roughness": [9, -1]})
+    assert steep.require("roughness")["roughness"].max() == 1
+    assert calibrated([one, two], None) == [one, two]
 
 
 def test_a_pipeline_decomposes_by_its_calibration(checkpoint: Path, tmp_path: Path) -> None:
     image, mask = picture()
-    before = UniRenderPipeline.from_pretrained(checkpoint).decompose(image, mask)
-    write_calibrated(checkpoint, tmp_path / "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
+    many = {"mode": "sample", "num_inference_steps": 2, "num_samples": 3}
+    plain = UniRenderPipeline.from_pretrained(checkpoint)
+    before, spread = plain.decompose(image, mask), plain.decompose(image, mask, **_seeded(many))
+    (tmp_path / "lined").mkdir()
+    write_calibrated(checkpoint, tmp_path / "lined", "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
     pipeline = UniRenderPipeline.from_pretrained(tmp_path / "lined")
     after = pipeline.decompose(image, mask)
     assert after.roughness == pytest.approx(0.5 * before.roughness + 0.2, abs=1e-5)
     assert after.metallic == pytest.approx(before.metallic, abs=1e-6)
+    maps = [own.decompose(image, mask, material="map", closed=False) for own in (plain, pipeline)]
+    assert maps[1].roughness == pytest.approx(0.5 * maps[0].roughness + 0.2, abs=1e-3)  # but for what is clipped
+    moved = pipeline.decompose(image, mask, **_seeded(many))
+    assert moved.std is not None
+    assert spread.std is not None
+    np.testing.assert_allclose(moved.std["roughness"], spread.std["roughness"], atol=1e-6)
+    assert moved.roughness == pytest.approx(0.5 * spread.roughness + 0.2, abs=1e-5)
     pipeline.save_pretrained(tmp_path / "again")
     again = UniRenderPipeline.from_pretrained(tmp_path / "again")
     assert again.decompose(image, mask).roughness == pytest.approx(after.roughness, abs=1e-6)
-    plain = UniRenderPipeline.from_pretrained(tmp_path / "lined", calibration=None)
-    assert plain.decompose(image, mask).roughness == pytest.approx(before.roughness, abs=1e-6)
+    without = UniRenderPipeline.from_pretrained(tmp_path / "lined", calibration=None)
+    assert without.decompose(image, mask).roughness == pytest.approx(before.roughness, abs=1e-6)
+
+
+def _seeded(options: dict) -> dict:
+    import torch
+
+    return options | {"generator": torch.Generator().manual_seed(0)}
 
 
 @pytest.mark.parametrize(
-    "lines", [{"albedo": [1, 0]}, {"roughness": [1]}, {"metallic": [-1, 0]}, {"roughness": [1, np.nan]}]
+    "lines",
+    [
+        {"albedo": [1, 0]},
+        {"roughness": [1]},
+        {"metallic": [-1, 0]},
+        {"roughness": [1, np.nan]},
+        {"roughness": 0.8},
+        {"roughness": ["a", 1]},
+        [0.8, 0.1],
+        {},
+    ],
 )
-def test_other_lines_are_refused(lines: dict) -> None:
-    with pytest.raises(UnirenderError, match="calibration: got"):
-        check_calibration(lines)
+def test_other_lines_are_refused(lines: object) -> None:
+    with pytest.raises(UnirenderError, match=r"calibration: got .* mend it in model_index.json"):
+        check_lines(lines)
 
 
 def test_the_command_writes_a_copy(data: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """An untrained network says the same of all, and these are rough: their mean is better."""
-    out = tmp_path / "calibrated"
+    for name in ("calibrated.old", "calibrated.partial"):  # somebody's own
+        (tmp_path / "new" / name).mkdir(parents=True)
+        (tmp_path / "new" / name / "precious").touch()
+    out = tmp_path / "new" / "calibrated"
     assert Calibrate(data, out, checkpoint, pictures=2).run() == 0
     said = capsys.readouterr().out
-    assert "decomposed 20 of 20 pictures" in said
+    assert "decomposed pictures of 10 of 10 groups" in said
+    assert sorted(path.name for path in out.parent.iterdir()) == ["calibrated", "calibrated.old", "calibrated.partial"]
+    assert all((out.parent / name / "precious").exists() for name in ("calibrated.old", "calibrated.partial"))
     lines = json.loads((out / "model_index.json").read_text())["calibration"]
-    assert "roughness" in lines
     weights = "dual_stream/diffusion_pytorch_model.safetensors"
     assert (out / weights).read_bytes() == (checkpoint / weights).read_bytes()
     pipeline = UniRenderPipeline.from_pretrained(checkpoint)
     objects, found, truth = readings(pipeline, GroupDataset(data), 2, 0)
-    assert sorted(set(objects)) == list(range(10))
+    assert [int(np.sum(objects == i)) for i in range(10)] == [2] * 10
     assert set(np.round(truth[:, 0], 2)) == {0.8, 0.95}
     line = fit(objects, found[:, 0], truth[:, 0])
-    assert isinstance(line, Line)
-    assert f"roughness: {line.slope:.3f} x predicted + {line.offset:.3f}" in said
+    assert f"roughness: {line}" in said
     np.testing.assert_allclose(lines["roughness"], [line.slope, line.offset], atol=1e-4)
 
 
+def test_as_many_pictures_of_groups_of_any_kind(tmp_path: Path, checkpoint: Path) -> None:
+    """A group that is no basis has as many items as pictures; of one object there may be several groups."""
+    keys = ["a_g0", "a_g1", "b_g0"]
+    groups = {key: group_members("independent", SIZE, 2, (40, 70), (20,), i) for i, key in enumerate(keys)}
+    write_shard(tmp_path / "shard-000000.tar", groups)
+    data = GroupDataset(tmp_path)
+    assert len(data) > len(keys)
+    objects, found, truth = readings(UniRenderPipeline.from_pretrained(checkpoint), data, 2, 0)
+    assert objects.tolist() == [0, 0, 0, 0, 1, 1]
+    assert found.shape == truth.shape == (6, 2)
+    np.testing.assert_allclose(truth[:, 1], 0.2, atol=1e-3)
+
+
+def test_nothing_is_written_where_no_line_is_worth_having(
+    data: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Line, "better", property(lambda line: False))
+    assert Calibrate(data, tmp_path / "out", checkpoint, pictures=1).run() == 0
+    said = capsys.readouterr().out
+    assert "nothing is written" in said
+    assert said.count(": not kept") == 2
+    assert not list(tmp_path.iterdir())
+
+
 def test_wrong_calls_are_refused(data: Path, checkpoint: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--pictures 0"):
-        Calibrate(data, tmp_path / "out", checkpoint, pictures=0).run()
-    with pytest.raises(UnirenderError, match="exists, expected a new folder"):
-        Calibrate(data, tmp_path, checkpoint).run()
+    out = tmp_path / "out"
+    for change, named in (({"pictures": 0}, "--pictures 0"), ({"seed": -1}, "--seed -1")):
+        with pytest.raises(UsageError, match=named):
+            Calibrate(data, out, checkpoint, **change).run()
+    with pytest.raises(UnirenderError, match="no such data folder"):
+        Calibrate(tmp_path / "none", out, checkpoint).run()
     few = write_dataset(tmp_path / "few", size=SIZE, shards=1, groups=2)
     with pytest.raises(UnirenderError, match="got 2 objects, expected 10 or more"):
-        Calibrate(few, tmp_path / "out", checkpoint).run()
-    assert not (tmp_path / "out").exists()
-
-
-def test_what_ships_has_lines_that_a_pipeline_takes() -> None:
-    pipeline = UniRenderPipeline.from_pretrained(checkpoint_folder("small"))
-    assert check_calibration(pipeline.config["calibration"]) == pipeline.config["calibration"]
+        Calibrate(few, out, checkpoint).run()
+    with pytest.raises(UnirenderError, match="exists and is not empty"):
+        Calibrate(data, tmp_path, checkpoint).run()
+    small = write_dataset(tmp_path / "small", size=SIZE // 2, shards=1, groups=10)
+    with pytest.raises(UnirenderError, match="16 x 16 pixels, expected at least 32"):
+        Calibrate(small, out, checkpoint).run()
+    shutil.copytree(checkpoint, tmp_path / "trained")
+    known = {"data": {"fingerprint": GroupDataset(data).fingerprint}}
+    (tmp_path / "trained" / "training.json").write_text(json.dumps({"continues": [known]}))
+    with pytest.raises(UnirenderError, match="was trained on this folder"):
+        Calibrate(data, out, tmp_path / "trained").run()
+    assert not out.exists()
 
 
 def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path) -> None:
@@ -140,14 +234,31 @@ def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path)
     data = {"folder": "new", "fingerprint": "ab" * 32, "shards": 2, "groups": 10, "pairs": 60}
     about = {"data": data, "pictures": 3, "seed": 0}
     line = Line(0.75, 0.125, 0.0526, 0.05, 0.0012)
-    write_calibrated(tmp_path / "trained", tmp_path / "mine", {"roughness": line}, about)
+    (tmp_path / "mine").mkdir()
+    write_calibrated(tmp_path / "trained", tmp_path / "mine", "mine", {"roughness": line}, about)
     facts = json.loads((tmp_path / "mine" / "training.json").read_text())
     assert (facts["preset"], facts["calibration"]["lines"]["roughness"]["slope"]) == ("tiny", 0.75)
     card = (tmp_path / "mine" / "README.md").read_text()
     assert "# unirender: mine" in card
     assert "roughness: 0.750 x predicted + 0.125, mean squared error 0.0526 → 0.0500 ± 0.0012" in card
-    assert "3 pictures of each object of `new`: 2 shards, 10 groups" in card
-    write_calibrated(tmp_path / "mine", tmp_path / "none", {}, about)
-    assert json.loads((tmp_path / "none" / "model_index.json").read_text())["calibration"] is None
-    assert "calibration" not in json.loads((tmp_path / "none" / "training.json").read_text())
-    assert "are read by" not in (tmp_path / "none" / "README.md").read_text()
+    assert "3 pictures of each group of `new`: 2 shards, 10 groups" in card
+
+
+def test_training_on_says_that_the_line_is_not_inherited(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    read_start(MODEL, checkpoint)
+    assert "calibration" not in capsys.readouterr().err
+    (tmp_path / "lined").mkdir()
+    write_calibrated(checkpoint, tmp_path / "lined", "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
+    read_start(MODEL, tmp_path / "lined")
+    assert "run `unirender calibrate` on the new ones" in capsys.readouterr().err
+
+
+def test_what_ships_has_lines_that_a_pipeline_takes() -> None:
+    lines = UniRenderPipeline.from_pretrained(checkpoint_folder("small")).config["calibration"]
+    assert lines
+    assert check_lines(lines) == lines
+    card = (checkpoint_folder("small") / "README.md").read_text()
+    slope, offset = lines["roughness"]
+    assert f"roughness: {slope:.3f} x predicted + {offset:.3f}" in card

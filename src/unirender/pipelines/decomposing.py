@@ -7,11 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.pipelines.calibration import Lines, calibrated
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
 from unirender.pipelines.rendering import render_any_size
-from unirender.pipelines.results import Decomposition, MaterialRule, combine, predicted_intrinsics
+from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
 
@@ -36,7 +37,14 @@ class View:
 
 
 def decompose_views(
-    network: Network, views: Sequence[View], how: Sampling, *, material: MaterialRule, closed: bool, tile: bool
+    network: Network,
+    views: Sequence[View],
+    how: Sampling,
+    *,
+    material: str,
+    closed: bool,
+    tile: bool,
+    calibration: Lines | None = None,
 ) -> list[Decomposition]:
     """Inverse rendering.
 
@@ -44,9 +52,10 @@ def decompose_views(
         network: whose size the pictures are brought to.
         views: any sizes and cameras.
         how: steps, samples and noise.
-        material: how metallic and roughness are read.
+        material: `scalar` or `map`.
         closed: whether albedo, s and d are changed so that their rendering is the picture; one more batch.
         tile: whether pictures larger than the network's square get the detail of tiles; a batch for every few tiles.
+        calibration: lines by which roughness and metallic are read.
     """
     frames = [view.frame(network.size) for view in views]
     found = network.attributes(
@@ -56,7 +65,7 @@ def decompose_views(
         how,
     )
     samples = [
-        [predicted_intrinsics(maps, frame, view.mask, view.camera, material) for maps in own]
+        calibrated([predicted_intrinsics(maps, frame, view.mask, view.camera, material) for maps in own], calibration)
         for view, frame, own in zip(views, frames, found, strict=True)
     ]
     for i, (view, frame) in enumerate(zip(views, frames, strict=True)):

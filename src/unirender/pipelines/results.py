@@ -1,13 +1,11 @@
 """What the pipeline returns, and how predictions become `Intrinsics`."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
-from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import constant_map, masked_mean
 from unirender.pipelines.framing import Frame, unit_normal
@@ -61,59 +59,15 @@ class EditResult:
         return float(self.coarse[self.intrinsics.require("mask")["mask"] > 0].mean())
 
 
-@dataclass(frozen=True)
-class MaterialRule:
-    """How predicted metallic and roughness are read.
-
-    Attributes:
-        kind: `scalar`, one number to an object, or `map`.
-        lines: by name, slope and offset of what replaces a predicted value (`unirender.training.calibrate`); one that
-            is missing stays as predicted.
-    """
-
-    kind: str
-    lines: Mapping[str, Sequence[float]] = field(default_factory=dict)
-
-    def read(
-        self, name: str, value: Float[np.ndarray, "h w 1"], mask: Float[np.ndarray, "h w 1"]
-    ) -> Float[np.ndarray, "h w 1"]:
-        """The map of a quantity, in [0, 1]; 0 outside the mask."""
-        value = np.clip(value, 0, 1)
-        read = constant_map(masked_mean(value, mask), mask) if self.kind == "scalar" else value
-        if name not in self.lines:
-            return read
-        slope, offset = self.lines[name]
-        return constant_map(np.clip(slope * read + offset, 0, 1), mask)
-
-
-def check_calibration(lines: Mapping[str, Sequence[float]] | None) -> dict[str, list[float]] | None:
-    """The lines of a `MaterialRule`, as a checkpoint's configuration holds them.
-
-    Raises:
-        UnirenderError: an unknown name, or a line that is no slope >= 0 and offset.
-    """
-    if lines is None:
-        return None
-    for name, line in lines.items():
-        if name not in ("roughness", "metallic") or len(line) != 2 or not np.isfinite(line).all() or line[0] < 0:
-            raise UnirenderError(
-                f"calibration: got {name!r}: {list(line)}, expected 'roughness' or 'metallic' with a slope of 0 or "
-                "more and an offset"
-            )
-    return {name: [float(value) for value in line] for name, line in lines.items()}
-
-
 def predicted_intrinsics(
-    maps: dict[str, np.ndarray],
-    frame: Frame,
-    mask: Float[np.ndarray, "h w 1"],
-    camera: Camera,
-    material: MaterialRule,
+    maps: dict[str, np.ndarray], frame: Frame, mask: Float[np.ndarray, "h w 1"], camera: Camera, material: str
 ) -> Intrinsics:
-    """One prediction `[s s c]` at the picture's size: unit normals, 0 outside the mask, materials by their rule."""
+    """One prediction `[s s c]` at the picture's size: unit normals, 0 outside the mask, scalar materials if asked."""
     sized = {name: frame.leave_map(maps[name], mask) for name in PREDICTED if name != "environment"}
     sized["normal"] = unit_normal(sized["normal"])
-    sized |= {name: material.read(name, sized[name], mask) for name in ("roughness", "metallic")}
+    for name in ("roughness", "metallic"):
+        value = np.clip(sized[name], 0, 1)
+        sized[name] = constant_map(masked_mean(value, mask), mask) if material == "scalar" else value
     return Intrinsics(**sized, environment=maps["environment"], mask=mask, camera=camera)
 
 

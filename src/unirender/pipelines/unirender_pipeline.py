@@ -9,7 +9,7 @@ of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` componen
 
 import logging
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -29,12 +29,13 @@ from unirender.intrinsics import Intrinsics
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.pipelines.calibration import Lines, check_lines
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, told_derived, unit_value
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
-from unirender.pipelines.results import Decomposition, EditResult, MaterialRule, check_calibration
+from unirender.pipelines.results import Decomposition, EditResult
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.shipped import checkpoint_folder, shipped_names
 
@@ -51,7 +52,7 @@ class UniRenderPipeline(DiffusionPipeline):
         scheduler: with zero terminal SNR and `prediction_type="sample"`, without noise of its own: DDIM or UniPC.
         vae: for models with the KL codec.
         material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
-        calibration: slope and offset of roughness, of metallic, or of both, by name (`unirender calibrate`).
+        calibration: lines by which predicted roughness and metallic are read (`unirender.pipelines.calibration`).
     """
 
     model_cpu_offload_seq = "dual_stream"
@@ -63,11 +64,11 @@ class UniRenderPipeline(DiffusionPipeline):
         scheduler: SchedulerMixin,
         vae: AutoencoderKL | None = None,
         material: str = "scalar",
-        calibration: Mapping[str, Sequence[float]] | None = None,
+        calibration: Lines | None = None,
     ) -> None:
         super().__init__()
         self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
-        self.register_to_config(material=material, calibration=check_calibration(calibration))
+        self.register_to_config(material=material, calibration=check_lines(calibration))
         self.dual_stream: DualStreamModel
         self.scheduler: SchedulerMixin
         codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
@@ -145,7 +146,7 @@ class UniRenderPipeline(DiffusionPipeline):
             tile: add the detail of tiles to albedo and normal where the picture is larger than that square.
             material: one number per object or maps; None: as the checkpoint was trained.
             closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`); False
-                gives what the network predicts.
+                gives what the network predicts (materials by the checkpoint's calibration, if it has one).
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
@@ -218,8 +219,8 @@ class UniRenderPipeline(DiffusionPipeline):
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
             picture, cover = as_picture(image, mask)
             views.append(View(srgb_decode(picture) * cover, cover, camera))
-        rule = MaterialRule(material, self.config["calibration"] or {})
-        return decompose_views(network, views, how, material=rule, closed=closed, tile=tile)
+        lines = self.config["calibration"]
+        return decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
 
     def render(
         self,

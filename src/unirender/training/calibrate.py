@@ -1,15 +1,16 @@
-"""`unirender calibrate`: how sure a checkpoint is of materials, set right on objects that it never saw.
+"""`unirender calibrate`: how sure a checkpoint is of materials, set right on objects that are new to it.
 
-A network knows the objects that it was trained on too well, and is too sure of others: the roughness that it predicts
-lies farther from the middle than the truth does on average. A line of least squares through new objects takes that
+A network knows the objects that it was trained on too well, and is too sure of others: where it predicts a roughness
+far from the middle, the truth is nearer to it on average. The line of least squares through new objects takes that
 back, for roughness and metallic each:
 
-    truth ~ k predicted + c,    clipped to [0, 1]
+    truth ~ k predicted + c
 
-Only a line is kept that lowers the error on objects that it was not fitted to, by more than chance. It stands in the
-configuration of the checkpoint's pipeline, whose weights stay as they are.
+Every object counts the same. Only a line is kept that lowers the error on objects that it was not fitted to, by more
+than chance. It stands in the configuration of the checkpoint's pipeline, whose weights stay as they are.
 """
 
+import contextlib
 import json
 import shutil
 from collections.abc import Callable, Mapping
@@ -17,7 +18,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
+from unirender.options import at_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,9 +28,9 @@ if TYPE_CHECKING:
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.training.data import GroupDataset
 
-NAMES = ("roughness", "metallic")
 FOLDS = 5  # parts of the objects, each of which is scored with the line of the others
 LEAST_OBJECTS = 2 * FOLDS
+LEAST_SPREAD = 0.01  # standard deviation of predictions: below it they are one number, and the line is level
 INDEX = "model_index.json"
 
 
@@ -39,22 +41,30 @@ class Calibrate:
     data: Path
     """Folder that `unirender dataset` wrote, of other objects than those of the training."""
     out: Path
-    """Folder of the calibrated copy of the checkpoint; it must not exist."""
+    """New folder of the calibrated copy of the checkpoint; none is written where no line is worth having."""
     checkpoint: Path | None = None
     """Folder of the checkpoint, or a shipped one by its name. None: `tiny`."""
     pictures: int = 3
-    """Pictures of each object, drawn as in training: of any mixture of its lights, any of its materials."""
+    """Pictures of each group, at most: any mixture of its lights, any of its materials."""
     seed: int = 0
     """Of what is drawn."""
 
+    def check(self) -> None:
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range.
+        """
+        at_least(1, pictures=self.pictures)
+        at_least(0, seed=self.seed)
+
     def run(self) -> int:
         """Returns the exit status."""
-        if self.pictures < 1:
-            raise UsageError(f"--pictures {self.pictures}: expected 1 or more")
-        if self.out.exists():
-            raise UnirenderError(f"{self.out}: exists, expected a new folder; choose another --out")
+        self.check()
+        if not self.data.is_dir():
+            raise UnirenderError(f"{self.data}: no such data folder, expected one written by `unirender dataset`")
         lines = calibrate(self)
-        print(f"{self.out}: {', '.join(lines) or 'nothing'} calibrated")
+        print(f"{self.out}: {', '.join(lines)} calibrated" if lines else "no line is worth having: nothing is written")
         return 0
 
 
@@ -67,7 +77,7 @@ class Line:
         offset: of the line.
         before: mean squared error of the predictions.
         after: the same of the lines' values, each at objects that its line was not fitted to.
-        chance: half of the 95 % interval of the difference, over objects.
+        chance: half of the 95 % interval of the difference.
     """
 
     slope: float
@@ -81,38 +91,63 @@ class Line:
         """Whether the line is worth having."""
         return self.before - self.after > self.chance
 
+    def __str__(self) -> str:
+        errors = f"{self.before:.4f}, with lines of other objects {self.after:.4f} (± {self.chance:.4f})"
+        kept = "" if self.better else ": not kept"
+        return f"{self.slope:.3f} x predicted + {self.offset:.3f}; mean squared error {errors}{kept}"
+
 
 def calibrate(options: Calibrate) -> dict[str, Line]:
-    """Fits the lines and writes the copy; returns those that it has got.
+    """Fits the lines and writes the copy, if there are any worth having; returns these.
 
     Raises:
-        UnirenderError: no such checkpoint or data, or too few objects.
+        UnirenderError: no such checkpoint, a broken account of its training, no data, too few objects or pictures that
+            are smaller than the network's; or the copy cannot be written.
     """
+    from unirender.files import new_folder
+    from unirender.models.precision import resolve_device
+    from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
     from unirender.training.data import GroupDataset
+    from unirender.training.export import read_history
     from unirender.training.facts import dataset_facts
 
     checkpoint = checkpoint_folder(options.checkpoint)
-    pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None)
+    pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None).to(resolve_device("auto"))
     pipeline.set_progress_bar_config(disable=True)
+    history = read_history(checkpoint)
     data = GroupDataset(options.data)
-    if len(data.keys) < LEAST_OBJECTS:
-        raise UnirenderError(f"{options.data}: got {len(data.keys)} objects, expected {LEAST_OBJECTS} or more")
-    objects, found, truth = readings(pipeline, data, options.pictures, options.seed, _tell)
-    kept: dict[str, Line] = {}
-    for column, name in enumerate(NAMES):
-        line = fit(objects, found[:, column], truth[:, column])
-        errors = f"{line.before:.4f}, with lines of other objects {line.after:.4f} (± {line.chance:.4f})"
-        print(
-            f"{name}: {line.slope:.3f} x predicted + {line.offset:.3f}; mean squared error {errors}"
-            f"{'' if line.better else ': left as it is'}"
+    if min(data.resolution) < pipeline.size:
+        raise UnirenderError(
+            f"{options.data}: got pictures of {data.resolution[1]} x {data.resolution[0]} pixels, expected at least "
+            f"{pipeline.size}, the size of {checkpoint}; render larger ones"
         )
-        if line.better:
-            kept[name] = line
-    about = {"data": dataset_facts(options.data, data), "pictures": options.pictures, "seed": options.seed}
-    write_calibrated(checkpoint, options.out, kept, about)
-    return kept
+    if data.fingerprint in {facts.get("data", {}).get("fingerprint") for facts in history}:
+        raise UnirenderError(f"{options.data}: {checkpoint} was trained on this folder, expected one of other objects")
+    if (count := len(set(map(object_of, data.keys)))) < LEAST_OBJECTS:
+        raise UnirenderError(f"{options.data}: got {count} objects, expected {LEAST_OBJECTS} or more")
+    with contextlib.suppress(_NothingKept), new_folder(options.out) as folder:
+        objects, found, truth = readings(pipeline, data, options.pictures, options.seed, _tell)
+        lines = {name: fit(objects, found[:, column], truth[:, column]) for column, name in enumerate(NAMES)}
+        for name, line in lines.items():
+            print(f"{name}: {line}")
+        kept = {name: line for name, line in lines.items() if line.better}
+        if not kept:
+            raise _NothingKept
+        about = {"data": dataset_facts(options.data, data), "pictures": options.pictures, "seed": options.seed}
+        write_calibrated(checkpoint, folder, options.out.name, kept, about)
+        return kept
+    return {}
+
+
+class _NothingKept(Exception):
+    """No folder is to appear."""
+
+
+def object_of(key: str) -> str:
+    """The object of a group, by its key: one object may have several."""
+    return key.rpartition("_g")[0] or key
 
 
 def readings(
@@ -126,96 +161,109 @@ def readings(
 
     Args:
         pipeline: without a calibration.
-        data: new objects, at any size.
-        pictures: of each object.
+        data: new objects.
+        pictures: of each group, at most.
         seed: of what is drawn.
-        progress: called with (pictures done, pictures in all).
+        progress: called with (groups done, groups in all).
+
+    Raises:
+        UnirenderError: a group's pictures cannot be used; the message names it.
     """
     import numpy as np
 
     from unirender.color import image_srgb, unpremultiply
+    from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.editing import masked_mean
-    from unirender.training.augment import NO_AUGMENTATION, from_maps
+    from unirender.training.augment import from_maps
     from unirender.training.presets import Augmentation
 
-    drawn = Augmentation(permute=NO_AUGMENTATION.permute, turn=NO_AUGMENTATION.turn)
-    total = pictures * len(data)
+    drawn = Augmentation(permute=0.0, turn=0.0)
+    number = {key: i for i, key in enumerate(dict.fromkeys(map(object_of, data.keys)))}
+    of_group: dict[int, list[int]] = {}
+    for index in range(pictures * len(data)):
+        own = of_group.setdefault(data.drawn(index, seed, drawn)[0], [])
+        own += [index] * (len(own) < pictures)
     objects, found, truth = [], [], []
-    for index in range(total):
-        image, maps = from_maps(data.sample(index, seed, drawn))
-        mask = maps.require("mask")["mask"]
-        seen = pipeline.decompose(image_srgb(unpremultiply(image, mask)), mask, closed=False)
-        true = maps.require(*NAMES)
-        objects.append(data.drawn(index, seed, drawn)[0])
-        found.append([getattr(seen, name) for name in NAMES])
-        truth.append([masked_mean(true[name], mask) for name in NAMES])
-        progress(index + 1, total)
+    for done, (group, indices) in enumerate(sorted(of_group.items()), start=1):
+        try:
+            scenes = [from_maps(data.sample(index, seed, drawn)) for index in indices]
+            masks = [maps.require("mask")["mask"] for _, maps in scenes]
+            seen = [image_srgb(unpremultiply(image, mask)) for (image, _), mask in zip(scenes, masks, strict=True)]
+            answers = pipeline.decompose_batch(seen, masks, closed=False)
+        except UnirenderError as error:
+            raise UnirenderError(f"{data.folder}: group {data.keys[group]}: {error}") from error
+        for (_, maps), mask, answer in zip(scenes, masks, answers, strict=True):
+            true = maps.require(*NAMES)
+            objects.append(number[object_of(data.keys[group])])
+            found.append([getattr(answer, name) for name in NAMES])
+            truth.append([masked_mean(true[name], mask) for name in NAMES])
+        progress(done, len(of_group))
     return np.array(objects), np.array(found), np.array(truth)
 
 
 def fit(objects: 'Int[np.ndarray, " n"]', found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]') -> Line:
-    """The line of least squares; its errors are those of lines that are fitted to four fifths of the objects."""
+    """The line of least squares; its errors are those of lines that are fitted to four fifths of the objects.
+
+    All objects weigh the same, however many pictures there are of them.
+    """
     import numpy as np
 
+    _, objects, count = np.unique(objects, return_inverse=True, return_counts=True)
+    weight = 1 / count[objects]
     part = objects % FOLDS
     after = np.zeros_like(found)
     for fold in range(FOLDS):
-        slope, offset = _line(found[part != fold], truth[part != fold])
-        after[part == fold] = np.clip(slope * found[part == fold] + offset, 0, 1)
-    change = np.square(after - truth) - np.square(found - truth)
-    count = np.bincount(objects)
-    of_object = np.bincount(objects, change)[count > 0] / count[count > 0]
-    chance = 1.96 * float(of_object.std()) / len(of_object) ** 0.5
-    before, after = (float(np.square(value - truth).mean()) for value in (found, after))
-    return Line(*_line(found, truth), before, after, chance)
+        own = part == fold
+        slope, offset = _line(found[~own], truth[~own], weight[~own])
+        after[own] = np.clip(slope * found[own] + offset, 0, 1)
+    errors = [np.bincount(objects, weight * np.square(value - truth)) for value in (found, after)]
+    chance = 1.96 * float((errors[1] - errors[0]).std()) / len(count) ** 0.5
+    return Line(*_line(found, truth, weight), float(errors[0].mean()), float(errors[1].mean()), chance)
 
 
-def _line(found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]') -> tuple[float, float]:
+def _line(
+    found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]', weight: 'Float[np.ndarray, " n"]'
+) -> tuple[float, float]:
     """Slope, not below 0, and offset."""
-    variance = float(found.var())
-    slope = max(float(((found - found.mean()) * (truth - truth.mean())).mean()) / variance, 0.0) if variance else 0.0
-    return slope, float(truth.mean() - slope * found.mean())
+    import numpy as np
+
+    x, y = (float(np.average(value, weights=weight)) for value in (found, truth))
+    variance = float(np.average(np.square(found - x), weights=weight))
+    covariance = float(np.average((found - x) * (truth - y), weights=weight))
+    slope = max(covariance / variance, 0.0) if variance > LEAST_SPREAD**2 else 0.0
+    return slope, y - slope * x
 
 
-def write_calibrated(checkpoint: Path, out: Path, lines: Mapping[str, Line], about: Mapping[str, Any]) -> None:
-    """A copy of a pipeline folder with these lines in its configuration, and in the account of its training, if it has
-    one; it appears when it is complete.
+def write_calibrated(
+    checkpoint: Path, folder: Path, name: str, lines: Mapping[str, Line], about: Mapping[str, Any]
+) -> None:
+    """Copies a pipeline folder and adds the lines, to its configuration and to the account of its training, if there is
+    one.
 
     Args:
         checkpoint: to be copied.
-        out: the copy.
-        lines: by name; none: a calibration that it has is taken out.
+        folder: empty.
+        name: of the copy, for its model card.
+        lines: by name, instead of those that it has.
         about: data, pictures and seed, for the account.
     """
-    from unirender.training.checkpoint import replace_folder
-    from unirender.training.export import TRAINING_FILE
-
-    partial = out.with_name(f"{out.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    shutil.copytree(checkpoint, partial)
-    index = json.loads((partial / INDEX).read_text())
-    rounded = {name: [round(line.slope, 4), round(line.offset, 4)] for name, line in lines.items()}
-    index["calibration"] = rounded or None
-    (partial / INDEX).write_text(json.dumps(index, indent=2, sort_keys=True) + "\n")
-    if (partial / TRAINING_FILE).is_file():
-        _write_account(partial, out.name, {"lines": {n: asdict(line) for n, line in lines.items()}, **about})
-    replace_folder(out, partial)
-
-
-def _write_account(folder: Path, name: str, calibration: Mapping[str, Any]) -> None:
-    """Adds a calibration to `training.json`, and writes the model card anew."""
     from unirender.training.card import CARD_FILE, card_text
     from unirender.training.export import SCORES_FILE, TRAINING_FILE
 
+    shutil.copytree(checkpoint, folder, dirs_exist_ok=True, copy_function=shutil.copyfile)
+    index = json.loads((folder / INDEX).read_text())
+    index["calibration"] = {key: [round(line.slope, 4), round(line.offset, 4)] for key, line in lines.items()}
+    (folder / INDEX).write_text(json.dumps(index, indent=2, sort_keys=True) + "\n")
+    if not (folder / TRAINING_FILE).is_file():
+        return
+    calibration = {"lines": {key: asdict(line) for key, line in lines.items()}, **about}
     facts = json.loads((folder / TRAINING_FILE).read_text()) | {"calibration": calibration}
-    if not calibration["lines"]:
-        del facts["calibration"]
-    chosen = folder / SCORES_FILE
     (folder / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+    chosen = folder / SCORES_FILE
     card = card_text(name, facts, json.loads(chosen.read_text()) if chosen.is_file() else None)
     (folder / CARD_FILE).write_text(card, encoding="utf-8")
 
 
 def _tell(done: int, total: int) -> None:
-    if done % 100 == 0 or done == total:
-        print(f"decomposed {done} of {total} pictures", flush=True)
+    if done % 50 == 0 or done == total:
+        print(f"decomposed pictures of {done} of {total} groups", flush=True)

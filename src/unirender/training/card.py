@@ -104,7 +104,7 @@ def _calibration(fitted: Facts | None) -> str | None:
         f"{line['after']:.4f} ± {line['chance']:.4f} (each part of the objects by the line of the others)"
         for name, line in fitted["lines"].items()
     ]
-    return "; ".join([*lines, f"{fitted['pictures']} pictures of each object of {_data(fitted['data'])}"])
+    return "; ".join([*lines, f"{fitted['pictures']} pictures of each group of {_data(fitted['data'])}"])
 
 
 def _data(data: Facts | None) -> str | None:

@@ -17,6 +17,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_features import PictureFeatures, read_vgg
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
+from unirender.options import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.export import read_history
@@ -93,6 +94,8 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
             f"{init}: its weights are those of {_KINDS[unified]}, expected {_KINDS[config.unified]}; choose the preset "
             "that the weights were trained with, or begin without --init"
         )
+    if pipeline.config["calibration"]:
+        notice(f"{init}: its calibration is that of its own weights; run `unirender calibrate` on the new ones")
     return Start(init, pipeline)
 
 
