@@ -1,7 +1,7 @@
 """Reading predicted roughness and metallic by a line that was fitted on new objects (`unirender.training.calibrate`).
 
 The line is one between means over objects. So a prediction is moved as a whole, all samples and all pixels by the
-same amount: what one sample says beside another, and one pixel beside another, stays.
+same amount: what one sample says beside another, and one pixel beside another, stays, but for the clip.
 
     value + (k m + c - m),    m the mean over pixels and samples, k m + c and the result clipped to [0, 1]
 """

@@ -1,8 +1,8 @@
 """`unirender calibrate`: how sure a checkpoint is of materials, set right on objects that are new to it.
 
-A network knows the objects that it was trained on too well, and is too sure of others: where it predicts a roughness
-far from the middle, the truth is nearer to it on average. The line of least squares through new objects takes that
-back, for roughness and metallic each:
+Of objects that it never saw a network says too extreme things, since it learned those of its training by heart: where
+it says roughness 0.9 the truth averages lower, where it says 0.1 higher. The line of least squares through new objects
+takes that back, for roughness and metallic each:
 
     truth ~ k predicted + c
 
@@ -45,7 +45,8 @@ class Calibrate:
     checkpoint: Path | None = None
     """Folder of the checkpoint, or a shipped one by its name. None: `tiny`."""
     pictures: int = 3
-    """Pictures of each group, at most: any mixture of its lights, any of its materials."""
+    """At most this many pictures of each group, each under a random mixture of its lights, with a random one of its
+    materials."""
     seed: int = 0
     """Of what is drawn."""
 

@@ -127,6 +127,7 @@ def _scores(facts: Facts, chosen: Facts | None) -> list[str]:
     if not values:
         return []
     on = f"Measured on {facts['scored_on']}, with the averaged weights in float32." if "scored_on" in facts else ""
+    on += " Before its materials were calibrated." if on and "calibration" in facts else ""
     if chosen is not None:
         by = f"by {chosen['chosen_by']} " if "chosen_by" in chosen else ""
         said = f"This pipeline was chosen {by}on these very scenes: its scores there flatter it."
