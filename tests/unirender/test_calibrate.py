@@ -215,7 +215,7 @@ def test_wrong_calls_are_refused(data: Path, checkpoint: Path, tmp_path: Path) -
     few = write_dataset(tmp_path / "few", size=SIZE, shards=1, groups=2)
     with pytest.raises(UnirenderError, match="got 2 objects, expected 10 or more"):
         Calibrate(few, out, checkpoint).run()
-    with pytest.raises(UnirenderError, match="exists and is not empty"):
+    with pytest.raises(UnirenderError, match=r"exists and is not empty, .* choose another --out"):
         Calibrate(data, tmp_path, checkpoint).run()
     small = write_dataset(tmp_path / "small", size=SIZE // 2, shards=1, groups=10)
     with pytest.raises(UnirenderError, match="16 x 16 pixels, expected at least 32"):
@@ -240,7 +240,7 @@ def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path)
     assert (facts["preset"], facts["calibration"]["lines"]["roughness"]["slope"]) == ("tiny", 0.75)
     card = (tmp_path / "mine" / "README.md").read_text()
     assert "# unirender: mine" in card
-    assert "roughness: 0.750 x predicted + 0.125, mean squared error 0.0526 → 0.0500 ± 0.0012" in card
+    assert "roughness: 0.750 x predicted + 0.125, mean squared error 0.0526, lower by 0.0026 ± 0.0012" in card
     assert "3 pictures of each group of `new`: 2 shards, 10 groups" in card
 
 

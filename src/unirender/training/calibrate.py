@@ -64,6 +64,8 @@ class Calibrate:
         self.check()
         if not self.data.is_dir():
             raise UnirenderError(f"{self.data}: no such data folder, expected one written by `unirender dataset`")
+        if self.out.is_dir() and any(self.out.iterdir()):
+            raise UnirenderError(f"{self.out}: exists and is not empty, expected a new folder; choose another --out")
         lines = calibrate(self)
         print(f"{self.out}: {', '.join(lines)} calibrated" if lines else "no line is worth having: nothing is written")
         return 0
@@ -93,9 +95,9 @@ class Line:
         return self.before - self.after > self.chance
 
     def __str__(self) -> str:
-        errors = f"{self.before:.4f}, with lines of other objects {self.after:.4f} (± {self.chance:.4f})"
+        gain = f"lower by {self.before - self.after:.4f} ± {self.chance:.4f} with lines of other objects"
         kept = "" if self.better else ": not kept"
-        return f"{self.slope:.3f} x predicted + {self.offset:.3f}; mean squared error {errors}{kept}"
+        return f"{self.slope:.3f} x predicted + {self.offset:.3f}; mean squared error {self.before:.4f}, {gain}{kept}"
 
 
 def calibrate(options: Calibrate) -> dict[str, Line]:

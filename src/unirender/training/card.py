@@ -100,8 +100,8 @@ def _calibration(fitted: Facts | None) -> str | None:
     if fitted is None:
         return None
     lines = [
-        f"{name}: {line['slope']:.3f} x predicted + {line['offset']:.3f}, mean squared error {line['before']:.4f} → "
-        f"{line['after']:.4f} ± {line['chance']:.4f} (each part of the objects by the line of the others)"
+        f"{name}: {line['slope']:.3f} x predicted + {line['offset']:.3f}, mean squared error {line['before']:.4f}, "
+        f"lower by {line['before'] - line['after']:.4f} ± {line['chance']:.4f} at objects that it was not fitted to"
         for name, line in fitted["lines"].items()
     ]
     return "; ".join([*lines, f"{fitted['pictures']} pictures of each group of {_data(fitted['data'])}"])
