@@ -45,6 +45,7 @@ from unirender_reference.commands import Dataset
 from unirender_reference.measure.commands import Reference
 from unirender_reference.measure.lights import Lights
 from unirender_reference.measure.meshes import Meshes
+from unirender_reference.mix_command import MixMeshes
 from unirender_reference.optimize.commands import Optimize
 
 if TYPE_CHECKING:
@@ -96,6 +97,7 @@ Command = (
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Lights, tyro.conf.subcommand("lights")]
     | Annotated[Meshes, tyro.conf.subcommand("meshes")]
+    | Annotated[MixMeshes, tyro.conf.subcommand("mix-meshes")]
     | Annotated[Reference, tyro.conf.subcommand("reference")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[TrainVisibility, tyro.conf.subcommand("train-visibility")]
@@ -110,6 +112,7 @@ OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
 READER_LEFT = 141  # as a shell reports SIGPIPE
 RESUMABLE = (
     Dataset,
+    MixMeshes,
     Train,
     TrainVisibility,
     BenchRun,

@@ -4,6 +4,8 @@ The scene is flattened and its materials are packed into one atlas. `docs/meshes
 format, in which colour space, what is ignored, and every reason for a refusal.
 """
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,16 +51,42 @@ def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
 
 def load_mesh_placed(path: str | Path, root: Path | None = None) -> tuple[MeshObject, Sphere]:
     """Loads a mesh like `load_mesh`, and says where it stood: cameras in the file's units move along with it."""
-    path = Path(path)
+    with _one_sentence(Path(path)):
+        return _assembled(Path(path), _read(Path(path), root))
+
+
+def read_model(path: str | Path, root: Path | None = None) -> Model:
+    """Reads a mesh as pieces with materials of their own, in its own units; arguments and errors are `load_mesh`'s."""
+    with _one_sentence(Path(path)):
+        model = _read(Path(path), root)
+        check_geometry(_corners(model.pieces), max(piece.step for piece in model.pieces))
+        return model
+
+
+def _read(path: Path, root: Path | None) -> Model:
+    """The pieces that have faces; at least one."""
     if not path.is_file():
-        raise UnirenderError(f"mesh {path}: no such file; expected one of {', '.join(SUFFIXES)}")
+        raise UnirenderError(f"no such file; expected one of {', '.join(SUFFIXES)}")
     if path.suffix.lower() not in SUFFIXES:
-        raise UnirenderError(f"mesh {path}: got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
+        raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
     if path.stat().st_size == 0:
-        raise UnirenderError(f"mesh {path}: is empty; copy it again")
+        raise UnirenderError("is empty; copy it again")
+    model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
+    pieces = [piece for piece in model.pieces if len(piece.faces)]
+    if not pieces:
+        raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")
+    return Model(pieces, model.ignored)
+
+
+def _corners(pieces: list[Piece]) -> Float[np.ndarray, "m 3 3"]:
+    return np.concatenate([piece.vertices[piece.faces] for piece in pieces])
+
+
+@contextlib.contextmanager
+def _one_sentence(path: Path) -> Iterator[None]:
+    """Whatever goes wrong with a file becomes a `UnirenderError` that names it."""
     try:
-        model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
-        return _assembled(path, model)
+        yield
     except UnirenderError as error:
         raise UnirenderError(f"mesh {path}: {error}") from error
     except MemoryError as error:
@@ -98,9 +126,7 @@ def _grouped(pieces: list[Piece]) -> list[_Group]:
 
 
 def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
-    if not any(len(piece.faces) for piece in model.pieces):
-        raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")
-    single, doubles = without_doubles([piece for piece in model.pieces if len(piece.faces)])
+    single, doubles = without_doubles(model.pieces)
     groups = _grouped(single)
     pieces = [piece for group in groups for piece in group.pieces]
     patches = [group.patch() for group in groups]
