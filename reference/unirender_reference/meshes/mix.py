@@ -1,8 +1,8 @@
 """Meshes in other proportions and put together: more shapes to train on than a folder has.
 
-A *mix* is one to three meshes, each stretched along its axes, turned, and pushed into the first; some of their
-materials have another colour, or the picture of another mesh. What comes out is made of the same parts, so it belongs
-on their side of a split.
+A *mix* is one to three meshes, most of them stretched along their axes, all turned, and pushed into the first; some of
+their materials have another colour, or the picture of another mesh. What comes out is made of the same parts, so it
+belongs on their side of a split.
 
 Of the materials the albedo alone is kept: roughness and metallic come from the scene, as with any OBJ file.
 """
@@ -22,7 +22,7 @@ STRETCH = 0.3  # standard deviation of the logarithm of the size along each axis
 KEPT_SHAPE = 0.25, 0.4  # probability that a mesh by itself, or a part, keeps its proportions
 TUMBLED = 0.35  # probability of any rotation at all, instead of one about +y
 PART_SIZE = 0.4, 1.0  # of every part but the first, whose longest side is 1
-REACH = 0.5  # how far from the middle of the first the others' lie, along each axis
+REACH = 1.0  # how far out in the first's box, as it stands, the middle of the others lies; 1: to its faces
 RECOLOURED, REPICTURED = 0.25, 0.25  # probability that a material gets a colour, or another mesh's picture
 GREY = 0.5  # share of grey among the colours
 
@@ -50,8 +50,9 @@ def mixed(parts: Sequence[Model], pictures: Sequence[Texture], rng: np.random.Ge
         UnirenderError: a part has no extent, or coordinates that are no numbers.
     """
     pieces: list[Piece] = []
+    reach = np.zeros(3)
     for number, part in enumerate(parts):
-        placed = _Placed.drawn(part, alone=len(parts) == 1, first=number == 0, rng=rng)
+        placed = _Placed.drawn(part, reach, alone=len(parts) == 1, first=number == 0, rng=rng)
         materials: dict[int, Material] = {}  # pieces share them, and the arrays of vertices
         vertices: dict[int, Float[np.ndarray, "n 3"]] = {}
         for piece in part.pieces:
@@ -59,14 +60,18 @@ def mixed(parts: Sequence[Model], pictures: Sequence[Texture], rng: np.random.Ge
                 materials[id(piece.material)] = _changed(piece.material, pictures, rng)
             if id(piece.vertices) not in vertices:
                 vertices[id(piece.vertices)] = placed.points(piece.vertices)
+            material = materials[id(piece.material)]
             pieces.append(
                 replace(
                     piece,
                     vertices=vertices[id(piece.vertices)],
                     normals=placed.normals(piece.normals),
-                    material=materials[id(piece.material)],
+                    colors=piece.colors if _same_albedo(piece.material, material) else None,
+                    material=material,
                 )
             )
+        if number == 0:
+            reach = REACH * np.ptp(_points(pieces), axis=0) / 2
     return Model(pieces, frozenset().union(*(part.ignored for part in parts)))
 
 
@@ -79,8 +84,10 @@ class _Placed:
     shift: Float[np.ndarray, "3"]
 
     @classmethod
-    def drawn(cls, part: Model, *, alone: bool, first: bool, rng: np.random.Generator) -> "_Placed":
-        corners = np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in part.pieces])
+    def drawn(
+        cls, part: Model, reach: Float[np.ndarray, "3"], *, alone: bool, first: bool, rng: np.random.Generator
+    ) -> "_Placed":
+        corners = _points(part.pieces)
         low, high = corners.min(0), corners.max(0)
         longest = float((high - low).max())
         if not np.isfinite(longest) or longest <= 0:
@@ -88,7 +95,7 @@ class _Placed:
         kept = rng.random() < KEPT_SHAPE[0 if alone else 1]
         stretch = np.ones(3) if kept else np.exp(rng.normal(size=3) * STRETCH)
         size = 1.0 if first else rng.uniform(*PART_SIZE)
-        shift = np.zeros(3) if first else rng.uniform(-REACH, REACH, 3)
+        shift = np.zeros(3) if first else rng.uniform(-1, 1, 3) * reach
         return cls((low + high) / 2, _rotation(rng) @ np.diag(stretch) * (size / longest), shift)
 
     def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -100,6 +107,11 @@ class _Placed:
             return None
         turned = normals @ np.linalg.inv(self.matrix)
         return turned / np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
+
+
+def _points(pieces: Sequence[Piece]) -> Float[np.ndarray, "n 3"]:
+    """What the faces use."""
+    return np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces])
 
 
 def _rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
@@ -123,6 +135,11 @@ def _changed(material: Material, pictures: Sequence[Texture], rng: np.random.Gen
         picture = pictures[int(rng.integers(len(pictures)))]
         return _of(Texture(picture.texels, albedo.texcoord, albedo.transform, albedo.wrap))
     return _of(albedo)
+
+
+def _same_albedo(before: Material, after: Material) -> bool:
+    """Whether a material kept its colour or picture, which vertex colours multiply."""
+    return before.channels["albedo"] is after.channels["albedo"]
 
 
 def _of(albedo: Channel) -> Material:
