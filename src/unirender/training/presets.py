@@ -174,7 +174,16 @@ _SMALL_WIDE = dataclasses.replace(
     augmentation=dataclasses.replace(_SMALL.augmentation, turn=0.0, move=0.5),
     optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3, warmup_steps=50),
 )
-# The same on many pictures whose light need not be derived; `small_renderer` comes after it.
+# It once more, on many objects with a picture or two each: their light need not be derived, few are rendered again.
+_SMALL_MORE = dataclasses.replace(
+    _SMALL_WIDE,
+    loss=dataclasses.replace(_SMALL_WIDE.loss, material=3.0, cycle_share=0.125),
+    augmentation=dataclasses.replace(_SMALL_WIDE.augmentation, derived=0.0),
+    optimizer=OptimizerConfig(kind="muon", learning_rate=1e-3, warmup_steps=50),
+    batch_size=24,
+    p_render=0.2,
+)
+# The network of `small_wide` with the loss of `small`, likewise; `small_renderer` comes after it.
 _SMALL_COLOUR = dataclasses.replace(
     _SMALL,
     model=_SMALL_WIDE.model,
@@ -232,6 +241,7 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
     "small_wide": _SMALL_WIDE,
+    "small_more": _SMALL_MORE,
     "small_colour": _SMALL_COLOUR,
     "small_renderer": dataclasses.replace(
         _SMALL,
