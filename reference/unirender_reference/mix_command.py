@@ -28,8 +28,8 @@ class MixMeshes:
     seed: int = 0
     """Another seed makes others."""
     holdout: int = 0
-    """Every N-th file of each folder, in order of name, is left out: `--split test` of a data set or suite with the
-    same --holdout. 0: all are used."""
+    """Every N-th file of each folder, in order of name, is left out: `--split test` of a data set of that folder with
+    the same --holdout. 0: all are used."""
     max_faces: int = 60_000
     """Meshes with more triangles are not used."""
 
@@ -37,7 +37,7 @@ class MixMeshes:
         """Looks at the values.
 
         Raises:
-            UsageError: one is outside its range, or `out` lies among the meshes.
+            UsageError: one is outside its range, or `out` lies in a folder of meshes.
         """
         from unirender_reference.meshes.limits import MAX_FACES
         from unirender_reference.meshes.mix import MAX_PARTS
@@ -56,7 +56,7 @@ class MixMeshes:
             raise UsageError(f"--holdout: got {self.holdout}, expected 0 or at least 2")
         for pattern in self.patterns:
             folder = Path(pattern).expanduser()
-            if folder.is_dir() and self.out.expanduser().resolve().is_relative_to(folder.resolve()):
+            if folder.is_dir() and self.out.resolve().is_relative_to(folder.resolve()):
                 raise UsageError(
                     f"--out: got {self.out}, which lies in {pattern}, whose meshes are mixed; expected another place"
                 )

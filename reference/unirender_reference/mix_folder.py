@@ -42,15 +42,16 @@ class MixReport:
 def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done: None) -> MixReport:
     """Writes the mixes that are missing.
 
-    Mix number i depends on the files, the seed and i alone.
+    Mix number i depends on i, the files and the options but `count` and `out` alone.
 
     Args:
         options: of the command, checked.
         progress: is told after each mix how many there are.
 
     Raises:
-        UnirenderError: no meshes, none that can be used, `out` cannot be written or holds something else, or another
-            process writes to it.
+        UnirenderError: no meshes, none that can be used, or two patterns name one file; `out` cannot be made, holds
+            meshes or something else, or another process writes to it.
+        OSError: a mix cannot be written; nothing of it stays.
     """
     folders = [mesh_folder(pattern, "train", options.holdout) for pattern in options.patterns]
     unreadable = [
@@ -58,12 +59,16 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         for folder in folders
         for name, reason in folder.unreadable
     ]
-    drawn = _Drawn([folder[i] for folder in folders for i in range(len(folder))], options.max_faces)
     out, made = options.out, 0
+    files = [folder[i] for folder in folders for i in range(len(folder))]
+    _check_places(files, out)
+    drawn = _Drawn(files, options.max_faces)
     with made_folder(out), locked(out):
         _claim(options, drawn.files)
         for leftover in out.glob(".mix-*"):  # of a run that was killed
             shutil.rmtree(leftover, ignore_errors=True)
+        for leftover in out.glob(f".{MANIFEST}.*"):
+            leftover.unlink(missing_ok=True)
         for number in range(options.count):
             folder = out / f"mix-{options.seed}-{number:05d}"
             if not folder.is_dir():
@@ -71,6 +76,22 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
                 made += 1
             progress(number + 1)
     return MixReport(made, [*unreadable, *drawn.refused.values()], len(drawn.too_large))
+
+
+def _check_places(files: Sequence[MeshFile], out: Path) -> None:
+    """Raises:
+    UnirenderError: two patterns name one file, of which one may hold it out; or a file lies in `out`.
+    """
+    seen: set[Path] = set()
+    for file in files:
+        path = file.path.resolve()
+        if path in seen:
+            raise UnirenderError(f"mix-meshes: {file.path} is named by two of the patterns, expected it once")
+        if path.is_relative_to(out.resolve()):
+            raise UnirenderError(
+                f"--out: got {out}, which holds one of the meshes that are mixed ({file.name}); expected another place"
+            )
+        seen.add(path)
 
 
 def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
@@ -102,7 +123,8 @@ def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
                 "another --out"
             )
     else:
-        others = [p.name for p in out.iterdir() if p.name not in (MANIFEST, LOCK) and not p.name.startswith(".mix-")]
+        own = (MANIFEST, LOCK)
+        others = [p.name for p in out.iterdir() if p.name not in own and not p.name.startswith((".mix-", ".mix.json."))]
         if others:
             raise UnirenderError(f"{out}: is not empty and holds no mixes ({min(others)}); pass another --out")
     replace_file(path, json.dumps(made, indent=2) + "\n")
@@ -167,7 +189,7 @@ def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
     chosen = [(first, model)] if model is not None else [drawn.next(rng)]
     chosen += [drawn.next(rng) for _ in range(draw_count(rng) - 1)]
     parts = [index for index, _ in chosen]
-    donor, pictures = drawn.donor(rng, parts)
+    donor, pictures = drawn.donor(rng, parts) if any(pictures_of(model) for _, model in chosen) else (-1, [])
     mix = mixed([model for _, model in chosen], pictures, rng)
     header = [f"made of {_named(drawn.files[index])}" for index in parts]
     borrowed = {id(picture.texels) for picture in pictures}

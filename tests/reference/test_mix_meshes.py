@@ -108,9 +108,13 @@ def test_a_colour_takes_the_place_of_vertex_colours(tmp_path):
 
 
 def test_parts_lie_in_the_box_of_the_first(tmp_path):
-    model = read_model(write_solid(tmp_path, "a", trimesh.creation.box((10, 0.1, 3))))
-    for seed in range(30):
-        first, *others = mixed([model, model, model], [], np.random.default_rng(seed)).pieces
+    """A wedge, whose box is not where it was before once it is turned."""
+    corner = np.array([[0, 0, 0], [10, 0, 0], [0, 1, 0], [0, 0, 3]], float)
+    wedge = trimesh.Trimesh(corner, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    model = read_model(write_solid(tmp_path, "a", wedge))
+    block = read_model(write_solid(tmp_path, "b"))
+    for seed in range(60):
+        first, *others = mixed([model, block, block], [], np.random.default_rng(seed)).pieces
         box = corners(first).reshape(-1, 3)
         for piece in others:
             points = corners(piece).reshape(-1, 3)
@@ -239,9 +243,10 @@ def test_a_stopped_run_goes_on_with_the_same_files(tmp_path, monkeypatch):
             mix_meshes(MixMeshes((str(meshes),), stopped, count=6, seed=3))
     assert sorted(p.name for p in stopped.iterdir()) == ["mix-3-00000", "mix-3-00001", "mix.json"]
     (stopped / ".mix-3-00002.killed").mkdir()
+    (stopped / ".mix.json.killed.partial").write_text("{")
     assert mix_meshes(MixMeshes((str(meshes),), stopped, count=6, seed=3)).made == 4
     assert files(whole) == files(stopped)
-    assert not (stopped / ".mix-3-00002.killed").exists()
+    assert not list(stopped.glob(".mix*"))
     mix_meshes(MixMeshes((str(meshes),), tmp_path / "another", count=6, seed=4))
     assert [len(v) for v in shapes(whole)] != [len(v) for v in shapes(tmp_path / "another")]
     for path in sorted(whole.rglob("*.obj")):
@@ -290,6 +295,25 @@ def test_a_folder_of_other_mixes_is_refused(tmp_path):
         (out / "mix.json").write_text(broken)
         with pytest.raises(UnirenderError, match=r"mix.json: cannot be read"):
             mix_meshes(options)
+
+
+def test_places_that_would_mix_up_the_sides(tmp_path, monkeypatch):
+    """A file of two patterns may be held out by one alone; mixes must not be mixed again."""
+    meshes = folder_of_boxes(tmp_path)
+    with pytest.raises(UnirenderError, match=r"box0.obj is named by two of the patterns, expected it once"):
+        mix_meshes(MixMeshes((str(meshes), f"{meshes}/*.obj"), tmp_path / "out", count=1))
+    monkeypatch.chdir(tmp_path)
+    inside = MixMeshes(("meshes/**/*.obj",), meshes / "mixed", count=1)
+    mix_meshes(inside)
+    with pytest.raises(UnirenderError, match=r"which holds one of the meshes that are mixed \(mixed/mix-0-00000"):
+        mix_meshes(inside)
+
+
+def test_a_kill_before_anything_was_made(tmp_path):
+    meshes, out = folder_of_boxes(tmp_path), tmp_path / "out"
+    out.mkdir()
+    (out / ".mix.json.killed.partial").write_text("{")
+    assert mix_meshes(MixMeshes((str(meshes),), out, count=1)).made == 1
 
 
 def test_one_process_writes_at_a_time(tmp_path):
@@ -347,8 +371,9 @@ def test_bad_options(tmp_path):
         MixMeshes((meshes,), tmp_path / "out", max_faces=500_000).check()
     with pytest.raises(UsageError, match=r"which lies in .*, whose meshes are mixed"):
         MixMeshes((meshes,), tmp_path / "meshes" / "mixed").check()
-    with pytest.raises(UnirenderError, match=r"is not empty and holds no mixes \(meshes\)"):
-        mix_meshes(MixMeshes((meshes,), tmp_path, count=1))
+    (tmp_path / "other" / "notes").mkdir(parents=True)
+    with pytest.raises(UnirenderError, match=r"is not empty and holds no mixes \(notes\)"):
+        mix_meshes(MixMeshes((meshes,), tmp_path / "other", count=1))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "sub"):
         with pytest.raises(UnirenderError, match="cannot be made"):

@@ -22,7 +22,7 @@ STRETCH = 0.3  # standard deviation of the logarithm of the size along each axis
 KEPT_SHAPE = 0.25, 0.4  # probability that a mesh by itself, or a part, keeps its proportions
 TUMBLED = 0.35  # probability of any rotation at all, instead of one about +y
 PART_SIZE = 0.4, 1.0  # of every part but the first, whose longest side is 1
-REACH = 1.0  # how far out in the first's box, as it stands, the middle of the others lies; 1: to its faces
+REACH = 1.0  # how far out in the box of the first, as it is turned, the others' middles lie; 1: to its faces
 RECOLOURED, REPICTURED = 0.25, 0.25  # probability that a material gets a colour, or another mesh's picture
 GREY = 0.5  # share of grey among the colours
 
@@ -50,9 +50,9 @@ def mixed(parts: Sequence[Model], pictures: Sequence[Texture], rng: np.random.Ge
         UnirenderError: a part has no extent, or coordinates that are no numbers.
     """
     pieces: list[Piece] = []
-    reach = np.zeros(3)
+    box = np.zeros((2, 3))  # of the first, as it is turned: low and high corner
     for number, part in enumerate(parts):
-        placed = _Placed.drawn(part, reach, alone=len(parts) == 1, first=number == 0, rng=rng)
+        placed = _Placed.drawn(part, box, alone=len(parts) == 1, first=number == 0, rng=rng)
         materials: dict[int, Material] = {}  # pieces share them, and the arrays of vertices
         vertices: dict[int, Float[np.ndarray, "n 3"]] = {}
         for piece in part.pieces:
@@ -71,13 +71,13 @@ def mixed(parts: Sequence[Model], pictures: Sequence[Texture], rng: np.random.Ge
                 )
             )
         if number == 0:
-            reach = REACH * np.ptp(_points(pieces), axis=0) / 2
+            box = np.stack([_points(pieces).min(0), _points(pieces).max(0)])
     return Model(pieces, frozenset().union(*(part.ignored for part in parts)))
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """Where a part goes: x -> matrix (x - middle) + shift."""
+    """Where a part goes: x -> matrix (x - middle) + shift; the middle is that of its own box, before it is turned."""
 
     middle: Float[np.ndarray, "3"]
     matrix: Float[np.ndarray, "3 3"]
@@ -85,7 +85,7 @@ class _Placed:
 
     @classmethod
     def drawn(
-        cls, part: Model, reach: Float[np.ndarray, "3"], *, alone: bool, first: bool, rng: np.random.Generator
+        cls, part: Model, box: Float[np.ndarray, "2 3"], *, alone: bool, first: bool, rng: np.random.Generator
     ) -> "_Placed":
         corners = _points(part.pieces)
         low, high = corners.min(0), corners.max(0)
@@ -95,7 +95,7 @@ class _Placed:
         kept = rng.random() < KEPT_SHAPE[0 if alone else 1]
         stretch = np.ones(3) if kept else np.exp(rng.normal(size=3) * STRETCH)
         size = 1.0 if first else rng.uniform(*PART_SIZE)
-        shift = np.zeros(3) if first else rng.uniform(-1, 1, 3) * reach
+        shift = box.mean(0) if first else box.mean(0) + REACH * rng.uniform(-1, 1, 3) * np.ptp(box, axis=0) / 2
         return cls((low + high) / 2, _rotation(rng) @ np.diag(stretch) * (size / longest), shift)
 
     def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

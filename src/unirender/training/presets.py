@@ -174,7 +174,7 @@ _SMALL_WIDE = dataclasses.replace(
     augmentation=dataclasses.replace(_SMALL.augmentation, turn=0.0, move=0.5),
     optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3, warmup_steps=50),
 )
-# It once more, on many objects with a picture or two each: their light need not be derived, few are rendered again.
+# It once more, on many objects with three pictures each: their light need not be derived, few are rendered again.
 _SMALL_MORE = dataclasses.replace(
     _SMALL_WIDE,
     loss=dataclasses.replace(_SMALL_WIDE.loss, material=3.0, cycle_share=0.125),
