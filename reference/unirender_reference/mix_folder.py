@@ -50,8 +50,8 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
 
     Raises:
         UnirenderError: no meshes, none that can be used, or two patterns name one file; `out` cannot be made, holds
-            meshes or something else, or another process writes to it.
-        OSError: a mix cannot be written; nothing of it stays.
+            meshes or something else, or another process writes to it; or a mix cannot be written, and nothing of it
+            stays.
     """
     folders = [mesh_folder(pattern, "train", options.holdout) for pattern in options.patterns]
     unreadable = [
@@ -79,8 +79,10 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
 
 
 def _check_places(files: Sequence[MeshFile], out: Path) -> None:
-    """Raises:
-    UnirenderError: two patterns name one file, of which one may hold it out; or a file lies in `out`.
+    """Looks where the files lie.
+
+    Raises:
+        UnirenderError: two patterns name one file, of which one may hold it out; or a file lies in `out`.
     """
     seen: set[Path] = set()
     for file in files:
@@ -181,7 +183,11 @@ class _Drawn:
 
 
 def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
-    """Makes one mix, complete or not at all."""
+    """Makes one mix, complete or not at all.
+
+    Raises:
+        UnirenderError: it cannot be written, or no mesh can be used.
+    """
     rng = np.random.default_rng((seed, number))
     turn, place = divmod(number, len(drawn.files))  # every mesh begins one mix before any begins another
     first = int(np.random.default_rng((seed, 2**31 + turn)).permutation(len(drawn.files))[place])
@@ -195,14 +201,19 @@ def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
     borrowed = {id(picture.texels) for picture in pictures}
     if any(id(texture.texels) in borrowed for texture in pictures_of(mix)):
         header.append(f"with a picture of {_named(drawn.files[donor])}")
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        write_obj(mix, temporary, folder.name, header)
-        temporary.chmod(0o755)
-        temporary.rename(folder)
-    except BaseException:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        try:
+            write_obj(mix, temporary, folder.name, header)
+            temporary.chmod(0o755)
+            temporary.rename(folder)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise UnirenderError(
+            f"{folder}: cannot be written ({error.strerror or error}); mend that and run the same command again"
+        ) from error
 
 
 def _named(file: MeshFile) -> str:

@@ -239,7 +239,7 @@ def test_a_stopped_run_goes_on_with_the_same_files(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr("unirender_reference.mix_folder.write_obj", full_disk)
-        with pytest.raises(OSError, match="disk full"):
+        with pytest.raises(UnirenderError, match=r"mix-3-00002: cannot be written \(disk full\); mend that"):
             mix_meshes(MixMeshes((str(meshes),), stopped, count=6, seed=3))
     assert sorted(p.name for p in stopped.iterdir()) == ["mix-3-00000", "mix-3-00001", "mix.json"]
     (stopped / ".mix-3-00002.killed").mkdir()
