@@ -105,6 +105,13 @@ def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
     assert not [pattern for pattern in patterns if fnmatch(f"{name}.py", pattern)]
 
 
+@pytest.mark.parametrize("name", ["mix_command", "mix_folder", "meshes/mix", "meshes/write_obj"])
+def test_what_makes_training_data_is_in_no_key(name: str) -> None:
+    path = f"unirender_reference/{name}.py"
+    assert (package_folder("unirender_reference") / f"{name}.py").is_file()
+    assert any(fnmatch(path, pattern) for pattern in PARTS[REFERENCE].without)
+
+
 def test_a_record_follows_the_weights_and_not_where_they_lie() -> None:
     assert any(fnmatch("unirender/shipped.py", pattern) for pattern in PARTS["core"].without)
     rows = [build_rows(BenchConfig(methods=("ours",), checkpoint=Path(name))) for name in ("tiny", "small")]

@@ -183,6 +183,14 @@ _SMALL_MORE = dataclasses.replace(
     batch_size=24,
     p_render=0.2,
 )
+# On such objects the inverse direction alone: what the network renders from given maps stays the same to the bit.
+_SMALL_INVERSE = dataclasses.replace(
+    _SMALL_MORE,
+    loss=dataclasses.replace(_SMALL_MORE.loss, cycle=0.0, composite=0.0),
+    optimizer=OptimizerConfig(learning_rate=2.5e-4, beta2=0.98, weight_decay=0.0, warmup_steps=30, ema_decay=0.995),
+    trains="inverse",
+    p_render=0.0,
+)
 # The network of `small_wide` with the loss of `small`, likewise; `small_renderer` comes after it.
 _SMALL_COLOUR = dataclasses.replace(
     _SMALL,
@@ -242,6 +250,7 @@ PRESETS: dict[str, TrainConfig] = {
     "small": _SMALL,
     "small_wide": _SMALL_WIDE,
     "small_more": _SMALL_MORE,
+    "small_inverse": _SMALL_INVERSE,
     "small_colour": _SMALL_COLOUR,
     "small_renderer": dataclasses.replace(
         _SMALL,
