@@ -9,6 +9,7 @@ from both_directions import OneBatch, decompose, render
 from tiny_models import TRAIN, make_batch
 
 from unirender.errors import UsageError
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.config_check import check_config
 from unirender.training.presets import PRESETS, TrainConfig
 from unirender.training.run import Train
@@ -30,16 +31,22 @@ def test_it_moves_the_attribute_decoder_and_nothing_of_what_is_rendered(tmp_path
     found, image = decompose(parts, maps), render(parts, maps)
     run.fit(OneBatch())
     moved = [name for name, value in run.model.state_dict().items() if not torch.equal(value, before[name])]
-    assert {name.split(".")[0] for name in moved} == {"attribute_unet", "image_to_attributes"}
-    assert not [name for name in moved if "down_blocks" in name or "mid_block" in name]
+    decoder = ("image_to_attributes", *(f"attribute_unet.{part}" for part in ("up_blocks", "conv_norm_out", "conv_out")))
+    assert not [name for name in moved if not name.startswith(decoder)]
+    assert not [part for part in decoder if not any(name.startswith(part) for name in moved)]
     assert torch.equal(render(parts, maps), image)
     assert not torch.equal(decompose(parts, maps), found)  # the twin
 
 
-def test_its_preset_begins_with_the_shipped_checkpoint_and_not_without_any(tmp_path: Path) -> None:
+def test_its_preset_begins_with_the_shipped_checkpoint(tmp_path: Path) -> None:
     config = PRESETS["small_inverse"]
     check_config(config)
-    run = trainer(tmp_path / "run", dataclasses.replace(config, batch_size=2), steps=1)
-    read_start(config.model, Path("small")).apply(run)
+    run, start = trainer(tmp_path / "run", dataclasses.replace(config, batch_size=2), steps=1), Path("small")
+    read_start(config.model, start).apply(run)
+    shipped = UniRenderPipeline.from_pretrained(start).dual_stream.state_dict()
+    assert all(torch.equal(value, shipped[name]) for name, value in run.model.state_dict().items())
+
+
+def test_its_preset_is_refused_without_a_checkpoint() -> None:
     with pytest.raises(UsageError, match="expected --init with a trained one"):
         Train(Path("data"), preset="small_inverse").check()
