@@ -31,7 +31,10 @@ def test_it_moves_the_attribute_decoder_and_nothing_of_what_is_rendered(tmp_path
     found, image = decompose(parts, maps), render(parts, maps)
     run.fit(OneBatch())
     moved = [name for name, value in run.model.state_dict().items() if not torch.equal(value, before[name])]
-    decoder = ("image_to_attributes", *(f"attribute_unet.{part}" for part in ("up_blocks", "conv_norm_out", "conv_out")))
+    decoder = (
+        "image_to_attributes",
+        *(f"attribute_unet.{part}" for part in ("up_blocks", "conv_norm_out", "conv_out")),
+    )
     assert not [name for name in moved if not name.startswith(decoder)]
     assert not [part for part in decoder if not any(name.startswith(part) for name in moved)]
     assert torch.equal(render(parts, maps), image)
