@@ -110,6 +110,10 @@ def test_what_makes_training_data_is_in_no_key(name: str) -> None:
     path = f"unirender_reference/{name}.py"
     assert (package_folder("unirender_reference") / f"{name}.py").is_file()
     assert any(fnmatch(path, pattern) for pattern in PARTS[REFERENCE].without)
+    modules = [m for part in ("reference", "evaluation") for m in package_folder(f"unirender_{part}").rglob("*.py")]
+    importing = f"unirender_reference.{name.replace('/', '.')} import"
+    users = {module.stem for module in modules if importing in module.read_text()}
+    assert users <= {"mix_command", "mix_folder"}, "what renders depends on it"
 
 
 def test_a_record_follows_the_weights_and_not_where_they_lie() -> None:
