@@ -28,6 +28,7 @@ from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.lean_imports import lean_imports
 from unirender.options import notice
+from unirender.training.average import Average
 from unirender.training.calibrate import Calibrate
 from unirender.training.run import Train
 from unirender.training.visibility import TrainVisibility
@@ -101,6 +102,7 @@ Command = (
     | Annotated[Reference, tyro.conf.subcommand("reference")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[TrainVisibility, tyro.conf.subcommand("train-visibility")]
+    | Annotated[Average, tyro.conf.subcommand("average")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Figures, tyro.conf.subcommand("figures")]

@@ -1,0 +1,203 @@
+"""`unirender average`: one checkpoint whose weights are the weighted mean of those of several.
+
+    theta = sum over k of  share_k theta_k,      shares that add up to 1
+
+Runs that began with the same weights, or one with another's, mostly lie in one basin of the loss, in which a mean of
+them has less of the noise that each ended with (Wortsman et al. 2022, "Model soups"). Of networks that have no common
+beginning the mean is no network; nothing here can tell.
+"""
+
+import json
+import math
+import reprlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import tyro
+
+from unirender.errors import UnirenderError, UsageError
+from unirender.options import notice
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+Stored = Literal["float16", "float32"]
+
+ROUNDING = 1e-6  # relative
+ID = 12  # characters of a sha256 by which weights are named
+OF_THE_WEIGHTS = ("scores", "scored_on", "losses", "calibration")  # facts of a run that its mean with others has not
+
+
+@dataclass(frozen=True)
+class Average:
+    """Average the weights of checkpoints of one network, such as a run and what it began with, into a new one."""
+
+    checkpoints: tyro.conf.Positional[tuple[Path, ...]]
+    """Folders of the checkpoints, or names of shipped ones; two or more. The account of the training is that of the
+    last, under which the runs of the others are listed."""
+    out: Path
+    """New folder of the average."""
+    shares: tuple[float, ...] = ()
+    """Of each checkpoint in the average, in the same order; only their ratios count. None given: all alike."""
+    store: Stored = "float16"
+    """Type in which the average is stored."""
+
+    def check(self) -> tuple[float, ...]:
+        """Looks at the values; the shares, which add up to 1.
+
+        Raises:
+            UsageError: fewer than two checkpoints, another number of shares, or one that is not above 0.
+        """
+        count = len(self.checkpoints)
+        if count < 2:
+            raise UsageError(f"average: got {count} checkpoints, expected two or more")
+        shares = self.shares or (1.0,) * count
+        if len(shares) != count:
+            raise UsageError(f"--shares: got {len(shares)}, expected {count}, one for each checkpoint")
+        if not all(0 < share < float("inf") for share in shares):
+            raise UsageError(f"--shares {' '.join(map(str, shares))}: expected numbers above 0; leave out the others")
+        return tuple(share / sum(shares) for share in shares)
+
+    def run(self) -> int:
+        """Returns the exit status."""
+        shares = self.check()
+        if self.out.is_dir() and any(self.out.iterdir()):
+            raise UnirenderError(f"{self.out}: exists and is not empty, expected a new folder; choose another --out")
+        average(self.checkpoints, shares, self.out, self.store)
+        parts = ", ".join(f"{share:.4g} of {path}" for path, share in zip(self.checkpoints, shares, strict=True))
+        print(f"{self.out}: {parts}; use it with --checkpoint {self.out}")
+        return 0
+
+
+def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, store: Stored = "float16") -> None:
+    """Writes the average as a pipeline folder with an account of what it is made of.
+
+    Lines of a calibration are not taken over: they belong to the weights that they were fitted to.
+
+    Args:
+        checkpoints: pipeline folders, or names of shipped ones.
+        shares: of each; they add up to 1.
+        out: new folder.
+        store: type of the stored weights.
+
+    Raises:
+        UnirenderError: a folder is no checkpoint, or the account of its training is broken; the networks differ; or
+            `out` cannot be written.
+    """
+    import diffusers
+    import torch
+
+    from unirender.files import checkpoint_sha256, new_folder
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+    from unirender.shipped import checkpoint_folder
+    from unirender.training.card import CARD_FILE, card_text
+    from unirender.training.export import TRAINING_FILE, read_history
+
+    diffusers.utils.logging.disable_progress_bar()  # of loading: small files
+    folders = [checkpoint_folder(path) for path in checkpoints]
+    histories = [read_history(folder) for folder in folders]
+    with new_folder(out) as new:
+        pipeline: UniRenderPipeline | None = None
+        total: dict[str, Tensor] = {}
+        for path, folder, share in zip(checkpoints, folders, shares, strict=True):
+            one = UniRenderPipeline.from_pretrained(folder)
+            if one.config["calibration"]:
+                notice(f"{path}: its calibration is that of its own weights; run `unirender calibrate` on the average")
+            if pipeline is not None:
+                _check_alike(pipeline, one, checkpoints[0], path)
+            for name, value in one.dual_stream.state_dict().items():
+                total[name] = total.get(name, torch.zeros_like(value, dtype=torch.float64)) + share * value.double()
+            pipeline = one
+        assert pipeline is not None, "there are two at least"
+        pipeline.dual_stream.load_state_dict(total)
+        pipeline.register_to_config(calibration=None)
+        for part in (pipeline.dual_stream, pipeline.vae):
+            if part is not None:
+                torch.nn.Module.to(part, getattr(torch, store))  # in place; ModelMixin's own warns for nothing
+        pipeline.save_pretrained(new, safe_serialization=True)
+        for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
+            weights.chmod(0o644)
+        labels = [f"{folder.resolve().name} ({checkpoint_sha256(folder)[:ID]})" for folder in folders]
+        facts = averaged_facts(histories, labels, shares) | {"stored_as": store}
+        (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+        (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
+
+
+def averaged_facts(
+    histories: Sequence[Sequence[Mapping[str, Any]]], labels: Sequence[str], shares: Sequence[float]
+) -> dict[str, Any]:
+    """The account of an average: that of the last checkpoint's run, and under `continues` all the others.
+
+    Args:
+        histories: of each checkpoint, its runs, oldest first; [] where nothing is known of it.
+        labels: of each, for `averaged`. The last one's own share goes to "this run", or, where it is an average itself,
+            to what it is made of.
+        shares: of each; they add up to 1.
+    """
+    *others, last = histories
+    facts: dict[str, Any] = dict(last[-1]) if last else {}
+    within = facts.pop("averaged", None) or {"this run" if last else labels[-1]: 1.0}
+    averaged = dict(zip(labels[:-1], shares[:-1], strict=True))
+    for label, share in within.items():
+        averaged[label] = averaged.get(label, 0.0) + share * shares[-1]
+    continues: list[Any] = []
+    for run in [run for runs in (*others, last[:-1]) for run in runs]:
+        if run not in continues and run != (last[-1] if last else None):
+            continues.append(run)
+    known = {name: value for name, value in facts.items() if name not in OF_THE_WEIGHTS}
+    return known | {"averaged": averaged} | ({"continues": continues} if continues else {})
+
+
+def _check_alike(first: "UniRenderPipeline", other: "UniRenderPipeline", first_name: Path, name: Path) -> None:
+    """Looks whether two checkpoints have one network, one scheduler and one autoencoder.
+
+    Raises:
+        UnirenderError: they have not; the message names the first thing that differs.
+    """
+    for part in ("dual_stream", "scheduler", None):
+        one, two = (_settings(pipeline, part) for pipeline in (first, other))
+        for entry in sorted(one.keys() | two.keys()):
+            if not _same_setting(one.get(entry), two.get(entry)):
+                where = f"{part}.{entry}" if part else entry
+                got, expected = (reprlib.repr(settings.get(entry)) for settings in (two, one))
+                raise UnirenderError(
+                    f"{name}: {where} is {got}, expected {expected}, that of {first_name}; only checkpoints of one "
+                    "network can be averaged"
+                )
+    if not _equal(first.vae, other.vae):
+        raise UnirenderError(
+            f"{name}: its autoencoder is not that of {first_name}; only networks on the same latents can be averaged"
+        )
+
+
+def _settings(pipeline: "UniRenderPipeline", part: str | None) -> dict[str, Any]:
+    """The configuration of a component, or of the pipeline itself, without what says nothing of the network."""
+    if part is None:
+        return {"material": pipeline.config["material"]}
+    settings = dict(getattr(pipeline, part).config)
+    return {"class": type(getattr(pipeline, part)).__name__} | {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in settings.items()
+        if not name.startswith("_")
+    }
+
+
+def _same_setting(a: Any, b: Any) -> bool:
+    """Whether two entries agree; numbers of a schedule to rounding, which differs between versions of PyTorch."""
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        return all(_same_setting(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=ROUNDING)
+    return a == b
+
+
+def _equal(one: "nn.Module | None", two: "nn.Module | None") -> bool:
+    """Whether two autoencoders are the same; None: there is none."""
+    if one is None or two is None:
+        return one is two
+    a, b = one.state_dict(), two.state_dict()
+    return a.keys() == b.keys() and all(value.equal(b[name]) for name, value in a.items())
