@@ -253,6 +253,10 @@ def test_training_on_says_that_the_line_is_not_inherited(
     write_calibrated(checkpoint, tmp_path / "lined", "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
     read_start(MODEL, tmp_path / "lined")
     assert "run `unirender calibrate` on the new ones" in capsys.readouterr().err
+    told: list[str] = []  # of several processes the first one alone says it
+    read_start(MODEL, tmp_path / "lined", tell=told.append)
+    assert len(told) == 1
+    assert capsys.readouterr().err.count("calibrate") == 0
 
 
 def test_what_ships_has_lines_that_a_pipeline_takes() -> None:

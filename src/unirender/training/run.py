@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, DType, usage
+from unirender.options import Device, DType, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
@@ -210,7 +210,8 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     )
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
-    start = read_start(config.model, options.init, options.init_from)
+    tell = notice if processes.is_main else lambda text: None
+    start = read_start(config.model, options.init, options.init_from, tell)
     trainer = Trainer(config, run, device, dtype, processes, start.vae)
     start.apply(trainer)
     del start  # Stable Diffusion's U-Net is no longer needed

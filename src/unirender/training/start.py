@@ -4,7 +4,7 @@ A state in the run's folder goes before all of them.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,13 +63,19 @@ class Start:
             load_features(trainer.model)
 
 
-def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | None = None) -> Start:
+def read_start(
+    config: ModelConfig,
+    init: Path | None = None,
+    init_from: Path | None = None,
+    tell: Callable[[str], None] = notice,
+) -> Start:
     """Reads what a run begins with, and looks whether the network can begin with it.
 
     Args:
         config: the network.
         init: folder of a trained pipeline, or the name of a shipped one.
         init_from: Stable Diffusion folder.
+        tell: is told what of the beginning is not taken over.
 
     Raises:
         UnirenderError: a folder cannot be used, or belongs to another network.
@@ -95,7 +101,7 @@ def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | 
             "that the weights were trained with, or begin without --init"
         )
     if pipeline.config["calibration"]:
-        notice(f"{init}: its calibration is that of its own weights; run `unirender calibrate` on the new ones")
+        tell(f"{init}: its calibration is that of its own weights; run `unirender calibrate` on the new ones")
     return Start(init, pipeline)
 
 
