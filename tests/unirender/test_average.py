@@ -59,6 +59,8 @@ def test_what_is_stored(checkpoints: tuple[Path, Path], tmp_path: Path, capsys: 
     assert [run["preset"] for run in read_history(out)] == ["one", "two"]
     assert f"| weights averaged | 0.5 of {label}, 0.5 of this run |" in (out / CARD_FILE).read_text()
     assert [path.name for path in out.parent.iterdir()] == ["mean"]
+    for path in out.rglob("*.json"):
+        assert str(checkpoints[0].parent) not in path.read_text(), path  # folders of this machine
 
 
 def test_an_average_of_averages_is_multiplied_out() -> None:

@@ -101,23 +101,20 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     folders = [checkpoint_folder(path) for path in checkpoints]
     histories = [read_history(folder) for folder in folders]
     with new_folder(out) as new:
-        pipeline: UniRenderPipeline | None = None
+        first: UniRenderPipeline | None = None
         total: dict[str, Tensor] = {}
         for path, folder, share in zip(checkpoints, folders, shares, strict=True):
             one = UniRenderPipeline.from_pretrained(folder)
             if one.config["calibration"]:
                 notice(f"{path}: its calibration is that of its own weights; run `unirender calibrate` on the average")
-            if pipeline is not None:
-                _check_alike(pipeline, one, checkpoints[0], path)
+            first = first or one
+            _check_alike(first, one, checkpoints[0], path)
             for name, value in one.dual_stream.state_dict().items():
                 total[name] = total.get(name, torch.zeros_like(value, dtype=torch.float64)) + share * value.double()
-            pipeline = one
-        assert pipeline is not None, "there are two at least"
-        pipeline.dual_stream.load_state_dict(total)
-        pipeline.register_to_config(calibration=None)
-        for part in (pipeline.dual_stream, pipeline.vae):
-            if part is not None:
-                torch.nn.Module.to(part, getattr(torch, store))  # in place; ModelMixin's own warns for nothing
+        assert first is not None, "there are two at least"
+        vae = None if first.vae is None else _fresh(first.vae, first.vae.state_dict(), store)
+        model = _fresh(first.dual_stream, total, store)
+        pipeline = UniRenderPipeline(model, first.scheduler, vae, material=first.config["material"])
         pipeline.save_pretrained(new, safe_serialization=True)
         for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
             weights.chmod(0o644)
@@ -125,6 +122,15 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         facts = averaged_facts(histories, labels, shares) | {"stored_as": store}
         (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
         (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
+
+
+def _fresh(model: Any, weights: "dict[str, Tensor]", store: Stored) -> Any:
+    """A model of the same configuration with these weights; it does not know from which folder the first was read."""
+    import torch
+
+    own = type(model).from_config({name: value for name, value in model.config.items() if not name.startswith("_")})
+    own.load_state_dict(weights)
+    return torch.nn.Module.to(own.eval(), getattr(torch, store))  # ModelMixin's own `to` warns for nothing
 
 
 def averaged_facts(

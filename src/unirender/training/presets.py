@@ -186,8 +186,8 @@ _SMALL_MORE = dataclasses.replace(
 # On such objects the inverse direction alone: what the network renders from given maps stays the same to the bit.
 _SMALL_INVERSE = dataclasses.replace(
     _SMALL_MORE,
-    loss=dataclasses.replace(_SMALL_MORE.loss, cycle=0.0, composite=0.0),
-    optimizer=OptimizerConfig(learning_rate=2.5e-4, beta2=0.98, weight_decay=0.0, warmup_steps=30, ema_decay=0.995),
+    loss=dataclasses.replace(_SMALL_MORE.loss, cycle=0.0),
+    optimizer=OptimizerConfig(learning_rate=1e-4, beta2=0.98, weight_decay=0.0, warmup_steps=30, ema_decay=0.998),
     trains="inverse",
     p_render=0.0,
 )
