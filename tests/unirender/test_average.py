@@ -1,5 +1,6 @@
 """The mean of checkpoints: its weights, what it says of itself, and what cannot be averaged."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -7,9 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
-from tiny_models import make_pipeline
+from tiny_models import MODEL, make_pipeline
+from tiny_stable_diffusion import tiny_vae
 
+from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError, UsageError
+from unirender.files import checkpoint_sha256
+from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.average import Average, averaged_facts
 from unirender.training.card import CARD_FILE
@@ -24,6 +29,7 @@ def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     root = tmp_path_factory.mktemp("checkpoints")
     first: dict = {"preset": "one", "steps": 2, "samples": 8, "minutes": 1.0, "train": {"seed": 0}}
     second: dict = {**first, "preset": "two", "losses": {"step": 2}, "scores": {"albedo.psnr": 1.0}}
+    second |= {"scored_on": "4 scenes", "calibration": {"lines": {}}}
     for seed, (name, facts) in enumerate({"one": first, "two": {**second, "continues": [first]}}.items()):
         make_pipeline(seed).save_pretrained(root / name)
         (root / name / TRAINING_FILE).write_text(json.dumps(facts))
@@ -51,11 +57,11 @@ def test_what_is_stored(checkpoints: tuple[Path, Path], tmp_path: Path, capsys: 
     assert {value.dtype for value in load_file(out / WEIGHTS).values()} == {torch.float16}
     facts = json.loads((out / TRAINING_FILE).read_text())
     (label,) = set(facts["averaged"]) - {"this run"}
-    assert label.startswith("one (")
+    assert label == f"one {checkpoint_sha256(checkpoints[0])[:12]}"
     assert facts["averaged"] == {label: 0.5, "this run": 0.5}
     assert facts["preset"] == "two"
     assert facts["stored_as"] == "float16"
-    assert not {"losses", "scores"} & facts.keys()  # those of the run alone
+    assert not {"losses", "scores", "scored_on", "calibration"} & facts.keys()  # those of the run alone
     assert [run["preset"] for run in read_history(out)] == ["one", "two"]
     assert f"| weights averaged | 0.5 of {label}, 0.5 of this run |" in (out / CARD_FILE).read_text()
     assert [path.name for path in out.parent.iterdir()] == ["mean"]
@@ -64,9 +70,9 @@ def test_what_is_stored(checkpoints: tuple[Path, Path], tmp_path: Path, capsys: 
 
 
 def test_an_average_of_averages_is_multiplied_out() -> None:
-    old, run = {"preset": "old", "steps": 1}, {"preset": "run", "steps": 2}
+    old, run = {"preset": "old", "steps": 1}, {"preset": "run", "steps": 2, "losses": {"step": 2}}
     mean = averaged_facts([[old], [old, run]], ["a", "b"], [0.25, 0.75])
-    assert mean == {**run, "averaged": {"a": 0.25, "this run": 0.75}, "continues": [old]}
+    assert mean == {"preset": "run", "steps": 2, "averaged": {"a": 0.25, "this run": 0.75}, "continues": [old]}
     runs = [*mean.pop("continues"), mean]
     again = averaged_facts([[old], runs], ["a", "c"], [0.5, 0.5])
     assert again["averaged"] == {"a": 0.5 + 0.5 * 0.25, "this run": 0.5 * 0.75}
@@ -75,6 +81,73 @@ def test_an_average_of_averages_is_multiplied_out() -> None:
     assert turned["averaged"] == {"c": 0.5, "this run": 0.5}
     assert [fact["preset"] for fact in turned["continues"]] == ["run"]
     assert averaged_facts([[old], []], ["a", "b"], [0.5, 0.5]) == {"averaged": {"a": 0.5, "b": 0.5}, "continues": [old]}
+
+
+def test_a_run_is_listed_once_whatever_became_of_its_weights() -> None:
+    """A run goes on from the mean of another with what that began with; then all three are averaged."""
+    old, first = {"preset": "old", "steps": 1}, {"preset": "first", "steps": 2, "losses": {"step": 2}}
+    began = averaged_facts([[old], [old, first]], ["old", "first"], [0.5, 0.5])
+    second = {"preset": "second", "steps": 3}
+    runs = [*began.pop("continues"), began, second]
+    histories = [[old], [old, first], runs]
+    mean = averaged_facts(histories, ["old", "first", "second"], [0.25, 0.25, 0.5])
+    assert mean["continues"] == [old, first]  # with its losses, which the mean of it has not
+    assert averaged_facts([[old, began], [old, first]], ["began", "first"], [0.5, 0.5])["continues"] == [old]
+    lined = {**first, "calibration": {"lines": {}}, "stored_as": "float16"}
+    assert len(averaged_facts([[old, lined], runs], ["lined", "second"], [0.5, 0.5])["continues"]) == 2
+    assert len(averaged_facts([[first], [{**first, "steps": 9}]], ["a", "b"], [0.5, 0.5])["continues"]) == 1  # the twin
+
+
+def test_a_checkpoint_that_is_given_twice_counts_twice(checkpoints: tuple[Path, Path], tmp_path: Path) -> None:
+    Average((checkpoints[0], checkpoints[0], checkpoints[1]), tmp_path / "out").run()
+    shares = json.loads((tmp_path / "out" / TRAINING_FILE).read_text())["averaged"]
+    assert shares == pytest.approx({next(iter(shares)): 2 / 3, "this run": 1 / 3})
+
+
+def test_a_run_gives_its_name(checkpoints: tuple[Path, Path], tmp_path: Path) -> None:
+    """All of them leave a folder `pipeline`."""
+    shutil.copytree(checkpoints[0], tmp_path / "sunday" / "pipeline")
+    Average((tmp_path / "sunday" / "pipeline", checkpoints[1]), tmp_path / "out").run()
+    label, _ = json.loads((tmp_path / "out" / TRAINING_FILE).read_text())["averaged"]
+    assert label.startswith("sunday ")
+
+
+def test_a_network_for_each_direction(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        make_pipeline(seed, unified=False).save_pretrained(tmp_path / str(seed))
+    Average((tmp_path / "0", tmp_path / "1"), tmp_path / "out", store="float32").run()
+    one, two, mean = (load_file(tmp_path / name / WEIGHTS) for name in ("0", "1", "out"))
+    for name in one:
+        torch.testing.assert_close(mean[name], 0.5 * (one[name] + two[name]))
+    make_pipeline().save_pretrained(tmp_path / "unified")
+    with pytest.raises(UnirenderError, match="only checkpoints of one network can be averaged"):
+        Average((tmp_path / "0", tmp_path / "unified"), tmp_path / "none").run()
+
+
+def test_an_autoencoder_stays_as_it_is(tmp_path: Path) -> None:
+    """In float32, so that an average can be averaged with what it is made of."""
+    vae = tiny_vae()
+
+    def write(seed: int, name: str) -> None:
+        torch.manual_seed(seed)
+        model, _ = build_model(dataclasses.replace(MODEL, codec="kl", physics_prior="none"), vae)
+        UniRenderPipeline(model, make_scheduler(), vae).save_pretrained(tmp_path / name)
+
+    write(0, "one")
+    write(1, "two")
+    Average((tmp_path / "one", tmp_path / "two"), tmp_path / "mean").run()
+    Average((tmp_path / "one", tmp_path / "mean"), tmp_path / "again").run()
+    stored = load_file(tmp_path / "again" / "vae" / "diffusion_pytorch_model.safetensors")
+    assert all(value.equal(vae.state_dict()[name]) for name, value in stored.items())
+    assert {value.dtype for value in load_file(tmp_path / "again" / WEIGHTS).values()} == {torch.float16}
+    card = (tmp_path / "again" / CARD_FILE).read_text()
+    assert "license:" not in card  # weights of other people
+    assert "the licence of those weights applies" in card
+    with torch.no_grad():
+        next(vae.parameters()).add_(1e-3)
+    write(0, "other")
+    with pytest.raises(UnirenderError, match="other: its autoencoder is not that of"):
+        Average((tmp_path / "one", tmp_path / "other"), tmp_path / "none").run()
 
 
 def test_lines_of_a_calibration_are_left_behind(
@@ -92,7 +165,7 @@ def test_other_networks_are_refused(checkpoints: tuple[Path, Path], tmp_path: Pa
     with pytest.raises(UnirenderError, match=r"wide: dual_stream.block_out_channels is \[16, 48\], expected"):
         Average((checkpoints[0], tmp_path / "wide"), tmp_path / "out").run()
     UniRenderPipeline.from_pretrained(checkpoints[0], material="map").save_pretrained(tmp_path / "map")
-    with pytest.raises(UnirenderError, match=r"map: material is 'map', expected 'scalar', that of"):
+    with pytest.raises(UnirenderError, match=r"map: its material is 'map', expected 'scalar', that of"):
         Average((checkpoints[0], tmp_path / "map"), tmp_path / "out").run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "wide"]
 
@@ -119,6 +192,7 @@ def test_schedules_may_differ_by_rounding_only(checkpoints: tuple[Path, Path], t
         (2, (1.0, 0.0), "expected numbers above 0"),
         (2, (1.0, -1.0), "expected numbers above 0"),
         (2, (1.0, float("nan")), "expected numbers above 0"),
+        (2, (1e308, 1e308), "expected numbers above 0"),
     ],
 )
 def test_wrong_calls_are_refused(
@@ -126,8 +200,21 @@ def test_wrong_calls_are_refused(
 ) -> None:
     with pytest.raises(UsageError, match=said):
         Average(checkpoints[:count], tmp_path / "out", shares).run()
+    assert not (tmp_path / "out").exists()
+
+
+def test_folders_that_are_no_use_are_refused(checkpoints: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match=r"exists and is not empty, .* choose another --out"):
         Average(checkpoints, checkpoints[0]).run()
     with pytest.raises(UnirenderError, match=r"none: no pipeline folder"):
         Average((checkpoints[0], tmp_path / "none"), tmp_path / "out").run()
-    assert not (tmp_path / "out").exists()
+    before = checkpoint_sha256(checkpoints[1])
+    with pytest.raises(UnirenderError, match=r"lies in .*two, which would then be another checkpoint"):
+        Average(checkpoints, checkpoints[1] / "mean").run()
+    assert checkpoint_sha256(checkpoints[1]) == before
+    shutil.copytree(checkpoints[1], tmp_path / "cut")
+    weights = (tmp_path / "cut" / WEIGHTS).read_bytes()
+    (tmp_path / "cut" / WEIGHTS).write_bytes(weights[: len(weights) // 2])
+    with pytest.raises(UnirenderError, match=r"cut: cannot be read as a checkpoint"):
+        Average((checkpoints[0], tmp_path / "cut"), tmp_path / "out").run()
+    assert [path.name for path in tmp_path.iterdir()] == ["cut"]

@@ -2,14 +2,15 @@
 
     theta = sum over k of  share_k theta_k,      shares that add up to 1
 
-Runs that began with the same weights, or one with another's, mostly lie in one basin of the loss, in which a mean of
-them has less of the noise that each ended with (Wortsman et al. 2022, "Model soups"). Of networks that have no common
-beginning the mean is no network; nothing here can tell.
+A run and the weights that it began with (Wortsman et al. 2021, "Robust fine-tuning of zero-shot models"), or several
+runs with one beginning (2022, "Model soups"), mostly lie in one basin of the loss, in which their mean has less of the
+noise that each ended with. Of networks that have no common beginning the mean is no network; nothing here can tell.
 """
 
 import json
 import math
 import reprlib
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.options import notice
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor, nn
 
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -28,8 +30,10 @@ if TYPE_CHECKING:
 Stored = Literal["float16", "float32"]
 
 ROUNDING = 1e-6  # relative
+INDEX = "model_index.json"
 ID = 12  # characters of a sha256 by which weights are named
 OF_THE_WEIGHTS = ("scores", "scored_on", "losses", "calibration")  # facts of a run that its mean with others has not
+NOT_OF_THE_RUN = (*OF_THE_WEIGHTS, "averaged", "stored_as", "continues")  # by which one run may be told differently
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Average:
     shares: tuple[float, ...] = ()
     """Of each checkpoint in the average, in the same order; only their ratios count. None given: all alike."""
     store: Stored = "float16"
-    """Type in which the average is stored."""
+    """Type in which the network is stored; float32 where training goes on with it. An autoencoder stays in float32."""
 
     def check(self) -> tuple[float, ...]:
         """Looks at the values; the shares, which add up to 1.
@@ -58,7 +62,7 @@ class Average:
         shares = self.shares or (1.0,) * count
         if len(shares) != count:
             raise UsageError(f"--shares: got {len(shares)}, expected {count}, one for each checkpoint")
-        if not all(0 < share < float("inf") for share in shares):
+        if not all(share > 0 for share in shares) or not math.isfinite(sum(shares)):
             raise UsageError(f"--shares {' '.join(map(str, shares))}: expected numbers above 0; leave out the others")
         return tuple(share / sum(shares) for share in shares)
 
@@ -85,13 +89,13 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         store: type of the stored weights.
 
     Raises:
-        UnirenderError: a folder is no checkpoint, or the account of its training is broken; the networks differ; or
-            `out` cannot be written.
+        UnirenderError: a folder is no checkpoint or cannot be read, or the account of its training is broken; the
+            networks differ; or `out` lies in one of them or cannot be written.
     """
     import diffusers
     import torch
 
-    from unirender.files import checkpoint_sha256, new_folder
+    from unirender.files import new_folder
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
     from unirender.training.card import CARD_FILE, card_text
@@ -99,44 +103,38 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     folders = [checkpoint_folder(path) for path in checkpoints]
+    for path, folder in zip(checkpoints, folders, strict=True):
+        if folder.resolve() in (out.resolve(), *out.resolve().parents):
+            raise UnirenderError(f"{out}: lies in {path}, which would then be another checkpoint; choose another --out")
+        if not (folder / INDEX).is_file():
+            UniRenderPipeline.from_pretrained(folder)  # says what is wrong with it, before any is read
     histories = [read_history(folder) for folder in folders]
+    labels = [_label(folder) for folder in folders]
     with new_folder(out) as new:
-        first: UniRenderPipeline | None = None
-        total: dict[str, Tensor] = {}
-        for path, folder, share in zip(checkpoints, folders, shares, strict=True):
-            one = UniRenderPipeline.from_pretrained(folder)
-            if one.config["calibration"]:
-                notice(f"{path}: its calibration is that of its own weights; run `unirender calibrate` on the average")
-            first = first or one
-            _check_alike(first, one, checkpoints[0], path)
-            for name, value in one.dual_stream.state_dict().items():
-                total[name] = total.get(name, torch.zeros_like(value, dtype=torch.float64)) + share * value.double()
-        assert first is not None, "there are two at least"
-        vae = None if first.vae is None else _fresh(first.vae, first.vae.state_dict(), store)
-        model = _fresh(first.dual_stream, total, store)
+        first = _read(checkpoints[0], folders[0])
+        total = {name: shares[0] * value.double() for name, value in first.dual_stream.state_dict().items()}
+        for path, folder, share in zip(checkpoints[1:], folders[1:], shares[1:], strict=True):
+            other = _read(path, folder)
+            _check_alike(first, other, checkpoints[0], path)
+            for name, value in other.dual_stream.state_dict().items():
+                total[name] += share * value.double()
+            del other
+        vae = None if first.vae is None else _fresh(first.vae, first.vae.state_dict(), torch.float32)
+        model = _fresh(first.dual_stream, total, getattr(torch, store))
         pipeline = UniRenderPipeline(model, first.scheduler, vae, material=first.config["material"])
         pipeline.save_pretrained(new, safe_serialization=True)
         for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
             weights.chmod(0o644)
-        labels = [f"{folder.resolve().name} ({checkpoint_sha256(folder)[:ID]})" for folder in folders]
-        facts = averaged_facts(histories, labels, shares) | {"stored_as": store}
+        known = {"train": {"model": {"codec": model.config["codec"]}}}  # the licence of the card depends on it
+        facts = known | averaged_facts(histories, labels, shares) | {"stored_as": store}
         (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
         (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
-
-
-def _fresh(model: Any, weights: "dict[str, Tensor]", store: Stored) -> Any:
-    """A model of the same configuration with these weights; it does not know from which folder the first was read."""
-    import torch
-
-    own = type(model).from_config({name: value for name, value in model.config.items() if not name.startswith("_")})
-    own.load_state_dict(weights)
-    return torch.nn.Module.to(own.eval(), getattr(torch, store))  # ModelMixin's own `to` warns for nothing
 
 
 def averaged_facts(
     histories: Sequence[Sequence[Mapping[str, Any]]], labels: Sequence[str], shares: Sequence[float]
 ) -> dict[str, Any]:
-    """The account of an average: that of the last checkpoint's run, and under `continues` all the others.
+    """The account of an average: that of the last checkpoint's run, and under `continues` all other runs, each once.
 
     Args:
         histories: of each checkpoint, its runs, oldest first; [] where nothing is known of it.
@@ -147,15 +145,64 @@ def averaged_facts(
     *others, last = histories
     facts: dict[str, Any] = dict(last[-1]) if last else {}
     within = facts.pop("averaged", None) or {"this run" if last else labels[-1]: 1.0}
-    averaged = dict(zip(labels[:-1], shares[:-1], strict=True))
+    averaged: defaultdict[str, float] = defaultdict(float)
+    for label, share in zip(labels[:-1], shares[:-1], strict=True):
+        averaged[label] += share
     for label, share in within.items():
-        averaged[label] = averaged.get(label, 0.0) + share * shares[-1]
-    continues: list[Any] = []
-    for run in [run for runs in (*others, last[:-1]) for run in runs]:
-        if run not in continues and run != (last[-1] if last else None):
-            continues.append(run)
+        averaged[label] += share * shares[-1]
+    runs: dict[str, Mapping[str, Any]] = {}
+    for run in [run for own in (*others, last[:-1]) for run in own]:
+        name = _name_of_run(run)
+        if len(run) > len(runs.get(name, ())):  # an average of it tells less of it than it does
+            runs[name] = run
+    runs.pop(_name_of_run(facts), None)
     known = {name: value for name, value in facts.items() if name not in OF_THE_WEIGHTS}
-    return known | {"averaged": averaged} | ({"continues": continues} if continues else {})
+    return known | {"averaged": dict(averaged)} | ({"continues": list(runs.values())} if runs else {})
+
+
+def _name_of_run(run: Mapping[str, Any]) -> str:
+    """The same for every account of one run, whatever became of its weights."""
+    return json.dumps({name: value for name, value in run.items() if name not in NOT_OF_THE_RUN}, sort_keys=True)
+
+
+def _label(folder: Path) -> str:
+    """A checkpoint's name and the beginning of its sha256; that of a run's pipeline is the run's."""
+    from unirender.files import checkpoint_sha256
+    from unirender.shipped import CHECKPOINTS
+    from unirender.training.card import OF_A_RUN
+
+    own = folder.resolve()
+    name = own.parent.name if own.name in OF_A_RUN else own.name
+    shipped = " (shipped)" if own.parent == CHECKPOINTS.resolve() else ""
+    return f"{name}{shipped} {checkpoint_sha256(folder)[:ID]}"
+
+
+def _read(path: Path, folder: Path) -> "UniRenderPipeline":
+    """A checkpoint, of whose calibration the user is told that it is not taken over.
+
+    Raises:
+        UnirenderError: it cannot be read.
+    """
+    from safetensors import SafetensorError
+
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+    try:
+        pipeline = UniRenderPipeline.from_pretrained(folder)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise UnirenderError(f"{path}: cannot be read as a checkpoint ({error}); copy it again") from error
+    if pipeline.config["calibration"]:
+        notice(f"{path}: its calibration is that of its own weights; run `unirender calibrate` on the average")
+    return pipeline
+
+
+def _fresh(model: Any, weights: "dict[str, Tensor]", dtype: "torch.dtype") -> Any:
+    """A model of the same configuration with these weights; it does not know from which folder the first was read."""
+    import torch
+
+    own = type(model).from_config({name: value for name, value in model.config.items() if not name.startswith("_")})
+    own.load_state_dict(weights)
+    return torch.nn.Module.to(own.eval(), dtype)  # ModelMixin's own `to` warns for nothing
 
 
 def _check_alike(first: "UniRenderPipeline", other: "UniRenderPipeline", first_name: Path, name: Path) -> None:
@@ -164,15 +211,19 @@ def _check_alike(first: "UniRenderPipeline", other: "UniRenderPipeline", first_n
     Raises:
         UnirenderError: they have not; the message names the first thing that differs.
     """
-    for part in ("dual_stream", "scheduler", None):
+    if first.config["material"] != other.config["material"]:
+        raise UnirenderError(
+            f"{name}: its material is {other.config['material']!r}, expected {first.config['material']!r}, that of "
+            f"{first_name}; only checkpoints of one kind can be averaged"
+        )
+    for part in ("dual_stream", "scheduler"):
         one, two = (_settings(pipeline, part) for pipeline in (first, other))
         for entry in sorted(one.keys() | two.keys()):
             if not _same_setting(one.get(entry), two.get(entry)):
-                where = f"{part}.{entry}" if part else entry
                 got, expected = (reprlib.repr(settings.get(entry)) for settings in (two, one))
                 raise UnirenderError(
-                    f"{name}: {where} is {got}, expected {expected}, that of {first_name}; only checkpoints of one "
-                    "network can be averaged"
+                    f"{name}: {part}.{entry} is {got}, expected {expected}, that of {first_name}; only checkpoints of "
+                    "one network can be averaged"
                 )
     if not _equal(first.vae, other.vae):
         raise UnirenderError(
@@ -180,10 +231,8 @@ def _check_alike(first: "UniRenderPipeline", other: "UniRenderPipeline", first_n
         )
 
 
-def _settings(pipeline: "UniRenderPipeline", part: str | None) -> dict[str, Any]:
-    """The configuration of a component, or of the pipeline itself, without what says nothing of the network."""
-    if part is None:
-        return {"material": pipeline.config["material"]}
+def _settings(pipeline: "UniRenderPipeline", part: str) -> dict[str, Any]:
+    """The configuration of a component, without what says nothing of the network."""
     settings = dict(getattr(pipeline, part).config)
     return {"class": type(getattr(pipeline, part)).__name__} | {
         name: list(value) if isinstance(value, tuple) else value
