@@ -125,8 +125,8 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         pipeline.save_pretrained(new, safe_serialization=True)
         for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
             weights.chmod(0o644)
-        known = {"train": {"model": {"codec": model.config["codec"]}}}  # the licence of the card depends on it
-        facts = known | averaged_facts(histories, labels, shares) | {"stored_as": store}
+        facts = averaged_facts(histories, labels, shares) | {"stored_as": store}
+        facts.setdefault("train", {"model": {"codec": model.config["codec"]}})  # the card's licence depends on it
         (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
         (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
 
