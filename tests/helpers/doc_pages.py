@@ -13,7 +13,6 @@ import torch
 from accelerate.tracking import GeneralTracker, on_main_process
 from inline_executor import Inline
 from reference_scenes import environment, sphere
-from safetensors.torch import save_file
 from synthetic_shards import own_picture, write_dataset
 from tiny_models import TRAIN
 from tiny_suites import make_suite
@@ -173,9 +172,7 @@ class MyTracker(GeneralTracker):
 
 
 def training() -> Names:
-    """Pictures with maps, the weights of two runs, and a run of one step."""
-    for number in (5, 6):
-        save_file({"weight": torch.full((2, 2), float(number)).half()}, f"part{number}.safetensors")
+    """Pictures with maps, and a run of one step."""
     config = dataclasses.replace(TRAIN, batch_size=2)
     trainer = Trainer(config, RunConfig(Path("run"), steps=1, log_every=1), torch.device("cpu"), torch.float32)
     source = ShardSource(write_dataset(Path("shards"), size=32), config.batch_size, config.seed)
@@ -185,7 +182,6 @@ def training() -> Names:
 
 def check_training(names: Names) -> None:
     names["source"].close()
-    assert float(names["average"]["weight"][0, 0]) == 5.75
     assert Path("run/log.jsonl").read_text(encoding="utf-8").count("\n") == 1
 
 
