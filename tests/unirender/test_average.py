@@ -92,6 +92,8 @@ def test_a_run_is_listed_once_whatever_became_of_its_weights() -> None:
     histories = [[old], [old, first], runs]
     mean = averaged_facts(histories, ["old", "first", "second"], [0.25, 0.25, 0.5])
     assert mean["continues"] == [old, first]  # with its losses, which the mean of it has not
+    turned = averaged_facts([runs, [old, first], [old]], ["second", "first", "old"], [0.25, 0.25, 0.5])
+    assert turned["continues"] == [first, second]
     assert averaged_facts([[old, began], [old, first]], ["began", "first"], [0.5, 0.5])["continues"] == [old]
     lined = {**first, "calibration": {"lines": {}}, "stored_as": "float16"}
     assert len(averaged_facts([[old, lined], runs], ["lined", "second"], [0.5, 0.5])["continues"]) == 2
@@ -189,10 +191,10 @@ def test_schedules_may_differ_by_rounding_only(checkpoints: tuple[Path, Path], t
     [
         (1, (), "got 1 checkpoints, expected two or more"),
         (2, (1.0,), "--shares: got 1, expected 2"),
-        (2, (1.0, 0.0), "expected numbers above 0"),
-        (2, (1.0, -1.0), "expected numbers above 0"),
-        (2, (1.0, float("nan")), "expected numbers above 0"),
-        (2, (1e308, 1e308), "expected numbers above 0"),
+        (2, (1.0, 0.0), "expected finite numbers above 0"),
+        (2, (1.0, -1.0), "expected finite numbers above 0"),
+        (2, (1.0, float("nan")), "expected finite numbers above 0"),
+        (2, (1e308, 1e308), "expected finite numbers above 0"),
     ],
 )
 def test_wrong_calls_are_refused(

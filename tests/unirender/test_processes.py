@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 import torch
 from synthetic_shards import write_dataset
-from tiny_models import TRAIN
+from tiny_models import TRAIN, make_pipeline
 
 from unirender.errors import UnirenderError
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training import processes
 from unirender.training.checkpoint import load_state
 from unirender.training.processes import ALONE, Processes, join_processes
@@ -103,6 +104,16 @@ def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads:
     for a, b, c in zip(two, one, other, strict=True):
         assert a == pytest.approx(b, rel=1e-5)
         assert a != pytest.approx(c, rel=1e-2)  # the twin: another seed
+
+
+@pytest.mark.long
+def test_the_first_process_alone_tells_of_the_beginning(run: Run, tmp_path: Path) -> None:
+    make_pipeline().save_pretrained(tmp_path / "plain")
+    lined = UniRenderPipeline.from_pretrained(tmp_path / "plain", calibration={"roughness": [0.5, 0.2]})
+    lined.save_pretrained(tmp_path / "lined")
+    ended = torchrun(run.data, tmp_path / "run", "--steps", "1", "--init", str(tmp_path / "lined"))
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.count("run `unirender calibrate` on the new ones") == 1
 
 
 @pytest.mark.long

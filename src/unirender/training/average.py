@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Stored = Literal["float16", "float32"]
 
 ROUNDING = 1e-6  # relative
-INDEX = "model_index.json"
 ID = 12  # characters of a sha256 by which weights are named
 OF_THE_WEIGHTS = ("scores", "scored_on", "losses", "calibration")  # facts of a run that its mean with others has not
 NOT_OF_THE_RUN = (*OF_THE_WEIGHTS, "averaged", "stored_as", "continues")  # by which one run may be told differently
@@ -63,7 +62,9 @@ class Average:
         if len(shares) != count:
             raise UsageError(f"--shares: got {len(shares)}, expected {count}, one for each checkpoint")
         if not all(share > 0 for share in shares) or not math.isfinite(sum(shares)):
-            raise UsageError(f"--shares {' '.join(map(str, shares))}: expected numbers above 0; leave out the others")
+            raise UsageError(
+                f"--shares {' '.join(map(str, shares))}: expected finite numbers above 0; leave out the others"
+            )
         return tuple(share / sum(shares) for share in shares)
 
     def run(self) -> int:
@@ -106,10 +107,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     for path, folder in zip(checkpoints, folders, strict=True):
         if folder.resolve() in (out.resolve(), *out.resolve().parents):
             raise UnirenderError(f"{out}: lies in {path}, which would then be another checkpoint; choose another --out")
-        if not (folder / INDEX).is_file():
-            UniRenderPipeline.from_pretrained(folder)  # says what is wrong with it, before any is read
     histories = [read_history(folder) for folder in folders]
-    labels = [_label(folder) for folder in folders]
     with new_folder(out) as new:
         first = _read(checkpoints[0], folders[0])
         total = {name: shares[0] * value.double() for name, value in first.dual_stream.state_dict().items()}
@@ -125,7 +123,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         pipeline.save_pretrained(new, safe_serialization=True)
         for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
             weights.chmod(0o644)
-        facts = averaged_facts(histories, labels, shares) | {"stored_as": store}
+        facts = averaged_facts(histories, [_label(folder) for folder in folders], shares) | {"stored_as": store}
         facts.setdefault("train", {"model": {"codec": model.config["codec"]}})  # the card's licence depends on it
         (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
         (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
@@ -153,7 +151,7 @@ def averaged_facts(
     runs: dict[str, Mapping[str, Any]] = {}
     for run in [run for own in (*others, last[:-1]) for run in own]:
         name = _name_of_run(run)
-        if len(run) > len(runs.get(name, ())):  # an average of it tells less of it than it does
+        if name not in runs or "averaged" in runs[name]:  # an average of it tells less of it than it does
             runs[name] = run
     runs.pop(_name_of_run(facts), None)
     known = {name: value for name, value in facts.items() if name not in OF_THE_WEIGHTS}
