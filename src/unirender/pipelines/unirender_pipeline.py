@@ -33,11 +33,11 @@ from unirender.pipelines.calibration import Lines, check_lines
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, told_derived, unit_value
+from unirender.pipelines.loading import check_complete, find_pipeline, reading
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
 from unirender.pipelines.settings import Sampling, same_noise
-from unirender.shipped import checkpoint_folder, shipped_names
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
@@ -84,20 +84,14 @@ class UniRenderPipeline(DiffusionPipeline):
         without `torch_dtype`.
 
         Raises:
-            UnirenderError: no such folder, or no pipeline in it.
+            UnirenderError: no such folder, no pipeline in it, or it cannot be read.
         """
-        path = checkpoint_folder(pretrained_model_name_or_path)
-        if not (path / "model_index.json").is_file():
-            inside = path / "pipeline"
-            if (inside / "model_index.json").is_file():
-                raise UnirenderError(f"{path}: is the folder of a training run; its pipeline is {inside}")
-            raise UnirenderError(
-                f"{path}: no pipeline folder (model_index.json is missing), expected one written by `unirender train`, "
-                f"or one of the names {', '.join(shipped_names())}"
-            )
+        path = find_pipeline(pretrained_model_name_or_path)
         old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
-        pipeline = super().from_pretrained(str(path), **kwargs)
+        with reading(path):
+            pipeline = super().from_pretrained(str(path), **kwargs)
+            check_complete(pipeline)
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline

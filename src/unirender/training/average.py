@@ -181,14 +181,9 @@ def _read(path: Path, folder: Path) -> "UniRenderPipeline":
     Raises:
         UnirenderError: it cannot be read.
     """
-    from safetensors import SafetensorError
-
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
-    try:
-        pipeline = UniRenderPipeline.from_pretrained(folder)
-    except (OSError, ValueError, SafetensorError) as error:
-        raise UnirenderError(f"{path}: cannot be read as a checkpoint ({error}); copy it again") from error
+    pipeline = UniRenderPipeline.from_pretrained(folder)
     if pipeline.config["calibration"]:
         notice(f"{path}: its calibration is that of its own weights; run `unirender calibrate` on the average")
     return pipeline

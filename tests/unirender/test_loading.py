@@ -1,0 +1,87 @@
+"""A pipeline folder is read whole, or refused in one sentence: damage of each kind that a copy or an edit can do."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from tests.helpers.tiny_models import make_pipeline
+from unirender.errors import UnirenderError
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+WEIGHTS = "dual_stream/diffusion_pytorch_model.safetensors"
+CONFIG = "dual_stream/config.json"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    make_pipeline().save_pretrained(tmp_path / "mine")
+    return tmp_path / "mine"
+
+
+def halve(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def lose_a_weight(path: Path) -> None:
+    weights = load_file(path)
+    del weights[sorted(weights)[0]]
+    save_file(weights, path)
+
+
+def widen(path: Path) -> None:
+    config = json.loads(path.read_text())
+    config["block_out_channels"] = [2 * width for width in config["block_out_channels"]]
+    path.write_text(json.dumps(config))
+
+
+@pytest.mark.parametrize(
+    ("damaged", "damage", "says"),
+    [
+        (WEIGHTS, halve, "Unable to load weights"),
+        (WEIGHTS, Path.unlink, "no file named"),
+        (WEIGHTS, lose_a_weight, "1 weights of dual_stream are missing, the first is attribute_"),
+        (WEIGHTS, lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\n"), "git-lfs"),
+        (CONFIG, halve, "not a valid JSON file"),
+        (CONFIG, Path.unlink, r"no file named config\.json"),
+        (CONFIG, widen, "expected shape"),
+        ("scheduler/scheduler_config.json", Path.unlink, r"no file named scheduler_config\.json"),
+        ("model_index.json", halve, r"model_index\.json: "),
+        (
+            "model_index.json",
+            lambda path: path.write_text("[]"),
+            r"model_index\.json: got list, expected a JSON object",
+        ),
+    ],
+)
+def test_a_damaged_folder_is_refused_by_name(
+    folder: Path, damaged: str, damage: Callable[[Path], object], says: str
+) -> None:
+    damage(folder / damaged)
+    with pytest.raises(
+        UnirenderError, match=rf"mine: cannot be read as a checkpoint \(.*{says}.*copy the folder again"
+    ):
+        UniRenderPipeline.from_pretrained(folder)
+
+
+def test_weights_that_the_network_does_not_know_are_no_reason_to_refuse(folder: Path) -> None:
+    weights = load_file(folder / WEIGHTS)
+    save_file(weights | {"of_a_later_version": np.zeros(3, dtype=np.float32)}, folder / WEIGHTS)
+    assert UniRenderPipeline.from_pretrained(folder).size == make_pipeline().size
+
+
+def test_what_a_setting_of_ours_says_is_said_as_it_is(folder: Path) -> None:
+    index = json.loads((folder / "model_index.json").read_text())
+    (folder / "model_index.json").write_text(json.dumps(index | {"calibration": {"albedo": [1, 0]}}))
+    with pytest.raises(UnirenderError, match=r"^calibration: got .*, expected a slope of 0 or more"):
+        UniRenderPipeline.from_pretrained(folder)
+
+
+def test_the_package_runs_as_a_module() -> None:
+    done = subprocess.run([sys.executable, "-m", "unirender", "--help"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: unirender [-h]")
