@@ -238,6 +238,11 @@ def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert changes["pairs"] == 3
     assert changes["albedo"] > 0
     assert changes["input"] > 0
+    # With other settings all are refused, and the account of what is there stays.
+    before = (tmp_path / "out" / "summary.json").read_bytes()
+    assert run(*arguments, "--steps", "3") == 1
+    assert "0 pictures (0 of them from before), 5 failed" in capsys.readouterr().out
+    assert (tmp_path / "out" / "summary.json").read_bytes() == before
 
 
 def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], str]]:

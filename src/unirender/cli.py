@@ -15,15 +15,17 @@ import importlib.metadata
 import logging
 import os
 import select
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import interrupted, parse
+from unirender.command_line import causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.lean_imports import lean_imports
@@ -205,14 +207,23 @@ class NoticeHandler(logging.Handler):
         notice(record.getMessage())
 
 
+class Ended(KeyboardInterrupt):
+    """The signal `args[0]` came."""
+
+
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
-    Exits with 0, 1 (failure), 2 (usage), 130 (interrupted) or 141 (who read its output left: `unirender ... | head`).
+    Exits with 0, 1 (failure), 2 (usage), 130 (interrupted), 141 (who read its output left: `unirender ... | head`), 143
+    (SIGTERM) or 129 (SIGHUP).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv
     command = None
+    if argv is None:
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) == signal.SIG_DFL:  # nohup has the second ignored
+                signal.signal(number, end)
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
     try:
@@ -229,7 +240,7 @@ def main(argv: list[str] | None = None) -> None:
             status = READER_LEFT
         elif interrupted(error):
             notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
-            status = 130
+            status = 128 + next((cause.args[0] for cause in causes(error) if isinstance(cause, Ended)), signal.SIGINT)
         elif os.environ.get("UNIRENDER_DEBUG"):
             raise
         else:
@@ -237,6 +248,15 @@ def main(argv: list[str] | None = None) -> None:
     finally:
         logger.removeHandler(handler)
     sys.exit(status)
+
+
+def end(number: int, frame: FrameType | None) -> None:
+    """Asked to stop by a batch system or a terminal that closes, a command ends as when it is interrupted.
+
+    Raises:
+        Ended: always.
+    """
+    raise Ended(number)
 
 
 def reader_left() -> bool:

@@ -78,7 +78,7 @@ class Decompose:
 
     def _run_folder(self) -> int:
         """Returns the exit status: 1 where a picture failed."""
-        from unirender.folders import decompose_folder, list_pictures, write_summary
+        from unirender.folders import SUMMARY_FILE, decompose_folder, list_pictures, write_summary
         from unirender.frames import temporal_difference
         from unirender.pipelines.inputs import as_picture
 
@@ -116,7 +116,8 @@ class Decompose:
         if self.frames:
             results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
             facts["temporal_difference"] = temporal_difference(results)
-        write_summary(output, found, facts)
+        if found.figures or not (output / SUMMARY_FILE).exists():  # where all failed, that of an earlier run stays
+            write_summary(output, found, facts)
         for first, *others in remarks.values():
             notice(first + (f" (and {len(others)} more)" if others else ""))
         for reason in found.failed.values():

@@ -8,11 +8,13 @@ import time
 from pathlib import Path
 
 import diffusers
+import numpy as np
 import pytest
 from optimizer_runs import rendered_views, truth
 
 from unirender import cli
 from unirender.command_line import causes, interrupted
+from unirender.files import write_png
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 
@@ -116,6 +118,11 @@ def heed_ctrl_c() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+def heed_hang_up() -> None:
+    """As `heed_ctrl_c`, where the tests run under nohup."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @pytest.mark.slow
 def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
     solution = truth()
@@ -141,6 +148,24 @@ def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
         process.kill()
     assert process.returncode == 130
     assert text.endswith("unirender: interrupted; run the same command again to go on\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_command_that_is_told_to_end_takes_back_what_it_began(number: signal.Signals, tmp_path: Path) -> None:
+    write_png(tmp_path / "mug.png", np.full((16, 16, 3), 0.5, np.float32))
+    command = [sys.executable, "-m", "unirender", "decompose", "mug.png", "--output", "out"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, preexec_fn=heed_hang_up)
+    try:
+        while process.poll() is None and not list(tmp_path.glob(".out.*")):
+            time.sleep(0.005)
+        process.send_signal(number)
+        _, text = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 128 + number
+    assert text.endswith("unirender: interrupted\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["mug.png"]
 
 
 @pytest.mark.slow
