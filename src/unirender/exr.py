@@ -96,7 +96,7 @@ def exr_bytes(
         if half and np.abs(value).max(initial=0.0) > HALF_MAX:
             raise UnirenderError(
                 f"EXR channel {name}: got {np.abs(value).max():.4g}, half precision ends at {HALF_MAX:g}; "
-                "pass half=False"
+                "lower the exposure of the light, or pass half=False"
             )
         stored[name] = np.ascontiguousarray(value, dtype=np.float16 if half else np.float32)
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

@@ -29,6 +29,7 @@ from unirender.exr import (
     image_channels,
     intrinsics_channels,
     intrinsics_from_channels,
+    on_pole_grid,
     read_exr,
     write_environment,
     write_exr,
@@ -271,7 +272,7 @@ def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
     if path.is_dir():
         camera = _camera_of_meta(path / META_FILE)
         if (path / ENVIRONMENT_FILE).is_file():
-            environment = channels_rgb(read_exr(path / ENVIRONMENT_FILE)[0])
+            environment = _read_environment(path / ENVIRONMENT_FILE)
     try:
         if camera is None and CAMERA_ATTRIBUTE in attributes:
             camera = Camera.parse(attributes[CAMERA_ATTRIBUTE])
@@ -290,6 +291,24 @@ def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
     return intrinsics
 
 
+def _read_environment(file: Path) -> Float[np.ndarray, "eh ew 3"]:
+    """The environment of a result folder.
+
+    Raises:
+        UnirenderError: it is broken, or a map from elsewhere, whose rows lie otherwise.
+    """
+    channels, attributes = read_exr(file)
+    if not on_pole_grid(attributes):
+        raise UnirenderError(
+            f"{file}: is no environment that unirender wrote, and a lat-long map from elsewhere has to be resampled; "
+            "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is)"
+        )
+    try:
+        return channels_rgb(channels)
+    except UnirenderError as error:
+        raise UnirenderError(f"{file}: {error}") from error
+
+
 def _camera_of_meta(path: Path) -> Camera | None:
     """The camera of a `meta.json`; None where there is no file, or none in it.
 
@@ -300,6 +319,8 @@ def _camera_of_meta(path: Path) -> Camera | None:
         return None
     try:
         meta = json.loads(path.read_text())
+        if not isinstance(meta, dict):
+            raise TypeError(f"got {type(meta).__name__}, expected a JSON object")
         if "fov_deg" not in meta:
             return None
         x, y = meta.get("principal", Camera().principal)

@@ -78,11 +78,11 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     """Returns the mask.
 
     Raises:
-        UnirenderError: no pixel is covered by at least one half.
+        UnirenderError: no pixel is covered by more than one half.
     """
-    if not (mask >= 0.5).any():
+    if not (mask > 0.5).any():
         raise UnirenderError(
-            f"{name}: the mask is empty: no pixel is covered by half or more, expected white (or opaque) pixels on the "
+            f"{name}: the mask is empty: no pixel is covered by more than half, expected white (or opaque) pixels on the "
             "object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
@@ -130,6 +130,8 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
                 "grey; save linear radiance as EXR"
             )
         return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+    if image.mode in ("RGBa", "La"):  # premultiplied
+        image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
     has_alpha = "A" in image.getbands() or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
 

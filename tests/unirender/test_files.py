@@ -10,7 +10,7 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
-from unirender.exr import intrinsics_channels, read_exr, write_exr
+from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, new_folder, read_result, replace_file, write_result
 from unirender.intrinsics import Intrinsics
 
@@ -218,3 +218,23 @@ def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         replace_file(path, "newer")
     assert path.read_bytes() == b"new"
     assert [file.name for file in path.parent.iterdir()] == ["file"]
+
+
+def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Path) -> None:
+    """Its rows are areas, ours lie on the poles: taken as it is, light from above would be weighed wrongly."""
+    mask = np.ones((8, 8, 1), dtype=np.float32)
+    light = np.ones((8, 16, 3), dtype=np.float32)
+    write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
+    assert read_result(tmp_path).environment is not None
+    write_exr(tmp_path / "environment.exr", image_channels(light))
+    with pytest.raises(UnirenderError, match=r"environment\.exr: is no environment that .*--environment"):
+        read_result(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["[]", "3", "null"])
+def test_a_meta_file_that_is_no_account_is_refused(text: str, tmp_path: Path) -> None:
+    mask = np.ones((8, 8, 1), dtype=np.float32)
+    write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, camera=Camera()), {})
+    (tmp_path / "meta.json").write_text(text)
+    with pytest.raises(UnirenderError, match=r"meta\.json: (not readable|expected)"):
+        read_result(tmp_path)

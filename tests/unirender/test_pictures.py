@@ -11,7 +11,7 @@ from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.options import read_input
-from unirender.pictures import MAX_PIXELS, read_mask, read_picture
+from unirender.pictures import MAX_PIXELS, display_values, read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
 RNG = np.random.default_rng(0)
@@ -159,3 +159,12 @@ def test_values_without_a_display_white_are_refused(values: np.ndarray, tmp_path
     for use in (lambda: as_picture(image), lambda: as_mask(image, (8, 8)), lambda: read_picture(tmp_path / "a.tiff")):
         with pytest.raises(UnirenderError, match="has no display values"):
             use()
+
+
+@pytest.mark.parametrize(("premultiplied", "straight"), [("RGBa", "RGBA"), ("La", "LA")])
+def test_premultiplied_modes_of_pil_keep_their_alpha(premultiplied: str, straight: str) -> None:
+    pixels = np.full((8, 8, len(straight)), 200, np.uint8)
+    pixels[..., -1] = 128
+    image = Image.fromarray(pixels, straight)
+    found = display_values(image.convert(premultiplied), "image")
+    np.testing.assert_allclose(found, display_values(image, "image"), atol=2 / 255)
