@@ -149,7 +149,7 @@ PARTS: Mapping[str, Part] = {
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
-            *(f"unirender/{name}.py" for name in ("cli", "command_line", "commands", "options", "shipped")),
+            *(f"unirender/{name}.py" for name in ("__main__", "cli", "command_line", "commands", "options", "shipped")),
             *(
                 f"unirender_evaluation/{name}.py"
                 for name in (

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
+from tiny_models import make_pipeline
 
-from tests.helpers.tiny_models import make_pipeline
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 

@@ -1,10 +1,15 @@
 """What the pipeline refuses besides a bad picture: lights, several pictures at once; and where an edit cannot say."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
+from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 from tiny_models import SIZE, make_pipeline
 
 from unirender.errors import UnirenderError
@@ -79,11 +84,57 @@ def test_what_is_no_array_is_refused() -> None:
 
 
 def test_a_number_of_samples_and_generators_must_fit() -> None:
-    with pytest.raises(UnirenderError, match="num_samples: got 0, expected at least 1"):
+    with pytest.raises(UnirenderError, match="num_samples: got 0, expected a whole number, at least 1"):
         Sampling.of("sample", None, 0, None)
     several = Sampling.of("sample", 2, 2, [torch.Generator(), torch.Generator()])
     with pytest.raises(UnirenderError, match="generator: got 2 for 1 pictures"):
         several.draw_seed()
+
+
+def test_a_material_is_a_number_or_a_map(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    decomposition = pipeline.decompose(image, mask)
+    same = [0.2, np.full((SIZE, SIZE, 1), 0.2)]
+    first, *others = (pipeline.edit(image, mask, metallic=each, decomposition=decomposition) for each in same)
+    for other in others:
+        np.testing.assert_array_equal(other.image_linear, first.image_linear)
+
+
+def test_with_a_decomposition_at_hand_settings_are_looked_at_too(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    known: dict[str, Any] = {"decomposition": pipeline.decompose(image, mask)}
+    with pytest.raises(TypeError, match="unexpected keyword argument 'clozed'"):
+        pipeline.edit(image, mask, metallic=1.0, clozed=False, **known)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'steps'"):
+        pipeline.relight(image, LIGHT, mask, steps=3, **known)
+    lit: dict[str, Any] = {name: np.repeat(mask, 3, -1) for name in ("specular", "diffuse")}
+    with pytest.raises(UnirenderError, match="exposure: got 'bright', expected 'auto' or 'keep'"):
+        pipeline.relight(image, None, mask, exposure="bright", **lit, **known)
+
+
+def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
+    """The exposure of a light is that of pixels covered by more than one half: with none of them there is none."""
+    with pytest.raises(UnirenderError, match="mask: no pixel is covered by more than one half"):
+        as_picture(picture()[0], 0.5 * picture()[1])
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (lambda config: DDIMScheduler(), "got a DDIMScheduler with prediction_type 'epsilon', expected 'sample'"),
+        (EulerDiscreteScheduler.from_config, "got EulerDiscreteScheduler, expected one without noise of its own"),
+        (DDPMScheduler.from_config, "got DDPMScheduler, expected one without"),
+        (
+            lambda config: DPMSolverMultistepScheduler.from_config(config, algorithm_type="sde-dpmsolver++"),
+            "got DPMSolverMultistepScheduler, expected one without",
+        ),
+    ],
+)
+def test_a_scheduler_that_would_give_wrong_maps_is_refused(made: Callable[[Any], Any], words: str) -> None:
+    pipeline: Any = make_pipeline()
+    pipeline.scheduler = made(pipeline.scheduler.config)
+    with pytest.raises(UnirenderError, match=f"scheduler: {words}"):
+        pipeline.decompose(*picture(), mode="sample", num_inference_steps=3, num_samples=1)
 
 
 def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRenderPipeline) -> None:

@@ -21,8 +21,8 @@ from unirender.commands import MUCH_COARSE
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender.pictures import Picture
-from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
-from unirender.pipelines.inputs import as_environment, unit_value
+from unirender.pipelines.editing import anchor, specular_for_roughness, too_coarse, under_light
+from unirender.pipelines.inputs import as_environment, as_material
 from unirender.pipelines.results import Decomposition
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -148,9 +148,9 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
     before = subject.maps
     edited, remarks, derived = before, [], ()
     if controls.metallic is not None:
-        edited = edited.replace(metallic=constant_map(unit_value("metallic", controls.metallic), subject.mask))
+        edited = edited.replace(metallic=as_material("metallic", controls.metallic, subject.mask))
     if controls.roughness is not None:
-        edited = edited.replace(roughness=constant_map(unit_value("roughness", controls.roughness), subject.mask))
+        edited = edited.replace(roughness=as_material("roughness", controls.roughness, subject.mask))
     if controls.light is not None or controls.turn_deg % 360:
         predicted = before.require("environment")["environment"]
         light = turned(predicted if controls.light is None else as_environment(controls.light), controls.turn_deg)

@@ -12,6 +12,7 @@ zero and log-SNR, UniPC's variable, is minus infinity; diffusers puts alpha_bar 
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral
 from typing import Any, Literal
 
 import torch
@@ -31,6 +32,9 @@ SAMPLE_STEPS = 20  # the paper's
 NUM_SAMPLES = 5
 MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timestep 0, where nothing is left to do
 
+PREDICTION_TYPE = "sample"  # diffusers' name of x0
+SCHEDULERS = ("DDIMScheduler", "UniPCMultistepScheduler", "DPMSolverMultistepScheduler")  # the last without sde
+
 Generators = torch.Generator | Sequence[torch.Generator] | None
 Cameras = Camera | Sequence[Camera] | None
 
@@ -46,13 +50,15 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
     """
     if mode not in ("mean", "sample"):
         raise UnirenderError(f"mode: got {mode!r}, expected 'mean' (one step, E[x0 | condition]) or 'sample'")
-    if num_inference_steps is not None and not 1 <= num_inference_steps <= MOST_STEPS:
-        raise UnirenderError(f"num_inference_steps: got {num_inference_steps}, expected 1 to {MOST_STEPS}")
+    if num_inference_steps is not None and (
+        not isinstance(num_inference_steps, Integral) or not 1 <= num_inference_steps <= MOST_STEPS
+    ):
+        raise UnirenderError(f"num_inference_steps: got {num_inference_steps!r}, expected 1 to {MOST_STEPS}")
     if mode == "mean":
         if num_inference_steps not in (None, 1):
             raise UnirenderError(f"mode mean takes 1 step, got num_inference_steps {num_inference_steps}; use 'sample'")
         return 1
-    return num_inference_steps or SAMPLE_STEPS
+    return SAMPLE_STEPS if num_inference_steps is None else int(num_inference_steps)
 
 
 def make_sampler(name: str, scheduler: Any) -> Any:
@@ -73,6 +79,25 @@ def make_sampler(name: str, scheduler: Any) -> Any:
 
         return UniPCMultistepScheduler.from_config(scheduler.config)
     raise UnirenderError(f"sampler: got {name!r}, expected 'ddim' or 'unipc'")
+
+
+def check_scheduler(scheduler: Any) -> None:
+    """Looks whether several steps can be taken with a scheduler: any other would give wrong maps without a word.
+
+    Raises:
+        UnirenderError: it takes what the network predicts, x0, for something else; or it draws noise of its own, which
+            no seed would fix, or wants its input scaled.
+    """
+    name, config = type(scheduler).__name__, scheduler.config
+    if config.get("prediction_type") != PREDICTION_TYPE:
+        raise UnirenderError(
+            f"scheduler: got a {name} with prediction_type {config.get('prediction_type')!r}, expected "
+            f"{PREDICTION_TYPE!r}, which the network predicts; make it by {name}.from_config(pipeline.scheduler.config)"
+        )
+    if name not in SCHEDULERS or "sde" in config.get("algorithm_type", ""):
+        raise UnirenderError(
+            f"scheduler: got {name}, expected one without noise of its own or a scaled input: {', '.join(SCHEDULERS)}"
+        )
 
 
 def sampler_name(scheduler: Any) -> str:

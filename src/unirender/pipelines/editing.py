@@ -129,8 +129,7 @@ def under_light(
     Raises:
         UnirenderError: another exposure, a map is missing, or the object receives no light.
     """
-    if exposure not in ("auto", "keep"):
-        raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
+    check_exposure(exposure)
     maps = intrinsics.require("normal", "roughness", "mask")
     given = {name: value for name, value in (("specular", specular), ("diffuse", diffuse)) if value is not None}
     names = {"specular", "diffuse"} - set(given) | ({"diffuse"} if exposure == "auto" else set())
@@ -138,6 +137,16 @@ def under_light(
     factor = exposure_factor(derived["diffuse"], maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
     scaled = {name: value * np.float32(factor) for name, value in derived.items()}
     return intrinsics.replace(environment=(environment * factor).astype(np.float32), **(scaled | given))
+
+
+def check_exposure(exposure: str) -> None:
+    """Looks at a rule of exposure.
+
+    Raises:
+        UnirenderError: there is no such rule.
+    """
+    if exposure not in ("auto", "keep"):
+        raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
 
 
 def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:

@@ -12,8 +12,10 @@ from unirender.intrinsics import Intrinsics
 from unirender.pictures import coverage, display_values
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
+from unirender.pipelines.editing import constant_map
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
+DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
 
@@ -47,7 +49,7 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     """Coverage of the given size; of a PIL picture its alpha channel if it varies, else the mean of its colours.
 
     Raises:
-        UnirenderError: wrong type, shape or range, NaN, or nothing covered by at least one half.
+        UnirenderError: wrong type, shape or range, NaN, or nothing covered by more than one half.
     """
     if isinstance(mask, Image.Image):
         mask = coverage(display_values(mask, "mask"))
@@ -57,8 +59,8 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     if mask.shape != (*size, 1):
         raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
     mask = _checked("mask", mask, "divide an 8-bit mask by 255")
-    if not (mask >= 0.5).any():
-        raise UnirenderError("mask: no pixel is covered by at least one half, expected an object in view")
+    if not (mask > 0.5).any():  # as `unirender.exposure` asks
+        raise UnirenderError("mask: no pixel is covered by more than one half, expected an object in view")
     return mask
 
 
@@ -66,9 +68,9 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     """Radiance of a lat-long map.
 
     Raises:
-        UnirenderError: wrong shape, NaN, negative, or black.
+        UnirenderError: no array of numbers, wrong shape, NaN, negative, or black.
     """
-    light = np.asarray(environment, dtype=np.float32)
+    light = _numbers("environment", environment)
     if light.ndim != 3 or light.shape[-1] != 3 or min(light.shape[:2]) < 2:
         raise UnirenderError(f"environment: got shape {light.shape}, expected a lat-long map [height, width, 3]")
     if not np.isfinite(light).all() or light.min() < 0:
@@ -80,7 +82,7 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
 
 def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
     """Which of specular and diffuse follow from the light where intrinsics are rendered."""
-    names = ("specular", "diffuse") if intrinsics.environment is not None else ()
+    names = DERIVABLE if intrinsics.environment is not None else ()
     return frozenset(name for name in names if getattr(intrinsics, name) is None)
 
 
@@ -127,6 +129,21 @@ def ready_to_render(intrinsics: Intrinsics, shadows: bool = True, derived: Colle
     return direct.replace(**{name: getattr(direct, name) + value for name, value in bounced.items()})
 
 
+def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
+    """Looks at what is to be rendered, and at the names of what was derived from its light.
+
+    Raises:
+        UnirenderError: no intrinsics, or a name of no map that can be derived.
+    """
+    if not isinstance(intrinsics, Intrinsics):
+        raise UnirenderError(
+            f"render: got {type(intrinsics).__name__}, expected unirender.intrinsics.Intrinsics; a Decomposition or an "
+            "EditResult has them as its `intrinsics`"
+        )
+    if unknown := sorted(set(derived) - set(DERIVABLE)):
+        raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
+
+
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     """The intrinsics with a mask: the whole frame where none is known."""
     if intrinsics.mask is not None:
@@ -134,17 +151,35 @@ def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     return intrinsics.replace(mask=np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32))
 
 
-def unit_value(name: str, value: Any) -> Float[np.ndarray, "..."]:
-    """A number or map in [0, 1].
+def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:
+    """A number or a map in [0, 1] as a map, 0 outside the mask.
+
+    Args:
+        name: roughness or metallic.
+        value: one number, or a map [h w 1] or [h w].
+        mask: of the picture.
 
     Raises:
-        UnirenderError: it is not.
+        UnirenderError: it is no number, outside [0, 1], or of another size.
     """
-    return _checked(name, np.asarray(value, dtype=np.float32), "roughness and metallic are fractions")
+    given = _numbers(name, value)
+    if given.size != 1 and given.shape not in (mask.shape, mask.shape[:2]):
+        raise UnirenderError(
+            f"{name}: got shape {given.shape}, expected one number, or a map of shape {mask.shape}, the picture's size"
+        )
+    given = _checked(name, given, "roughness and metallic are fractions")
+    return constant_map(given.reshape(mask.shape if given.size != 1 else ()), mask)
+
+
+def _numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    try:
+        return np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
 
 
 def _checked(name: str, value: np.ndarray, advice: str) -> Float[np.ndarray, "..."]:
-    value = np.asarray(value, dtype=np.float32)
+    value = _numbers(name, value)
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value)))
         raise UnirenderError(f"{name}: {bad} of {value.size} values are NaN or infinite, expected values in [0, 1]")

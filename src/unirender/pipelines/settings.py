@@ -1,13 +1,19 @@
 """How the network is asked: the mode, and what follows from it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
+from typing import Any
 
 import torch
 
 from unirender.diffusion.sampling import NUM_SAMPLES, Generators, steps_of
 from unirender.errors import UnirenderError
 
+SETTINGS = (  # of `decompose`
+    *("camera", "mode", "num_inference_steps", "num_samples", "generator"),
+    *("sampler", "size", "tile", "material", "closed"),
+)
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
 
@@ -39,8 +45,12 @@ class Sampling:
         """Resolves the arguments of a call.
 
         Raises:
-            UnirenderError: an unknown mode, or numbers that do not go with it.
+            UnirenderError: an unknown mode, numbers that do not go with it, or a generator that is none.
         """
+        if generator is not None and not isinstance(generator, torch.Generator | Sequence):
+            raise UnirenderError(
+                f"generator: got {generator!r}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
+            )
         return cls(mode, steps_of(mode, num_inference_steps), _sample_count(mode, num_samples), generator)
 
     def generators(self, pictures: int) -> Generators:
@@ -69,14 +79,24 @@ class Sampling:
         return int(torch.randint(0, 2**62, (), generator=own, device=own.device if own is not None else "cpu"))
 
 
+def check_settings(sampling: Mapping[str, Any]) -> None:
+    """Looks at the settings that `edit` and `relight` hand on: with a decomposition at hand nothing else would.
+
+    Raises:
+        TypeError: there is no such setting, as Python has it of an argument.
+    """
+    if unknown := sorted(set(sampling) - set(SETTINGS)):
+        raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}, expected some of {', '.join(SETTINGS)}")
+
+
 def same_noise(seed: int, count: int) -> list[torch.Generator]:
     """Generators that all draw the same."""
     return [torch.Generator().manual_seed(seed) for _ in range(count)]
 
 
 def _sample_count(mode: str, num_samples: int | None) -> int:
-    if num_samples is not None and num_samples < 1:
-        raise UnirenderError(f"num_samples: got {num_samples}, expected at least 1")
+    if num_samples is not None and (not isinstance(num_samples, Integral) or num_samples < 1):
+        raise UnirenderError(f"num_samples: got {num_samples!r}, expected a whole number, at least 1")
     if mode == "mean" and num_samples not in (None, 1):
         raise UnirenderError(f"mode mean gives 1 sample, got num_samples {num_samples}; use mode 'sample'")
     return 1 if mode == "mean" else num_samples or NUM_SAMPLES

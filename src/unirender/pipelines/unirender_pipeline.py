@@ -10,6 +10,7 @@ of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` componen
 import logging
 import math
 from collections.abc import Collection, Iterable, Sequence
+from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, overload
 
@@ -23,7 +24,7 @@ from PIL import Image
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
-from unirender.diffusion.sampling import Generators, make_sampler
+from unirender.diffusion.sampling import Generators, check_scheduler, make_sampler
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models.codec import make_codec
@@ -31,13 +32,20 @@ from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
 from unirender.pipelines.decomposing import View, decompose_views
-from unirender.pipelines.editing import anchor, constant_map, specular_for_roughness, too_coarse, under_light
-from unirender.pipelines.inputs import as_environment, as_picture, ready_to_render, told_derived, unit_value
+from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
+from unirender.pipelines.inputs import (
+    as_environment,
+    as_material,
+    as_picture,
+    check_rendered,
+    ready_to_render,
+    told_derived,
+)
 from unirender.pipelines.loading import check_complete, find_pipeline, reading
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
-from unirender.pipelines.settings import Sampling, same_noise
+from unirender.pipelines.settings import Sampling, check_settings, same_noise
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
@@ -127,7 +135,8 @@ class UniRenderPipeline(DiffusionPipeline):
         """Inverse rendering.
 
         Args:
-            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture.
+            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (whose EXIF orientation is not
+                looked at).
             mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
@@ -197,14 +206,18 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
-        masks = [None] * len(images_srgb) if masks is None else masks
+        images_srgb = list(images_srgb)
+        masks = [None] * len(images_srgb) if masks is None else list(masks)
         cameras = [cameras or Camera()] * len(images_srgb) if not isinstance(cameras, Sequence) else cameras
+        for camera in cameras:
+            if not isinstance(camera, Camera):
+                raise UnirenderError(f"camera: got {camera!r}, expected a unirender.camera.Camera, like {Camera()}")
         if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
             raise UnirenderError(
                 f"decompose: got {len(images_srgb)} pictures, {len(masks)} masks and {len(cameras)} cameras, expected "
                 "at least one picture, and one of each for every picture"
             )
-        material = material or self.config["material"]
+        material = self.config["material"] if material is None else material
         if material not in ("scalar", "map"):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
@@ -253,6 +266,7 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
+        check_rendered(intrinsics, derived)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
         return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
@@ -300,14 +314,15 @@ class UniRenderPipeline(DiffusionPipeline):
         """
         if roughness is None and metallic is None:
             raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
+        check_settings(sampling)
         picture, cover = as_picture(image_srgb, mask)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
         before = decomposition.intrinsics
         edited, bounded, coarse = before, 0.0, None
         if metallic is not None:
-            edited = edited.replace(metallic=constant_map(unit_value("metallic", metallic), cover))
+            edited = edited.replace(metallic=as_material("metallic", metallic, cover))
         if roughness is not None:
-            target = constant_map(unit_value("roughness", roughness), cover)
+            target = as_material("roughness", roughness, cover)
             specular, bounded = specular_for_roughness(before, target)
             coarse = too_coarse(before, target)
             edited = edited.replace(roughness=target, specular=specular)
@@ -350,6 +365,8 @@ class UniRenderPipeline(DiffusionPipeline):
         """
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
+        check_settings(sampling)
+        check_exposure(exposure)
         picture, cover = as_picture(image_srgb, mask)
         if environment is not None:
             environment = as_environment(environment)
@@ -399,20 +416,23 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: it is no multiple of `size_multiple`.
         """
-        if size < 1 or size % self.size_multiple:
+        if not isinstance(size, Integral) or size < 1 or size % self.size_multiple:
             raise UnirenderError(f"size: got {size}, expected a multiple of {self.size_multiple}, like {self.size}")
 
     def _network(self, mode: str = "mean", sampler: str | None = None, size: int | None = None) -> Network:
         """The network as a call asks for it.
 
         Raises:
-            UnirenderError: no such sampler or size; or a sampler in mode `mean`, which takes one step.
+            UnirenderError: no such sampler or size; a sampler in mode `mean`, which takes one step; or a scheduler
+                that several steps cannot be taken with.
         """
         if sampler is not None and mode == "mean":
             raise UnirenderError(f"sampler {sampler}: mode mean takes one step and no sampler; use mode 'sample'")
         if size is not None:
             self.check_size(size)
         scheduler = self.scheduler if sampler is None else make_sampler(sampler, self.scheduler)
+        if mode == "sample":
+            check_scheduler(scheduler)
         return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
