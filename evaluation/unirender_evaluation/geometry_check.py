@@ -6,11 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 
-ALBEDO_TWIN = 1.02
+ALBEDO_TWIN = 0.02  # of every value
+ALBEDO_TWIN_ADDED = 0.05  # added where a factor changes nothing, or less than edges tolerate
+BLACK = 1e-3  # below this mean a factor of the albedo is no error that can be found
+NORMAL_TWIN_DEG = 8.0
 INSIDE = 0.99  # coverage above which a pixel is not an edge
 FAINT = 0.1  # edges with less coverage hold too few of the samples to compare
 TOLERANCE_SPP = 256  # with fewer samples of a trace tolerances grow as its noise does
@@ -76,7 +81,7 @@ def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE
     found = {"mask, mean": mask.mean(), "mask, max": mask.max()} if mask.size else {}
     if inside.any():
         mean_a, mean_b = (np.mean(maps["albedo"][inside], axis=0, dtype=np.float64) for maps in (a, b))
-        found["albedo, bias"] = np.max(np.abs(mean_b - mean_a) / np.maximum(mean_a, 1e-3))
+        found["albedo, bias"] = np.max(np.abs(mean_b - mean_a) / np.maximum(mean_a, BLACK))
         found |= {"albedo inside, mean": albedo[inside].mean(), "albedo inside, max": albedo[inside].max()}
         found |= {"normal inside, mean deg": angle[inside].mean(), "normal inside, max deg": angle[inside].max()}
     if edge.any():
@@ -88,9 +93,29 @@ def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE
 
 
 def twin_geometry(maps: Intrinsics) -> dict[str, Intrinsics]:
-    """Wrong maps that the comparison has to refuse."""
-    good = maps.require("albedo", "normal")
+    """Wrong maps that the comparison has to refuse, whatever the object: each error moves away from what it cannot
+    change.
+
+    The albedo is 2 % brighter, or darker where that would be brighter than white; black, and an object that covers no
+    pixel wholly, gets another albedo instead. The normal is turned about the x or the y axis, whichever it is less
+    along: a picture that is its own mirror image shows that too.
+    """
+    good = maps.require("mask", "albedo", "normal")
+    albedo, inside = good["albedo"], good["mask"][..., 0] > INSIDE
+    if inside.any() and albedo[inside].mean(axis=0).max() >= BLACK:
+        factor = 1 + ALBEDO_TWIN if albedo.max() * (1 + ALBEDO_TWIN) <= 1 else 1 - ALBEDO_TWIN
+        name, wrong = f"albedo {ALBEDO_TWIN:.0%} off", albedo * factor
+    else:
+        inwards = np.where(albedo < 0.5, ALBEDO_TWIN_ADDED, -ALBEDO_TWIN_ADDED)
+        name, wrong = f"albedo {ALBEDO_TWIN_ADDED:g} off", albedo + inwards * (good["mask"] > 0)
     return {
-        f"albedo {ALBEDO_TWIN - 1:.0%} off": maps.replace(albedo=np.clip(good["albedo"] * ALBEDO_TWIN, 0, 1)),
-        "normal mirrored in x": maps.replace(normal=good["normal"] * np.array([-1, 1, 1], np.float32)),
+        name: maps.replace(albedo=wrong.astype(np.float32)),
+        f"normal turned by {NORMAL_TWIN_DEG:g} degrees": maps.replace(normal=_turned(good["normal"])),
     }
+
+
+def _turned(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Normals turned by `NORMAL_TWIN_DEG` about x or y."""
+    axis = int(np.argmin(np.square(normal[..., :2], dtype=np.float64).mean(axis=(0, 1))))
+    turn = Rotation.from_euler("xy"[axis], NORMAL_TWIN_DEG, degrees=True).as_matrix()
+    return (normal @ turn.T).astype(np.float32)

@@ -110,12 +110,10 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     ]
     state = "HOLDS" if check["passed"] else "FAILS"
     agree = "differ from" if check["failed"] else "agree with"
-    twins = "were found" if check["twin_detected"] else "were NOT found: too blind on this suite, raise its samples"
     lines.append(
         f"  {state}  truth: {check['members']} members, and mask, albedo and normal of {check['geometries']} objects, "
         f"rendered again with other seeds {agree} the truth file (check seed {check['seed']}, {check['date']}, "
-        f"smallest pass share {check['smallest_pass_share']:.3f}); deliberate errors of roughness, albedo and normal "
-        f"{twins}"
+        f"smallest pass share {check['smallest_pass_share']:.3f}); {_twins_text(check)}"
     )
     here, scenes = check.get("chosen_from", (0, 0))  # a check that an earlier version stored has none
     if here < scenes:
@@ -129,3 +127,13 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def _twins_text(check: dict) -> str:
+    """Whether the check found its deliberate errors; which it did not, with what may help."""
+    if check["twin_detected"]:
+        return "deliberate errors of roughness, albedo and normal were found"
+    missed = check.get("missed")  # a check that an earlier version stored does not say which
+    if not missed:
+        return "not all deliberate errors of roughness, albedo and normal were found: check again with --recheck"
+    return "deliberate errors NOT found: " + "; ".join(f"{name} ({advice})" for name, advice in missed.items())

@@ -59,6 +59,18 @@ def test_verdict_states_claims_and_failures() -> None:
     )
 
 
+def test_deliberate_errors_that_were_missed_are_named() -> None:
+    """Those alone, each with what may help; a check that an earlier version stored does not say which."""
+    run = RunInfo("t", "h", 64, ())
+    assert "errors of roughness, albedo and normal were found" in verdict_text([], run, CHECK)
+    missed = {"passed": False, "twin_detected": False, "missed": {"normal turned by 8 degrees": "check more scenes"}}
+    text = verdict_text([], run, CHECK | missed)
+    assert "deliberate errors NOT found: normal turned by 8 degrees (check more scenes)" in text
+    assert "roughness" not in text
+    old = verdict_text([], run, CHECK | {"passed": False, "twin_detected": False})
+    assert "not all deliberate errors of roughness, albedo and normal were found" in old
+
+
 def test_a_strangers_row_has_claims_of_its_own() -> None:
     """Against every trivial row on the tables that it has answers for, and against the ceiling; ours are not missed."""
     rng = np.random.default_rng(1)
