@@ -28,6 +28,9 @@ ATTRIBUTE_PREFIX = "unirender:"
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
 GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
+MAP_CHANNELS: Mapping[str, tuple[str, ...]] = {
+    name: tuple(f"{name}.{component}" for component in _COMPONENTS.get(name, "Y")) for name in IMAGE_MAPS
+}
 
 
 def write_exr(
@@ -111,7 +114,8 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
 
     Raises:
-        UnirenderError: the file is missing or is no readable single-part OpenEXR.
+        UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels that begin elsewhere
+            than its picture does.
     """
     path = Path(path)
     try:
@@ -134,6 +138,12 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
         ) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
+    stored, shown = (tuple(int(x) for x in header[window][0]) for window in ("dataWindow", "displayWindow"))
+    if stored != shown:
+        raise UnirenderError(
+            f"{name}: the pixels begin at {stored} (dataWindow) and the picture at {shown} (displayWindow), expected "
+            "both at the same place; save the whole picture"
+        )
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
     return channels, attributes
 
@@ -162,8 +172,8 @@ def intrinsics_channels(intrinsics: Intrinsics) -> Channels:
     for name in IMAGE_MAPS:
         value = getattr(intrinsics, name)
         if value is not None:
-            for i, component in enumerate(_COMPONENTS.get(name, "Y")):
-                channels[f"{name}.{component}"] = value[..., i]
+            for i, channel in enumerate(MAP_CHANNELS[name]):
+                channels[channel] = value[..., i]
     return channels
 
 
@@ -172,12 +182,15 @@ def intrinsics_from_channels(
     environment: Float[np.ndarray, "eh ew 3"] | None = None,
     camera: Camera | None = None,
 ) -> Intrinsics:
-    """The inverse of `intrinsics_channels`; maps without channels are None, the mask is `mask.Y` or else `A`."""
+    """The inverse of `intrinsics_channels`; maps without channels are None, the mask is `mask.Y` or else `A`.
+
+    Raises:
+        UnirenderError: a map has some of its channels only, or values outside the contract.
+    """
     maps: dict[str, np.ndarray] = {}
     for name in IMAGE_MAPS:
-        components = _COMPONENTS.get(name, "Y")
-        if f"{name}.{components[0]}" in channels:
-            maps[name] = channels_rgb(channels, name, components)
+        if any(channel in channels for channel in MAP_CHANNELS[name]):
+            maps[name] = channels_rgb(channels, name, _COMPONENTS.get(name, "Y"))
     if "mask" not in maps and "A" in channels:
         maps["mask"] = channels["A"][..., None]
     return Intrinsics(**maps, environment=environment, camera=camera or Camera())
