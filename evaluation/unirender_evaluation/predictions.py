@@ -21,6 +21,8 @@ there and unreadable, of another size or not finite is an error, which `predicti
 """
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, intrinsics_from_channels, read_exr
+from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, read_exr
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
@@ -38,6 +40,9 @@ PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
 COLOURS = ("albedo", "specular", "diffuse")
 MAP_FILES = ("intrinsics.exr", *(f"{name}.png" for name in PNG_MAPS))
 SUFFIXES = (".exr", ".png")
+READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
+HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
+BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
 class PredictionFolder:
@@ -116,38 +121,48 @@ class PredictionFolder:
         """A rendered picture, linear and premultiplied.
 
         Raises:
-            UnirenderError: the file is broken, has another size than the mask, or values that are not finite.
+            UnirenderError: the file is broken, has another size than the mask, or values that are not finite or beyond
+                `BRIGHTEST`.
         """
-        stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else read_png(path, 3)
-        _check_size(path, "the picture", stored, mask)
-        if not np.isfinite(stored).all():
-            raise UnirenderError(f"predictions: {path} has NaN or infinite values, expected finite radiance")
-        image = self.conventions.linear(stored, path.suffix)
+        with _named(path):
+            stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else read_png(path, 3)
+            _check_size(path, "the picture", stored, mask)
+            if not np.isfinite(stored).all():
+                raise UnirenderError(f"predictions: {path} has NaN or infinite values, expected finite radiance")
+            with np.errstate(over="ignore"):  # an overflow is brighter than the bound
+                image = self.conventions.linear(stored, path.suffix)
+            _check_brightness("the picture", image)
         return image if self.conventions.premultiplied else (image * mask).astype(np.float32)
 
     def read_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
         """The maps of one file, in the contract's conventions.
 
         Raises:
-            UnirenderError: the file is broken or without maps, or one has another size than the mask or values outside
-                the contract.
+            UnirenderError: the file is broken, without maps or with channels that nothing reads, or a map has another
+                size than the mask or values outside the contract.
         """
-        try:
+        with _named(path):
             return self._read_exr_maps(path, mask, camera) if path.suffix == ".exr" else self._read_png_map(path, mask)
-        except UnirenderError as error:
-            raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
 
     def read_mask(self, path: Path) -> Mask | None:
         """The method's own mask, from a file of maps; None: it has none, and the true one is pasted."""
         return intrinsics_from_channels(read_exr(path)[0]).mask if path.suffix == ".exr" else None
 
     def _read_exr_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
-        read = intrinsics_from_channels(read_exr(path)[0], camera=camera)
+        channels, _ = read_exr(path)
+        read = intrinsics_from_channels(channels, camera=camera)
         maps = {name: getattr(read, name) for name in read.present if name != "mask"}
         if not maps:
             raise UnirenderError(f"predictions: {path} has no map, expected channels like albedo.R or roughness.Y")
+        unread = sorted(channels.keys() - {*READ, *HARMLESS})
+        if unread:
+            raise UnirenderError(
+                f"has channels that are not read, {', '.join(unread)}; expected names of {', '.join(READ)}; rename or "
+                "remove them"
+            )
         for name, value in maps.items():
             _check_size(path, name, value, mask)
+            _check_brightness(name, value)
         if "albedo" in maps:
             maps["albedo"] = self.conventions.linear(maps["albedo"], ".exr")
         return self._converted(maps)
@@ -170,6 +185,21 @@ class PredictionFolder:
         if "roughness" in maps:
             maps["roughness"] = self.conventions.perceptual(maps["roughness"])
         return Intrinsics().replace(**maps).maps
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors raised inside name the file."""
+    try:
+        yield
+    except UnirenderError as error:
+        raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
+
+
+def _check_brightness(what: str, value: Float[np.ndarray, "h w c"]) -> None:
+    largest = float(np.abs(value).max())
+    if not largest <= BRIGHTEST:
+        raise UnirenderError(f"{what} has values up to {largest:.3g}, expected at most {BRIGHTEST:g}; limit them")
 
 
 def _check_size(path: Path, what: str, value: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "mh mw 1"]) -> None:

@@ -151,6 +151,73 @@ def test_values_outside_the_contract_are_problems(suite: Suite, tmp_path: Path) 
         check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
 
 
+def problems_of(suite: Suite, folder: Path) -> tuple[str, ...]:
+    """What the check before a run says; nothing if the folder passes."""
+    try:
+        check_predictions(prediction_rows({"mine": folder}), suite)
+    except PredictionError as error:
+        return error.problems
+    return ()
+
+
+def test_a_picture_without_its_channels_is_named(suite: Suite, tmp_path: Path) -> None:
+    """Every line says which file it is about."""
+    task = first(suite, "rendering", "given")
+    path = tmp_path / task.folder / "render_given.exr"
+    path.parent.mkdir()
+    assert task.truth_image is not None
+    write_exr(path, {f"image.{c}": task.truth_image[..., i] for i, c in enumerate("RGB")})
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: EXR channels R, G, B missing")
+
+
+@pytest.mark.parametrize("name", ["roughness.R", "metalic.Y", "normals.X", "albedo", "std.R"])
+def test_channels_that_nothing_reads_are_problems(suite: Suite, tmp_path: Path, name: str) -> None:
+    """Beside known ones, too: a misspelt map would be a map that the method does not have."""
+    task = first(suite, "inverse", "single-image")
+    path = tmp_path / task.folder / "intrinsics.exr"
+    path.parent.mkdir()
+    truth = suite.intrinsics(task.scene, task.scene.materials[0])
+    channels = intrinsics_channels(truth)
+    write_exr(path, channels | image_channels(truth.require("diffuse")["diffuse"]) | {"A": task.mask[..., 0]})
+    assert problems_of(suite, tmp_path) == ()  # what unirender writes
+    write_exr(path, channels | {name: channels["roughness.Y"]})
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: has channels that are not read, {name}; expected names of albedo.R")
+    write_exr(path, {key: value for key, value in channels.items() if key != "albedo.R"})
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: EXR channels albedo.R missing")
+
+
+@pytest.mark.parametrize("colour", ["linear", "srgb"])
+def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, colour: str) -> None:
+    """What the check lets through is scored with numbers."""
+    (tmp_path / "conventions.toml").write_text(f'exr_colour = "{colour}"\n')
+    task = first(suite, "rendering", "given")
+    path = tmp_path / task.folder / "render_given.exr"
+    path.parent.mkdir()
+
+    def write(value: float) -> None:
+        write_exr(path, image_channels(np.full((*task.mask.shape[:2], 3), value, np.float32)), half=False)
+
+    write(9e29 if colour == "linear" else 1e12)
+    assert problems_of(suite, tmp_path) == ()
+    row = prediction_rows({"mine": tmp_path})[0]
+    assert not np.isnan(list(engine.score(task, engine.answer(row, task), ()).values())).any()
+    for value in (3e38, -3e38):
+        write(value)
+        (problem,) = problems_of(suite, tmp_path)
+        assert f"{path}: the picture has values up to" in problem
+        assert "expected at most 1e+30" in problem
+    maps = tmp_path / first(suite, "inverse", "single-image").folder / "intrinsics.exr"
+    maps.parent.mkdir(exist_ok=True)
+    path.unlink()
+    specular = np.full((*task.mask.shape[:2], 3), 3e38, np.float32)
+    write_exr(maps, intrinsics_channels(Intrinsics(specular=specular)), half=False)
+    (problem,) = problems_of(suite, tmp_path)
+    assert f"{maps}: specular has values up to 3e+38" in problem
+
+
 def test_conventions_are_undone(suite: Suite, tmp_path: Path) -> None:
     """The same truth in OpenCV axes, sRGB EXR, GGX alpha and straight colour scores as the truth; undeclared it does
     not."""
