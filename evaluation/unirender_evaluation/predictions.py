@@ -34,6 +34,7 @@ from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, 
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
+from unirender_evaluation.png import read_png
 from unirender_evaluation.tasks import Task
 
 PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
@@ -208,25 +209,3 @@ def _check_size(path: Path, what: str, value: Float[np.ndarray, "h w c"], mask: 
         raise UnirenderError(
             f"predictions: {path}: {what} is {width} x {height} pixels, expected {columns} x {rows}; resample it"
         )
-
-
-def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
-    """Values in [0, 1] of a PNG; alpha is dropped, grey and colour are converted to `channels`.
-
-    Grey keeps 16 bits; colour is read at 8 bits a channel.
-
-    Raises:
-        UnirenderError: not a readable PNG.
-    """
-    from PIL import Image as Pil
-
-    try:
-        with Pil.open(path) as picture:
-            if picture.mode.startswith("I"):
-                value = np.asarray(picture, np.float32) / 65535.0
-            else:
-                value = np.asarray(picture.convert("RGB" if channels == 3 else "L"), np.float32) / 255.0
-    except (OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"predictions: {path} is not a readable PNG ({error})") from None
-    value = value if value.ndim == 3 else value[..., None]
-    return np.repeat(value, 3, axis=-1) if channels == 3 and value.shape[-1] == 1 else value.astype(np.float32)
