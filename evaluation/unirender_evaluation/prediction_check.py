@@ -2,6 +2,7 @@
 every file."""
 
 import difflib
+import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ from unirender_evaluation.tasks import PROTOCOLS, tasks
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", "environment.exr", "environment.png", "mask.png")
+GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
 
 
 class PredictionError(UnirenderError):
@@ -54,6 +56,7 @@ def check_predictions(rows: Iterable[Row], suite: Suite) -> None:
     folders = [row.predictions for row in rows if row.predictions is not None]
     asked = questions(suite) if folders else {}
     problems = [problem for folder in folders for problem in folder_problems(folder, asked, suite.spec.name)]
+    problems += [problem for folder in folders for problem in _other_truth(folder.folder, asked, suite)]
     if problems:
         raise PredictionError(problems)
 
@@ -80,7 +83,9 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
         predictions = PredictionFolder(predictions.folder, Conventions())  # and on to the files
     answered = 0
     for path in _visible(predictions.folder):
-        if path.is_dir() and path.name in asked:
+        if _is_broken_link(path):
+            found.append(_broken_link(path))
+        elif path.is_dir() and path.name in asked:
             files = list(_visible(path))
             found += _layout_problems(path, files, asked[path.name])
             readable = [file for file in files if _is_answer(file, asked[path.name])]
@@ -109,14 +114,56 @@ def _is_answer(path: Path, question: Question) -> bool:
 def _layout_problems(folder: Path, files: list[Path], question: Question) -> Iterator[str]:
     for path in files:
         expected = _is_answer(path, question) or path.name in IGNORED
-        if path.is_dir() and path.name not in question.answers:
+        if _is_broken_link(path):
+            yield _broken_link(path)
+        elif path.is_dir() and path.name not in question.answers:
             yield f"{path}: an unknown folder, expected files {question.files}"
+        elif path.is_dir():
+            yield from _problems_in_an_answers_folder(path)
         elif path.is_file() and not expected and path.suffix.lower() in PICTURE_LIKE:
             yield f"{path}: answers no question about this picture, expected {question.files}"
     names = {path.name for path in files}
     for answer in sorted(question.answers):
         if {f"{answer}{suffix}" for suffix in SUFFIXES} <= names:
             yield f"{folder}: {answer} is there as EXR and as PNG, expected one of them"
+
+
+def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
+    """What lies beside the files that `bench export` puts there: nothing else is looked at."""
+    for path in _visible(folder):
+        if _is_broken_link(path):
+            yield _broken_link(path)
+        elif path.is_dir() or (path.suffix.lower() in PICTURE_LIKE and path.name not in GIVEN):
+            yield f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png"
+
+
+def _is_broken_link(path: Path) -> bool:
+    return path.is_symlink() and not path.exists()
+
+
+def _broken_link(path: Path) -> str:
+    return f"{path}: a link to {path.readlink()}, which is not there; copy the file, or remove the link"
+
+
+def _other_truth(folder: Path, asked: dict[str, Question], suite: Suite) -> Iterator[str]:
+    """That the inputs, whose `meta.json` lies beside the answers, were exported with another truth: one line."""
+    named = {path: _named_truth(path) for path in (folder / name / "meta.json" for name in sorted(asked))}
+    others = [path for path, sha256 in named.items() if sha256 not in (None, suite.sha256)]
+    if others:
+        yield (
+            f"{others[0]}: suite_sha256 is {named[others[0]]}, and {suite.sha256} of the truth here ({len(others)} "
+            "such files): these inputs are of another truth; export them again (`unirender bench export`) and predict "
+            "anew, or score with that truth"
+        )
+
+
+def _named_truth(path: Path) -> str | None:
+    """The truth that a `meta.json` of `bench export` is of; None: another file of the name, or none."""
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return str(meta["suite_sha256"]) if isinstance(meta, dict) and "suite_sha256" in meta else None
 
 
 def _file_problems(predictions: PredictionFolder, path: Path, question: Question) -> Iterator[str]:

@@ -82,7 +82,8 @@ class PredictionFolder:
     def sha256(self) -> str:
         """Over names and contents of all files that are read."""
         digest = hashlib.sha256()
-        for path in sorted(p for p in self.folder.rglob("*") if p.suffix in SUFFIXES or p.name == FILE):
+        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name == FILE) and p.is_file())
+        for path in sorted(read):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 

@@ -1,5 +1,6 @@
 """Folders of predictions: how their files are read, and that all that is wrong with one is found at once."""
 
+import json
 import struct
 import zlib
 from pathlib import Path
@@ -303,3 +304,42 @@ def test_conventions_are_the_contract_by_default(tmp_path: Path) -> None:
     (tmp_path / "conventions.toml").write_text("premultiplied = ")
     with pytest.raises(UnirenderError, match="not a readable TOML file"):
         read_conventions(tmp_path)
+
+
+def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -> None:
+    """Nobody looks for an answer there; the export's own files lie there rightly. A link to nothing is no file."""
+    export_inputs(suite, tmp_path)
+    answer_all(suite, tmp_path)
+    task = first(suite, "relighting", "from-image-sd")
+    folder = tmp_path / task.folder / task.answer
+    assert {path.name for path in folder.iterdir()} == {"given.exr"}
+    (folder / "notes.txt").write_text("notes")
+    (folder / ".hidden.png").write_text("")
+    assert problems_of(suite, tmp_path) == ()
+    (folder / "out.exr").write_text("an answer")
+    (folder / "deeper").mkdir()
+    links = (tmp_path / "far.png", tmp_path / task.folder / "albedo.png", folder / "given.png")
+    for link in links:
+        link.symlink_to("nowhere.png")
+    problems = problems_of(suite, tmp_path)
+    assert len(problems) == 5, problems
+    for path in (folder / "out.exr", folder / "deeper"):
+        assert f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png" in problems
+    for link in links:
+        assert f"{link}: a link to nowhere.png, which is not there; copy the file, or remove the link" in problems
+
+
+def test_answers_to_another_truth_are_refused(suite: Suite, tmp_path: Path) -> None:
+    """In one line, however many pictures there are; the `meta.json` of other programs says nothing of it."""
+    export_inputs(suite, tmp_path)
+    answer_all(suite, tmp_path)
+    metas = sorted(tmp_path.glob("*/meta.json"))
+    metas[0].write_text('{"fov_deg": 36}')
+    metas[1].write_text("no JSON")
+    metas[2].write_text("[1]")
+    assert problems_of(suite, tmp_path) == ()
+    for path in metas[3:5]:
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"suite_sha256": "0" * 64}))
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{metas[3]}: suite_sha256 is {'0' * 64}, and {suite.sha256} of the truth here (2 such")
+    assert "export them again (`unirender bench export`) and predict anew" in problem
