@@ -46,8 +46,8 @@ def score(
         Metric key -> value: `albedo.psnr@masked-srgb-raw`, `normal.cosine`, ... The PSNR of identical pictures is inf.
 
     Raises:
-        UnirenderError: the two are of different kinds or sizes, a picture is not linear floats with the channels last,
-            a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score.
+        UnirenderError: the two are of different kinds or sizes, a picture is not finite linear floats with the channels
+            last, a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score.
     """
     from unirender_evaluation.scoring import score_image, score_maps
 
@@ -125,4 +125,8 @@ def _array(value: Any, what: str, channels: int, meaning: str) -> Float[np.ndarr
         wanted += "; score one picture at a time"
     if found.dtype.kind != "f" or found.ndim != 3 or found.shape[-1] != channels:
         raise UnirenderError(f"score: {what} is {found.dtype} of shape {found.shape}, expected {wanted}")
-    return found.astype(np.float32)
+    with np.errstate(over="ignore"):  # what overflows is infinite
+        values = found.astype(np.float32)
+    if not np.isfinite(values).all():
+        raise UnirenderError(f"score: {what} has NaN or infinite values, expected finite ones: {meaning}")
+    return values

@@ -100,7 +100,10 @@ def bytes_of(picture: np.ndarray) -> np.ndarray:
         ((FOUND, TRUE), {"protocol": "mask"}, "got 'mask', expected one word per axis"),
         ((FOUND, maps(1.0).replace(mask=None)), {}, "the truth has no mask"),
         ((Intrinsics(metallic=MASK), TRUE), {}, "no map that both sides have, expected at least one number"),
-        ((PICTURES[0] * np.nan, PICTURES[1]), {"mask": MASK}, "has NaN or infinite values"),
+        ((PICTURES[0] * np.nan, PICTURES[1]), {"mask": MASK}, "the prediction has NaN or infinite values"),
+        ((PICTURES[0], PICTURES[1] * np.nan), {"mask": MASK}, "the truth has NaN or infinite values"),
+        ((PICTURES[0], PICTURES[1] * np.float64(1e300)), {"mask": MASK}, "the truth has NaN or infinite values"),
+        (PICTURES, {"mask": np.where(MASK > 0, MASK, np.nan)}, "mask has NaN or infinite values, expected .* coverage"),
     ],
 )
 def test_what_it_refuses(arguments: tuple[Any, Any], options: dict[str, Any], said: str) -> None:
