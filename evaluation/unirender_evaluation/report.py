@@ -25,6 +25,7 @@ from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_rec
 from unirender_evaluation.report_plots import heading, strip_plots, tiles
 from unirender_evaluation.report_samples import Place, Sheet, make_sheets, sample_sections
 from unirender_evaluation.specs import TABLES, TableSpec
+from unirender_evaluation.table_counts import cell_counts
 from unirender_evaluation.table_formats import (
     NOT_AVAILABLE,
     format_estimate,
@@ -182,18 +183,15 @@ def _tab(variant: Variant, with_published: bool) -> str:
 
 
 def _row(row: Row, table: Table) -> dict[str, Any]:
-    cells = []
-    for i, (cell, column) in enumerate(zip(row.cells, table.columns, strict=True)):
-        counts = [cell.measured.n for cell in (r.cells[i] for r in table.rows) if cell.measured is not None]
-        everywhere = max(counts, default=0)
-        known = row.n if row.n < table.n else everywhere  # a row on a subset says so in its label
-        cells.append(_cell(cell, column.metric.decimals, known))
+    counts = cell_counts(table.rows, row)
+    pairs = zip(row.cells, table.columns, strict=True)
+    cells = [_cell(cell, column.metric.decimals, counts.get(i)) for i, (cell, column) in enumerate(pairs)]
     label = row_label(row, table).replace("n = ", _unbroken("n = "))
     return {"label": label, "kind": row.kind, "cells": cells}
 
 
-def _cell(cell: Cell, decimals: int, known: int) -> dict[str, Any]:
-    """One cell; its n is printed where it is below the `known` one."""
+def _cell(cell: Cell, decimals: int, few: int | None) -> dict[str, Any]:
+    """One cell, with its n where it is on fewer samples than others and the row's label does not say so (`few`)."""
     view: dict[str, Any] = {"value": None, "sort": "", "missing": measured_text(cell), "published": None}
     if cell.published is not None:
         view["missing"] = NOT_AVAILABLE if cell.unavailable else ""
@@ -206,7 +204,7 @@ def _cell(cell: Cell, decimals: int, known: int) -> dict[str, Any]:
         view |= {
             "value": value,
             "spread": spread,
-            "n": f"n = {cell.measured.n}" if cell.measured.n < known else "",
+            "n": "" if few is None else f"n = {few}",
             "sort": cell.measured.mean,
             "rank": {1: "best", 2: "second"}.get(cell.measured_rank or 0, ""),
             "title": f"95 % interval [{low}, {high}], n = {cell.measured.n}, {cell.measured.clusters} objects",

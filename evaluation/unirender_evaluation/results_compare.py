@@ -135,9 +135,10 @@ def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, meth
         key: metric key.
         method: the row.
     """
-    values = {info.key: values_of(records, info.key, key) for info in run.methods if info.kind in RANKED_KINDS}
+    values = {info.key: values_of(records, info.key, key) for info in run.methods}
     fullest = max(map(len, values.values()), default=0)
-    means = {row: sum(found.values()) / fullest for row, found in values.items() if found and len(found) == fullest}
+    competing = [info.key for info in run.methods if info.kind in RANKED_KINDS and len(values[info.key]) == fullest > 0]
+    means = {row: sum(values[row].values()) / fullest for row in competing}
     if method not in means:
         return None
     rounded = {row: round(mean, metric.decimals) for row, mean in means.items()}

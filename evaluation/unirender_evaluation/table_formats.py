@@ -1,15 +1,15 @@
 """Tables as Markdown, LaTeX, JSON and terminal text.
 
 In every format: best in bold, second underlined (on rounded values), "-" where a value does not exist, "n/a" where it
-could not be computed here, ± half of the bootstrap interval, a dagger on a published value that a trivial row beats,
-the watermark of a partial run, and the protocol below.
+could not be computed here, ± half of the bootstrap interval, n where others have more samples, a dagger on a published
+value that a trivial row beats, the watermark of a partial run, and the protocol below.
 """
 
 import dataclasses
 import json
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -21,6 +21,7 @@ from rich.table import Table as RichTable
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate
+from unirender_evaluation.table_counts import label_n, printed_counts
 from unirender_evaluation.tables import Cell, Row, Table
 
 MISSING, NOT_AVAILABLE = "-", "n/a"
@@ -46,9 +47,15 @@ def header(column: Column) -> str:
 
 
 def row_label(row: Row, table: Table) -> str:
-    """Label with n where it differs from the table's, and "stored" where nothing ran."""
-    subset = f" (n = {row.n})" if row.info is not None and 0 < row.n < table.n else ""
+    """Label with n where its cells are on fewer samples than others, and "stored" where nothing ran."""
+    n = label_n(table.rows, row)
+    subset = "" if n is None else f" (n = {n})"
     return row.label + subset + (" (stored)" if row.stored else "")
+
+
+def _few(counts: Mapping[int, int], column: int) -> str:
+    """What stands behind a number on fewer samples than others, where the row's label does not say it."""
+    return f" (n = {counts[column]})" if column in counts else ""
 
 
 def measured_text(cell: Cell) -> str:
@@ -67,8 +74,8 @@ def to_markdown(table: Table) -> str:
     lines += [f"> **{table.watermark}**", ""] if table.watermark else []
     lines += [_pipe(titles), _pipe(marks)]
     for row in table.rows:
-        texts = [row_label(row, table)]
-        for column, cell, doubled in zip(table.columns, row.cells, table.published_columns, strict=True):
+        texts, counts = [row_label(row, table)], printed_counts(table.rows, row)
+        for i, (column, cell, doubled) in enumerate(_cells(row, table)):
             digits = column.metric.decimals
             if doubled:
                 published = MISSING if cell.published is None else format_number(cell.published, digits)
@@ -77,7 +84,7 @@ def to_markdown(table: Table) -> str:
                 texts.append(measured_text(cell))
             else:
                 mean, spread = format_estimate(cell.measured, digits)
-                texts.append(f"{_markdown_rank(mean, cell.measured_rank)} {spread}".strip())
+                texts.append(f"{_markdown_rank(mean, cell.measured_rank)} {spread}".strip() + _few(counts, i))
         lines.append(_pipe(texts))
     lines += ["", f"Protocol: {protocol_text(table.protocol)}."]
     lines += [line for note in table.notes for line in ("", note)]
@@ -162,7 +169,7 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
         if section is not None and row.section != section:
             rich_table.add_section()
         section = row.section
-        texts = [escape(row_label(row, table))]
+        texts, counts = [escape(row_label(row, table))], printed_counts(table.rows, row)
         for i in indices:
             cell, digits = row.cells[i], table.columns[i].metric.decimals
             if table.published_columns[i]:
@@ -172,9 +179,8 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
                 texts.append(measured_text(cell))
             else:
                 mean, spread = format_estimate(cell.measured, digits)
-                texts.append(
-                    f"{_rich_rank(mean, cell.measured_rank)} [dim]{spread.replace(' ', '')}[/]" if spread else mean
-                )
+                ranked = _rich_rank(mean, cell.measured_rank)
+                texts.append((f"{ranked} [dim]{spread.replace(' ', '')}[/]" if spread else mean) + _few(counts, i))
         rich_table.add_row(*texts)
     return rich_table
 
@@ -210,9 +216,14 @@ def _pipe(texts: Iterable[str]) -> str:
     return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
 
 
+def _cells(row: Row, table: Table) -> Iterator[tuple[Column, Cell, bool]]:
+    """Each column with the row's cell, and whether it is doubled."""
+    return zip(table.columns, row.cells, table.published_columns, strict=True)
+
+
 def _latex_cells(row: Row, table: Table) -> list[str]:
-    texts = [_tex(row_label(row, table))]
-    for column, cell, doubled in zip(table.columns, row.cells, table.published_columns, strict=True):
+    texts, counts = [_tex(row_label(row, table))], printed_counts(table.rows, row)
+    for i, (column, cell, doubled) in enumerate(_cells(row, table)):
         digits = column.metric.decimals
         if doubled:
             published = MISSING if cell.published is None else _tex_number(format_number(cell.published, digits))
@@ -221,7 +232,8 @@ def _latex_cells(row: Row, table: Table) -> list[str]:
             texts.append(measured_text(cell))
         else:
             mean, spread = (_tex_number(text) for text in format_estimate(cell.measured, digits))
-            small = rf" {{\scriptsize {spread}}}" if spread else ""
+            beside = f"{spread}{_few(counts, i)}".strip()
+            small = rf" {{\scriptsize {beside}}}" if beside else ""
             texts.append(_tex_rank(mean, cell.measured_rank) + small)
     return texts
 

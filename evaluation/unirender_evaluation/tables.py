@@ -6,7 +6,7 @@ so that "given" inputs can never stand beside them. Nothing is printed without i
 """
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
@@ -17,6 +17,7 @@ from unirender_evaluation.published import PublishedRow, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.table_counts import label_n, printed_counts, short_cells
 
 OTHER_AXES = {"linear": "linear light", "aligned": "scale-aligned", "aligned_rgb": "scale-aligned per channel"}
 RANKED_KINDS = ("ours", "paper", "optimisation", "baseline", "external", "trivial")  # bounds are no competitors
@@ -56,7 +57,7 @@ class Row:
     section: str
     cells: tuple[Cell, ...]
     info: MethodInfo | None = None  # None = published only
-    n: int = 0  # samples behind the measured cells
+    n: int = 0  # samples behind the fullest of its measured cells
     stored: str | None = None
 
 
@@ -123,7 +124,7 @@ def build_table(
     measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
     rows = _merge(published_tables().get(spec.name, ()) if show_published else (), spec, measured)
     total = max((row.n for row in rows), default=0)
-    rows = _rank(spec, rows, total)
+    rows = _rank(spec, rows)
     return Table(
         name=spec.name,
         title=spec.title,
@@ -134,7 +135,7 @@ def build_table(
         columns=spec.columns,
         rows=tuple(rows),
         protocol=protocol_line(declared, variant, run, methods, chosen, show_published),
-        notes=_notes(spec, rows, total),
+        notes=_notes(spec, rows),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
     )
@@ -221,14 +222,15 @@ def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping
     return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))
 
 
-def _rank(spec: TableSpec, rows: Sequence[Row], total: int) -> list[Row]:
-    """Ranks 1 and 2 per column on rounded values; rows on fewer samples than the table's n are not ranked."""
+def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
+    """Ranks 1 and 2 per column on rounded values; a cell on fewer samples than the column's fullest is not ranked."""
+    short = [short_cells(rows, row) for row in rows]
     ranked = [list(row.cells) for row in rows]
     for i, column in enumerate(spec.columns):
         cells = [row.cells[i] for row in rows]
         published = {r: cell.published for r, cell in enumerate(cells) if cell.published is not None}
         means = {r: cell.measured.mean for r, cell in enumerate(cells) if cell.measured is not None}
-        competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and rows[r].n == total}
+        competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and i not in short[r]}
         published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
         trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
         grid = column.uniform_grid  # comparable only where the suite's materials are distributed like the paper's
@@ -252,11 +254,10 @@ def _ranks(values: Mapping[int, float], metric: Metric) -> dict[int, int]:
     return {r: order.index(value) + 1 for r, value in rounded.items() if value in order[:2]}
 
 
-def _notes(spec: TableSpec, rows: Iterable[Row], total: int) -> tuple[str, ...]:
-    rows = list(rows)
+def _notes(spec: TableSpec, rows: Sequence[Row]) -> tuple[str, ...]:
     notes = [spec.description] if spec.description else []
     notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
-    fewer = [f"{row.label} (n = {row.n})" for row in rows if row.info is not None and 0 < row.n < total]
+    fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
     if fewer:
         notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
     if any(cell.dagger for row in rows for cell in row.cells):
@@ -271,3 +272,15 @@ def _notes(spec: TableSpec, rows: Iterable[Row], total: int) -> tuple[str, ...]:
     origins = dict.fromkeys(row.stored for row in rows if row.stored)
     stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
     return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))
+
+
+def _counts_said(spec: TableSpec, rows: Sequence[Row], row: Row) -> str:
+    """On how many samples a row's cells stand that are on fewer than others: that behind its label, then others."""
+    label, columns = label_n(rows, row), spec.columns
+    others: dict[str, set[int]] = {}
+    for i, n in printed_counts(rows, row).items():
+        others.setdefault(columns[i].group, set()).add(n)
+    found = [] if label is None else [f"n = {label}"]
+    for group, counts in others.items():
+        found.append(f"{group} n = {' and '.join(map(str, sorted(counts)))}")
+    return ", ".join(found)

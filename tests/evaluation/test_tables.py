@@ -123,6 +123,68 @@ def test_ranks_are_on_rounded_values_and_leave_bounds_and_subsets_out() -> None:
     assert [r.cells[0].measured_rank for r in tied.rows] == [1, 1]
 
 
+def counted(albedo: Mapping[str, int], metallic: Mapping[str, int], note: str = "") -> Table:
+    """The masked inverse table of rows that answer so many samples of albedo, and so many of metallic."""
+    records = []
+    for method in dict.fromkeys([*albedo, *metallic]):
+        for i in range(max(albedo.get(method, 0), metallic.get(method, 0))):
+            values = {metric_key("albedo", "psnr"): 30.0} if i < albedo.get(method, 0) else {}
+            values |= {metric_key("metallic", "mse"): 0.1} if i < metallic.get(method, 0) else {}
+            records.append(Record("inverse", "single-image", method, f"s{i}", f"o{i // 2}", values))
+    infos = tuple(MethodInfo(key, key, "external") for key in ("a", "b", "c"))
+    run = replace(RUN, methods=(*infos, MethodInfo("own", "own", "ours", note=note)))
+    return build_table(TABLES["inverse"], records, run, protocol="single-image")
+
+
+def labels(found: Table) -> list[str]:
+    """The rows' labels as printed, without those of the paper."""
+    return [line.split(" | ")[0][2:] for line in to_markdown(found).splitlines() if re.match(r"\| (a|b)\b", line)]
+
+
+def fewer(found: Table) -> str:
+    """Which rows the note names."""
+    return next((n.partition("ranked: ")[2] for n in found.notes if n.startswith("Measured on fewer")), "")
+
+
+def test_a_cell_on_fewer_samples_than_its_columns_fullest_says_so_and_is_not_ranked() -> None:
+    found = counted({"a": 8, "b": 8, "c": 2}, {"a": 8, "b": 8, "c": 8})
+    albedo = [column.metric.name for column in found.columns].index("psnr")
+    metallic = [column.group for column in found.columns].index("Metallic")
+    assert [r.cells[albedo].measured_rank for r in found.rows] == [1, 1, None]
+    assert [r.cells[metallic].measured_rank for r in found.rows] == [1, 1, 1]
+    assert fewer(found) == "c (Albedo n = 2)."
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=200), found)
+    for text in (to_markdown(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+        (line,) = (line for line in text.splitlines() if re.match(r"(\| )? ?c ", line))
+        assert line.count("(n = 2)") == 1
+        assert text.count("n = 2") == 1 + (text.count("Albedo n = 2"))
+
+
+def test_a_row_that_answers_one_question_in_full_is_complete() -> None:
+    found = counted({"a": 8, "b": 8}, {"a": 4, "b": 4, "c": 4})
+    assert fewer(found) == ""
+    assert [row(found, "c").cells[i].measured_rank for i, c in enumerate(found.columns) if c.group == "Metallic"] == [1]
+    assert "(n =" not in to_markdown(found)
+
+
+def test_the_n_behind_a_label_is_that_of_no_other_cell() -> None:
+    found = counted({"a": 8, "b": 4}, {"a": 4, "b": 2})
+    assert labels(found) == ["a", "b (n = 4)"]
+    assert to_markdown(found).count("(n = 2)") == 1
+    assert fewer(found) == "b (n = 4, Metallic n = 2)."
+    mixed = counted({"a": 8, "b": 5}, {"a": 4, "b": 4})  # complete in metallic, where n is 4
+    assert labels(mixed) == ["a", "b"]
+    assert fewer(mixed) == "b (Albedo n = 5)."
+
+
+def test_a_row_of_ours_on_a_stated_subset_has_one_n() -> None:
+    stated, silent = (counted({"a": 8, "own": 4}, {"a": 4, "own": 2}, note) for note in ("2 scenes only", ""))
+    assert fewer(stated) == "own (n = 4)."
+    assert "(n = 2)" not in to_markdown(stated)
+    assert "(n = 2)" in to_markdown(silent)
+
+
 def test_a_published_value_worse_than_a_constant_has_a_dagger() -> None:
     index = [column.group for column in TABLES["inverse"].columns].index("Metallic")
     daggers = {r.label: r.cells[index].dagger for r in table().rows if r.cells[index].published is not None}
