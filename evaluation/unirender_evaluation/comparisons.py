@@ -1,7 +1,7 @@
 """Who beats whom: values of two rows, paired by sample, with the interval of their difference."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
@@ -9,6 +9,9 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, Metric, Variant
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import Estimate, beats, paired_difference
+
+AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
+ZERO = 1e-6  # and the absolute one, of values near zero
 
 
 @dataclass(frozen=True)
@@ -53,8 +56,15 @@ def values_of(records: Iterable[Record], method: str, key: str) -> dict[str, flo
     return {record.sample: record.values[key] for record in records if record.method == method and key in record.values}
 
 
+def agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
+    """Whether the values of all keys that both have are one measurement, but for rounding (`AGREEMENT`, `ZERO`)."""
+    return all(math.isclose(a[key], b[key], rel_tol=AGREEMENT, abs_tol=ZERO) for key in a.keys() & b.keys())
+
+
 def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str) -> Comparison:
     """Paired comparison of two methods on the samples they share; `records` is one `Selection`.
+
+    Values that differ by rounding alone on every sample are level, however sure the sign of their difference is.
 
     Raises:
         UnirenderError: if one of the two has no such value, they share no sample, or a difference is not finite.
@@ -66,13 +76,14 @@ def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str)
             raise UnirenderError(f"comparison: {method!r} has no value {key!r}; {known} has")
     clusters = {record.sample: record.object for record in records}
     better = metric.higher_is_better
+    same = agree(values[a], values[b])
     return Comparison(
         a=a,
         b=b,
         key=key,
         difference=paired_difference(values[a], values[b], clusters),
-        a_beats_b=beats(values[a], values[b], higher_is_better=better, clusters=clusters),
-        b_beats_a=beats(values[b], values[a], higher_is_better=better, clusters=clusters),
+        a_beats_b=not same and beats(values[a], values[b], higher_is_better=better, clusters=clusters),
+        b_beats_a=not same and beats(values[b], values[a], higher_is_better=better, clusters=clusters),
     )
 
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.comparisons import agree
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results_data import Results
 from unirender_evaluation.rows import slug
 
-AGREEMENT = 1e-4  # relative difference up to which two files' values of a row are one measurement, on other CPUs
 Sample = tuple[str, str, str, str]  # table, protocol, subset, sample
 
 
@@ -74,7 +74,7 @@ class _Row:
         """Whether another file's row is this one: the same method with the same configuration and values."""
         shared = self.records.keys() & records.keys()
         same = (self.info.key, self.info.kind, self.info.config) == (info.key, info.kind, info.config)
-        return same and all(_agree(self.records[sample].values, records[sample].values) for sample in shared)
+        return same and all(agree(self.records[sample].values, records[sample].values) for sample in shared)
 
 
 def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
@@ -105,10 +105,6 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
     # In the order of a run's own records, on which the bootstrap's draws depend.
     merged.sort(key=lambda r: (r.table, r.protocol, r.method, r.sample))
     return _merged_run([file.run for file in files], methods), merged
-
-
-def _agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
-    return all(math.isclose(a[key], b[key], rel_tol=AGREEMENT, abs_tol=1e-6) for key in a.keys() & b.keys())
 
 
 def _stored(file: Results, name: str) -> str:

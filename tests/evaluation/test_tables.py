@@ -382,3 +382,14 @@ def test_verdicts_pair_by_sample() -> None:
     assert ("sample", "input", "Albedo") in pairs
     with pytest.raises(UnirenderError, match="has no value"):
         compare(chosen, METRICS["mse"], key, "input", "ours")
+
+
+@pytest.mark.parametrize(("by", "verdict"), [(6e-7, "is level with"), (1e-2, "beats")])
+def test_rounding_on_another_machine_beats_nothing(by: float, verdict: str) -> None:
+    key = metric_key("albedo", "psnr")
+    more = [
+        replace(r, method="sample", values={key: r.values[key] + by * (1 + i)}) for i, r in enumerate(inverse("ours"))
+    ]
+    found = compare([*inverse("ours"), *more], METRICS["psnr"], key, "sample", "ours")
+    assert found.difference.low > 0
+    assert found.verdict == verdict
