@@ -76,6 +76,12 @@ class _Row:
         same = (self.info.key, self.info.kind, self.info.config) == (info.key, info.kind, info.config)
         return same and all(agree(self.records[sample].values, records[sample].values) for sample in shared)
 
+    def take(self, records: Mapping[Sample, Record]) -> None:
+        """Adds what another file has of this row; the first file's record and values stay, where both have one."""
+        for sample, record in records.items():
+            own = self.records.get(sample)
+            self.records[sample] = record if own is None else replace(own, values={**record.values, **own.values})
+
 
 def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
     """The description and the records of several runs as if they were one, for `tables.build_tables`.
@@ -98,7 +104,7 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
             if row is None:
                 row = _Row(replace(info, stored=info.stored or _stored(file, name)), name)
                 rows.append(row)
-            row.records = records | row.records  # the first file's, where both have one
+            row.take(records)
     rows = _told_apart(rows)
     methods = tuple(row.info for row in rows)
     merged = [replace(r, method=row.info.key) for row in rows for r in row.records.values()]

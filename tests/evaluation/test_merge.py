@@ -8,6 +8,7 @@ from small_results import METHODS, small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.merge import check_comparable, differences, merge, obstacles
+from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.results_data import Results
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.tables import Table, build_tables
@@ -77,6 +78,20 @@ def test_rivals_of_one_name_stand_side_by_side(by: float) -> None:
     means = [row.cells[0].measured.mean for row in rows if row.cells[0].measured]
     assert means[1] - means[0] == pytest.approx(by)
     assert [row.cells[0].measured_rank for row in rows] == [2, 1]
+
+
+def test_a_value_that_only_one_file_has_is_kept() -> None:
+    """One run had the weights of LPIPS, the other had not: merged either way, the number is there."""
+    lpips = metric_key("albedo", "lpips_alex")
+    plain = small_results("plain.json")
+    more = tuple(replace(r, values={**r.values, lpips: 0.25}) if r.table == "inverse" else r for r in plain.records)
+    rich = changed(replace(plain, records=more, run=replace(plain.run, lpips=("alex",))), 1e-7, "rich.json")
+    for first, second in ((plain, rich), (rich, plain)):
+        run, records = merge([first, second])
+        assert [info.key for info in run.methods] == [info.key for info in METHODS]
+        assert all(lpips in r.values for r in records if r.table == "inverse")
+        first_values = {(r.table, r.method, r.sample): r.values for r in first.records}
+        assert all(r.values | first_values[r.table, r.method, r.sample] == r.values for r in records)
 
 
 def test_another_configuration_is_another_row_and_another_cpus_rounding_is_not() -> None:
