@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import DEFAULT_VARIANT, Metric, Variant
+from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric, Variant
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import Estimate, beats, paired_difference
@@ -54,6 +54,14 @@ class Comparison:
 def values_of(records: Iterable[Record], method: str, key: str) -> dict[str, float]:
     """Sample -> value of a method, for the records that have the metric key."""
     return {record.sample: record.values[key] for record in records if record.method == method and key in record.values}
+
+
+def exact_fit(key: str, value: float) -> bool:
+    """Whether a value, or a mean of values, is infinite because a fitted factor made a picture the truth itself.
+
+    Any constant becomes exact on an object of one colour; such a mean says nothing of the other pictures.
+    """
+    return math.isinf(value) and key.partition("@")[2].split("-")[-1] in SCALES[1:]
 
 
 def agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
+from unirender_evaluation.comparisons import Comparison, Selection, compare, exact_fit, values_of
 from unirender_evaluation.metrics import Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results_data import Results
@@ -126,7 +126,8 @@ def compare_pair(
 
 
 def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, method: str) -> Rank | None:
-    """A row's rank in its own run; None for a bound, and for a row on fewer samples than the fullest one.
+    """A row's rank in its own run; None for a bound, for a row on fewer samples than the fullest one, and for an
+    `exact_fit`.
 
     Args:
         records: of one `Selection`.
@@ -138,7 +139,7 @@ def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, meth
     values = {info.key: values_of(records, info.key, key) for info in run.methods}
     fullest = max(map(len, values.values()), default=0)
     competing = [info.key for info in run.methods if info.kind in RANKED_KINDS and len(values[info.key]) == fullest > 0]
-    means = {row: sum(values[row].values()) / fullest for row in competing}
+    means = {row: mean for row in competing if not exact_fit(key, mean := sum(values[row].values()) / fullest)}
     if method not in means:
         return None
     rounded = {row: round(mean, metric.decimals) for row, mean in means.items()}

@@ -10,14 +10,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import Selection, values_of
+from unirender_evaluation.comparisons import Selection, exact_fit, values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.protocol import protocol_line
 from unirender_evaluation.published import PublishedRow, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
 from unirender_evaluation.statistics import Estimate, bootstrap_mean
-from unirender_evaluation.table_counts import label_n, printed_counts, short_cells
+from unirender_evaluation.table_counts import short_cells
+from unirender_evaluation.table_notes import table_notes
 
 OTHER_AXES = {"linear": "linear light", "aligned": "scale-aligned", "aligned_rgb": "scale-aligned per channel"}
 RANKED_KINDS = ("ours", "paper", "optimisation", "baseline", "external", "trivial")  # bounds are no competitors
@@ -124,7 +125,7 @@ def build_table(
     measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
     rows = _merge(published_tables().get(spec.name, ()) if show_published else (), spec, measured)
     total = max((row.n for row in rows), default=0)
-    rows = _rank(spec, rows)
+    rows = _rank(spec, rows, variant)
     return Table(
         name=spec.name,
         title=spec.title,
@@ -135,7 +136,7 @@ def build_table(
         columns=spec.columns,
         rows=tuple(rows),
         protocol=protocol_line(declared, variant, run, methods, chosen, show_published),
-        notes=_notes(spec, rows),
+        notes=table_notes(spec, chosen, rows, variant),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
     )
@@ -222,8 +223,10 @@ def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping
     return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))
 
 
-def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
-    """Ranks 1 and 2 per column on rounded values; a cell on fewer samples than the column's fullest is not ranked."""
+def _rank(spec: TableSpec, rows: Sequence[Row], variant: Variant) -> list[Row]:
+    """Ranks 1 and 2 per column on rounded values; a cell on fewer samples than the column's fullest is not ranked, nor
+    is one that is infinite by a fit.
+    """
     short = [short_cells(rows, row) for row in rows]
     ranked = [list(row.cells) for row in rows]
     for i, column in enumerate(spec.columns):
@@ -231,6 +234,7 @@ def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
         published = {r: cell.published for r, cell in enumerate(cells) if cell.published is not None}
         means = {r: cell.measured.mean for r, cell in enumerate(cells) if cell.measured is not None}
         competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and i not in short[r]}
+        competing = {r: mean for r, mean in competing.items() if not exact_fit(column.key(variant), mean)}
         published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
         trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
         grid = column.uniform_grid  # comparable only where the suite's materials are distributed like the paper's
@@ -252,35 +256,3 @@ def _ranks(values: Mapping[int, float], metric: Metric) -> dict[int, int]:
     rounded = {r: round(value, metric.decimals) for r, value in values.items()}
     order = sorted(set(rounded.values()), reverse=metric.higher_is_better)
     return {r: order.index(value) + 1 for r, value in rounded.items() if value in order[:2]}
-
-
-def _notes(spec: TableSpec, rows: Sequence[Row]) -> tuple[str, ...]:
-    notes = [spec.description] if spec.description else []
-    notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
-    fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
-    if fewer:
-        notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
-    if any(cell.dagger for row in rows for cell in row.cells):
-        notes.append(
-            "† The published value is worse than the constant 0.5, measured on materials distributed as in the paper."
-        )
-    if any(cell.unavailable for row in rows for cell in row.cells):
-        notes.append(
-            "n/a: the weights of this LPIPS backbone are not on this machine; "
-            "`python -m unirender_evaluation.lpips_convert vgg` fetches and converts them."
-        )
-    origins = dict.fromkeys(row.stored for row in rows if row.stored)
-    stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
-    return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))
-
-
-def _counts_said(spec: TableSpec, rows: Sequence[Row], row: Row) -> str:
-    """On how many samples a row's cells stand that are on fewer than others: that behind its label, then others."""
-    label, columns = label_n(rows, row), spec.columns
-    others: dict[str, set[int]] = {}
-    for i, n in printed_counts(rows, row).items():
-        others.setdefault(columns[i].group, set()).add(n)
-    found = [] if label is None else [f"n = {label}"]
-    for group, counts in others.items():
-        found.append(f"{group} n = {' and '.join(map(str, sorted(counts)))}")
-    return ", ".join(found)

@@ -178,6 +178,17 @@ def test_ranks_are_on_rounded_means_of_rows_on_all_samples() -> None:
     assert rank(close, results.run, METRICS["psnr"], KEY, "input-as-albedo") == Rank(1, 2)
 
 
+def test_an_exact_fit_has_no_rank() -> None:
+    results = small_results()
+    key = KEY.replace("raw", "aligned")
+    inf = {"input-as-albedo": math.inf}
+    fits = [
+        replace(r, values={k: inf.get(r.method, 20.0) for k in (key, KEY)}) for r in results.records if KEY in r.values
+    ]
+    ranked = [rank(fits, results.run, METRICS["psnr"], k, m) for k in (key, KEY) for m in ("ours-mean", *inf)]
+    assert ranked == [Rank(1, 1), None, Rank(2, 2), Rank(1, 2)]
+
+
 def test_identical_pictures_are_not_compared_and_rows_without_a_common_name_are_named() -> None:
     a = small_results()
     exact = replace(a, records=tuple(replace(r, values={KEY: math.inf}) for r in a.records if r.table == "inverse"))

@@ -393,3 +393,19 @@ def test_rounding_on_another_machine_beats_nothing(by: float, verdict: str) -> N
     found = compare([*inverse("ours"), *more], METRICS["psnr"], key, "sample", "ours")
     assert found.difference.low > 0
     assert found.verdict == verdict
+
+
+@pytest.mark.parametrize(("scale", "ranks"), [("aligned_rgb", [1, None, 2]), ("raw", [2, 1, None])])
+def test_an_exact_fit_is_not_ranked_and_is_counted(scale: str, ranks: list[int | None]) -> None:
+    variant = Variant(scale=scale)  # type: ignore[arg-type]  # one of the scales
+    levels = {"ours": [21.0] * 4, "constant": [math.inf, 12.0, math.inf, 12.0], "input": [12.0] * 4}
+    records = [
+        Record("inverse", "single-image", method, f"s{i}", f"o{i}", {metric_key("albedo", "psnr", variant): value})
+        for method, values in levels.items()
+        for i, value in enumerate(values)
+    ]
+    found = build_table(TABLES["inverse"], records, RUN, protocol="single-image", variant=variant)
+    assert [r.cells[0].measured_rank for r in found.rows] == ranks
+    assert "| Constant 0.5 | " in (text := to_markdown(found))
+    assert "∞" in text
+    assert ("Constant 0.5 (Albedo PSNR: 2 of 4 samples)" in text) == (scale != "raw")
