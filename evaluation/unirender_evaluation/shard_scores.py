@@ -13,7 +13,9 @@ import numpy as np
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.intrinsics import Intrinsics
+from unirender.training.calibrate import object_of
 from unirender.training.data import GroupDataset
+from unirender.training.groups import Pair
 from unirender_evaluation.methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
@@ -41,7 +43,7 @@ class Scored:
 
     Attributes:
         folder: it is from.
-        group: its key there; a group is one object.
+        group: its key there; an object may have several.
         metallic: of the object; None: it has a map.
         scores: by metric.
     """
@@ -50,6 +52,11 @@ class Scored:
     group: str
     metallic: float | None
     scores: dict[str, float]
+
+    @property
+    def object(self) -> str:
+        """Of the group: what intervals draw, since its pictures are not independent."""
+        return object_of(self.group)
 
 
 def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int, renders: bool = False) -> Iterator[Scored]:
@@ -67,19 +74,24 @@ def scored(pipeline: Any, folder: Path, objects: int, pairs: int, seed: int, ren
         UnirenderError: no usable shards.
     """
     data, rng = GroupDataset(folder), np.random.default_rng(seed)
-    for group in sorted(rng.permutation(len(data.keys))[:objects].tolist()):
-        stored = data.pairs(group)
+    pictures: dict[str, list[tuple[int, Pair]]] = {}  # of each object
+    for group, key in enumerate(data.keys):
+        pictures.setdefault(object_of(key), []).extend((group, pair) for pair in data.pairs(group))
+    of_object = list(pictures.values())
+    for number in sorted(rng.permutation(len(of_object))[:objects].tolist()):
+        stored = of_object[number]
         for index in sorted(rng.permutation(len(stored))[:pairs].tolist()):
-            image, truth = data.stored(group, stored[index])
+            group, pair = stored[index]
+            image, truth = data.stored(group, pair)
             assert truth.mask is not None, "every group has one"
             display = np.clip(image_srgb(unpremultiply(image, truth.mask)), 0, 1)
             seen = (np.round(display * 255) / 255).astype(np.float32)
             found: Intrinsics = pipeline.decompose(seen, mask=truth.mask).intrinsics
             values = score_maps(found.replace(mask=None), truth)
             if renders:
-                whole = truth.replace(environment=data.whole_light(group, stored[index]))
+                whole = truth.replace(environment=data.whole_light(group, pair))
                 values |= _render_scores(pipeline, image, whole)
-            yield Scored(str(folder), data.keys[group], stored[index].metallic, values)
+            yield Scored(str(folder), data.keys[group], pair.metallic, values)
 
 
 def _render_scores(pipeline: Any, image: np.ndarray, truth: Intrinsics) -> dict[str, float]:
@@ -145,7 +157,7 @@ def _row(name: str, found: Sequence[Scored], columns: Mapping[str, tuple[str, in
         if not with_value:
             cells.append("-")
             continue
-        mean = bootstrap_mean([one.scores[key] for one in with_value], [one.group for one in with_value])
+        mean = bootstrap_mean([one.scores[key] for one in with_value], [one.object for one in with_value])
         interval = "" if np.isnan(mean.half_width) else f" ± {mean.half_width:.{decimals}f}"
         cells.append(f"{mean.mean:.{decimals}f}{interval}")
-    return (name, str(len({one.group for one in found})), str(len(found)), *cells)
+    return (name, str(len({one.object for one in found})), str(len(found)), *cells)
