@@ -268,7 +268,14 @@ def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] 
     from unirender_evaluation.suites import load_suite  # what runs need, a report alone does not
 
     run, records, tables = read_results(folder, variants)
-    loaded = load_suite(suite or run.suite)
+    try:
+        loaded = load_suite(suite or run.suite)
+    except UnirenderError as error:
+        if suite is not None:
+            raise
+        raise UnirenderError(
+            f"{error}; if the run in {folder} scored a suite of your own, give it with --suite"
+        ) from error
     if loaded.sha256 != run.suite_hash:
         raise UnirenderError(
             f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
