@@ -39,6 +39,6 @@ def cell_counts(rows: Sequence["Row"], row: "Row") -> dict[int, int]:
 
 
 def printed_counts(rows: Sequence["Row"], row: "Row") -> dict[int, int]:
-    """`cell_counts` but of rows whose note states their subset: what tables of text print beside a number."""
-    stated = row.info is not None and row.info.kind != "external" and bool(row.info.note)
+    """`cell_counts` but of our rows whose note says on which scenes they ran: what tables of text print by a number."""
+    stated = row.info is not None and row.info.kind != "external" and "scene" in row.info.note
     return {} if stated else cell_counts(rows, row)

@@ -234,9 +234,9 @@ def test_a_report_is_made_again_from_its_folder(tmp_path: Path) -> None:
         rebuild(tmp_path / "nothing")
     write_run(tmp_path / "run.json", run)
     write_records(tmp_path / "records.jsonl", records())
-    with pytest.raises(UnirenderError, match=f"no suite '{suite.spec.name}'.*path of a .toml file.* with --suite$"):
+    with pytest.raises(UnirenderError, match=rf"no suite '{suite.spec.name}'.*path of a \.toml file.* with --suite$"):
         rebuild(tmp_path)
-    with pytest.raises(UnirenderError, match="no suite 'other'.*file$"):
+    with pytest.raises(UnirenderError, match=r"no suite 'other'.*file$"):
         rebuild(tmp_path, "other")
     assert rebuild(tmp_path, str(suite.spec.path)) == tmp_path / "report.html"
     assert "<table class" in (tmp_path / "report.html").read_text(encoding="utf-8")
