@@ -2,8 +2,7 @@
 
 A cell on fewer samples than the fullest row of its column is *short*: it is not ranked, and its n is printed. A row
 whose cells are all short has the n of the fullest of them behind its label; the other short cells have their own beside
-the number. A row of the benchmark's own that runs on a stated subset says which in its note, so that what its label
-does not count, as half as many edits of metallic as of roughness, is not said again in every cell.
+the number, unless they are the same share of their columns.
 """
 
 from collections.abc import Sequence
@@ -33,12 +32,12 @@ def label_n(rows: Sequence["Row"], row: "Row") -> int | None:
 
 
 def cell_counts(rows: Sequence["Row"], row: "Row") -> dict[int, int]:
-    """Column -> n of the short cells whose n is not the one behind the row's label."""
+    """Column -> n of the short cells of which the row's label does not say it.
+
+    It says so of a cell on its own n, and of one on the same share of its column, as where a row ran on a third of the
+    scenes, and a column asks half as much of each.
+    """
     label = label_n(rows, row)
-    return {i: n for i, n in short_cells(rows, row).items() if n != label}
-
-
-def printed_counts(rows: Sequence["Row"], row: "Row") -> dict[int, int]:
-    """`cell_counts` but of our rows whose note says on which scenes they ran: what tables of text print by a number."""
-    stated = row.info is not None and row.info.kind != "external" and "scene" in row.info.note
-    return {} if stated else cell_counts(rows, row)
+    whole = max((fullest(rows, i) for i in range(len(row.cells))), default=0)
+    short = short_cells(rows, row).items()
+    return {i: n for i, n in short if label is None or (n != label and n * whole != label * fullest(rows, i))}

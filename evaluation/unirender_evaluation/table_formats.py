@@ -21,7 +21,7 @@ from rich.table import Table as RichTable
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate
-from unirender_evaluation.table_counts import label_n, printed_counts
+from unirender_evaluation.table_counts import cell_counts, label_n
 from unirender_evaluation.tables import Cell, Row, Table
 
 MISSING, NOT_AVAILABLE = "-", "n/a"
@@ -74,7 +74,7 @@ def to_markdown(table: Table) -> str:
     lines += [f"> **{table.watermark}**", ""] if table.watermark else []
     lines += [_pipe(titles), _pipe(marks)]
     for row in table.rows:
-        texts, counts = [row_label(row, table)], printed_counts(table.rows, row)
+        texts, counts = [row_label(row, table)], cell_counts(table.rows, row)
         for i, (column, cell, doubled) in enumerate(_cells(row, table)):
             digits = column.metric.decimals
             if doubled:
@@ -169,7 +169,7 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
         if section is not None and row.section != section:
             rich_table.add_section()
         section = row.section
-        texts, counts = [escape(row_label(row, table))], printed_counts(table.rows, row)
+        texts, counts = [escape(row_label(row, table))], cell_counts(table.rows, row)
         for i in indices:
             cell, digits = row.cells[i], table.columns[i].metric.decimals
             if table.published_columns[i]:
@@ -222,7 +222,7 @@ def _cells(row: Row, table: Table) -> Iterator[tuple[Column, Cell, bool]]:
 
 
 def _latex_cells(row: Row, table: Table) -> list[str]:
-    texts, counts = [_tex(row_label(row, table))], printed_counts(table.rows, row)
+    texts, counts = [_tex(row_label(row, table))], cell_counts(table.rows, row)
     for i, (column, cell, doubled) in enumerate(_cells(row, table)):
         digits = column.metric.decimals
         if doubled:

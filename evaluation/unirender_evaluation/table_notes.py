@@ -8,7 +8,7 @@ from unirender_evaluation.comparisons import exact_fit, values_of
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import TableSpec
-from unirender_evaluation.table_counts import label_n, printed_counts
+from unirender_evaluation.table_counts import cell_counts, label_n
 
 if TYPE_CHECKING:
     from unirender_evaluation.tables import Row
@@ -47,7 +47,7 @@ def _counts_said(spec: TableSpec, rows: Sequence["Row"], row: "Row") -> str:
     """On how many samples a row's cells stand that are on fewer than others: that behind its label, then others."""
     label, columns = label_n(rows, row), spec.columns
     others: dict[str, set[int]] = {}
-    for i, n in printed_counts(rows, row).items():
+    for i, n in cell_counts(rows, row).items():
         others.setdefault(columns[i].group, set()).add(n)
     found = [] if label is None else [f"n = {label}"]
     for group, counts in others.items():
