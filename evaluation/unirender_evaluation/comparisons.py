@@ -12,6 +12,7 @@ from unirender_evaluation.statistics import Estimate, beats, paired_difference
 
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
 ZERO = 1e-6  # and the absolute one, of values near zero
+ROUNDING = 1e-5  # relative difference of two rows' values that decides nothing, far below the last printed digit
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,16 @@ def agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
     return all(math.isclose(a[key], b[key], rel_tol=AGREEMENT, abs_tol=ZERO) for key in a.keys() & b.keys())
 
 
+def without_rounding(a: Mapping[str, float], b: Mapping[str, float]) -> dict[str, float]:
+    """b with the values of a where the two differ by rounding alone (`ROUNDING`), so that their difference is 0."""
+    shared = {key for key in a.keys() & b.keys() if math.isclose(a[key], b[key], rel_tol=ROUNDING, abs_tol=ROUNDING**2)}
+    return {key: a[key] if key in shared else value for key, value in b.items()}
+
+
 def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str) -> Comparison:
     """Paired comparison of two methods on the samples they share; `records` is one `Selection`.
 
-    Values that differ by rounding alone on every sample are level, however sure the sign of their difference is.
+    Values of a sample that differ by rounding alone count as equal in the verdict, however sure the sign is.
 
     Raises:
         UnirenderError: if one of the two has no such value, they share no sample, or a difference is not finite.
@@ -84,14 +91,14 @@ def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str)
             raise UnirenderError(f"comparison: {method!r} has no value {key!r}; {known} has")
     clusters = {record.sample: record.object for record in records}
     better = metric.higher_is_better
-    same = agree(values[a], values[b])
+    settled = without_rounding(values[a], values[b])
     return Comparison(
         a=a,
         b=b,
         key=key,
         difference=paired_difference(values[a], values[b], clusters),
-        a_beats_b=not same and beats(values[a], values[b], higher_is_better=better, clusters=clusters),
-        b_beats_a=not same and beats(values[b], values[a], higher_is_better=better, clusters=clusters),
+        a_beats_b=beats(values[a], settled, higher_is_better=better, clusters=clusters),
+        b_beats_a=beats(settled, values[a], higher_is_better=better, clusters=clusters),
     )
 
 

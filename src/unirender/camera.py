@@ -5,7 +5,6 @@ Camera axes: +x right, +y up, +z towards the viewer; the camera sits at the orig
 
 import math
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
 
@@ -33,10 +32,13 @@ class Camera:
     principal: tuple[float, float] = (0.5, 0.5)
 
     def __post_init__(self) -> None:
-        principal = self.principal if isinstance(self.principal, Sequence) else (None,)
+        try:
+            principal = tuple(self.principal)
+        except TypeError:
+            principal = (None,)
         if not all(isinstance(number, Real) for number in (self.fov_deg, *principal)):
             raise UnirenderError(f"camera: got {self}, expected numbers, like {Camera()}")
-        object.__setattr__(self, "principal", tuple(principal))  # a list would have no hash
+        object.__setattr__(self, "principal", principal)  # a list would have no hash
         if not 0.0 < self.fov_deg < 180.0:
             raise UnirenderError(
                 f"field of view: got {self.fov_deg} degrees, expected a vertical angle between 0 and 180; pass --fov"

@@ -215,15 +215,11 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
     Exits with 0, 1 (failure), 2 (usage), 130 (interrupted), 141 (who read its output left: `unirender ... | head`), 143
-    (SIGTERM) or 129 (SIGHUP).
+    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv
     command = None
-    if argv is None:
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) == signal.SIG_DFL:  # nohup has the second ignored
-                signal.signal(number, end)
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
     try:
@@ -231,6 +227,10 @@ def main(argv: list[str] | None = None) -> None:
             print(f"unirender {importlib.metadata.version('unirender')}", flush=True)
             sys.exit(0)
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
+        if argv is None and isinstance(command, MODEL):
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) == signal.SIG_DFL:  # nohup has the second ignored
+                    signal.signal(number, end)
         with quick_start() if argv is None and isinstance(command, MODEL) else contextlib.nullcontext():
             status = run(command)
         sys.stdout.flush()
@@ -239,7 +239,8 @@ def main(argv: list[str] | None = None) -> None:
             drop_output()
             status = READER_LEFT
         elif interrupted(error):
-            notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
+            with contextlib.suppress(OSError):  # a terminal that has closed
+                notice("interrupted" + ("; run the same command again to go on" if resumes(command) else ""))
             status = 128 + next((cause.args[0] for cause in causes(error) if isinstance(cause, Ended)), signal.SIGINT)
         elif os.environ.get("UNIRENDER_DEBUG"):
             raise
@@ -251,11 +252,15 @@ def main(argv: list[str] | None = None) -> None:
 
 
 def end(number: int, frame: FrameType | None) -> None:
-    """Asked to stop by a batch system or a terminal that closes, a command ends as when it is interrupted.
+    """Asked to stop by a batch system or a terminal that closes, a command of the model ends as when it is interrupted.
+
+    Others resume by what they have written, and end at once.
 
     Raises:
         Ended: always.
     """
+    for each in (signal.SIGTERM, signal.SIGHUP):  # `timeout` sends it to the process and to its group
+        signal.signal(each, signal.SIG_IGN)
     raise Ended(number)
 
 

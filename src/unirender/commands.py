@@ -158,7 +158,7 @@ class Render:
         check_exposure(self.exposure)
         if self.exposure is not None and self.environment is None:
             raise UsageError(f"--exposure {self.exposure:g} is of a new light: expected --environment beside it")
-        intrinsics = read_result(self.maps, self.model.fov)
+        intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
             if self.environment is not None:

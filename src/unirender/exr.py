@@ -138,11 +138,13 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
         ) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
-    stored, shown = (tuple(int(x) for x in header[window][0]) for window in ("dataWindow", "displayWindow"))
+    stored, shown = (
+        tuple(tuple(int(x) for x in corner) for corner in header[window]) for window in ("dataWindow", "displayWindow")
+    )
     if stored != shown:
         raise UnirenderError(
-            f"{name}: the pixels begin at {stored} (dataWindow) and the picture at {shown} (displayWindow), expected "
-            "both at the same place; save the whole picture"
+            f"{name}: the pixels cover {stored} (dataWindow) and the picture {shown} (displayWindow), from the first "
+            "pixel to the last, expected the same; save the whole picture"
         )
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
     return channels, attributes

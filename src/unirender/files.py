@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -69,12 +70,14 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
             raise UnirenderError(
                 f"{shown}: has no {META_FILE}, expected an earlier result to overwrite; choose another folder"
             )
+    # Its name comes first: a signal may arrive between the folder and who would take it back.
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    except OSError as error:
-        raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
-    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.mkdir(mode=0o700)
+        except OSError as error:
+            raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
         yield temporary
         os.chmod(temporary, 0o755)
         try:
@@ -248,7 +251,7 @@ def checkpoint_sha256(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
+def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool = True) -> Intrinsics:
     """The maps of a result folder, or those of one EXR file, which then come without the environment.
 
     The camera is that of the folder's `meta.json`, else that of the EXR header, else the contract's default, which is
@@ -257,6 +260,7 @@ def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
     Args:
         path: the folder or the EXR file.
         fov_deg: instead of the field of view that is stored.
+        light: whether the folder's environment is wanted; else it is not looked at.
 
     Raises:
         UnirenderError: there is nothing of the kind, or a file is broken.
@@ -271,7 +275,7 @@ def read_result(path: str | Path, fov_deg: float | None = None) -> Intrinsics:
     environment, camera = None, None
     if path.is_dir():
         camera = _camera_of_meta(path / META_FILE)
-        if (path / ENVIRONMENT_FILE).is_file():
+        if light and (path / ENVIRONMENT_FILE).is_file():
             environment = _read_environment(path / ENVIRONMENT_FILE)
     try:
         if camera is None and CAMERA_ATTRIBUTE in attributes:

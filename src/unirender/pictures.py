@@ -82,8 +82,8 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     """
     if not (mask > 0.5).any():
         raise UnirenderError(
-            f"{name}: the mask is empty: no pixel is covered by more than half, expected white (or opaque) pixels on the "
-            "object"
+            f"{name}: the mask is empty: no pixel is covered by more than half, expected white (or opaque) pixels "
+            "on the object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
 

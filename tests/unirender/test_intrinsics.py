@@ -112,21 +112,20 @@ def test_broken_and_multipart_files_give_one_line(tmp_path: Path) -> None:
         read_exr(tmp_path / "two.exr")
 
 
-def test_pixels_that_begin_elsewhere_than_the_picture_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shown", [((0, 2), (3, 5)), ((2, 0), (5, 3)), ((2, 2), (5, 7)), ((2, 2), (7, 5))])
+def test_pixels_that_cover_another_part_than_the_picture_are_refused(shown: tuple, tmp_path: Path) -> None:
     """A crop read as the whole would lie in the wrong place; both windows moved alike are the whole."""
 
-    def write(stored: int, shown: int) -> Path:
-        header = {
-            name: (np.array([low, low], np.int32), np.array([low + 3, low + 3], np.int32))
-            for name, low in (("dataWindow", stored), ("displayWindow", shown))
-        }
+    def write(shown: tuple) -> Path:
+        corners = {"dataWindow": ((2, 2), (5, 5)), "displayWindow": shown}
+        header = {name: tuple(np.array(corner, np.int32) for corner in two) for name, two in corners.items()}
         pixels = {"roughness.Y": np.full((4, 4), 0.5, np.float32)}
         OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, pixels).write(str(tmp_path / "moved.exr"))
         return tmp_path / "moved.exr"
 
-    with pytest.raises(UnirenderError, match=r"moved.exr: the pixels begin at \(2, 2\) .* the picture at \(0, 0\)"):
-        read_exr(write(2, 0))
-    assert read_exr(write(2, 2))[0]["roughness.Y"].shape == (4, 4)
+    with pytest.raises(UnirenderError, match=r"moved.exr: the pixels cover \(\(2, 2\), \(5, 5\)\) .* the picture \(\("):
+        read_exr(write(shown))
+    assert read_exr(write(((2, 2), (5, 5))))[0]["roughness.Y"].shape == (4, 4)
 
 
 def test_a_map_with_some_of_its_channels_is_refused() -> None:

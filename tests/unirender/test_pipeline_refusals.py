@@ -122,11 +122,23 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
     ("made", "words"),
     [
         (lambda config: DDIMScheduler(), "got a DDIMScheduler with prediction_type 'epsilon', expected 'sample'"),
-        (EulerDiscreteScheduler.from_config, "got EulerDiscreteScheduler, expected one without noise of its own"),
-        (DDPMScheduler.from_config, "got DDPMScheduler, expected one without"),
+        (EulerDiscreteScheduler.from_config, "got EulerDiscreteScheduler, expected one of DDIMScheduler"),
+        (DDPMScheduler.from_config, "got .*DDPMScheduler"),
         (
             lambda config: DPMSolverMultistepScheduler.from_config(config, algorithm_type="sde-dpmsolver++"),
-            "got DPMSolverMultistepScheduler, expected one without",
+            "got DPMSolverMultistepScheduler, expected one of",
+        ),
+        (
+            lambda config: DDIMScheduler(prediction_type="sample"),
+            "got a DDIMScheduler with clip_.*leading",
+        ),
+        (
+            lambda config: DDIMScheduler.from_config(config, clip_sample=True),
+            "got a DDIMScheduler with clip_",
+        ),
+        (
+            lambda config: DDIMScheduler.from_config(config, rescale_betas_zero_snr=False, trained_betas=None),
+            "got a DDIMScheduler with rescale_betas_zero_snr=False",
         ),
     ],
 )

@@ -86,7 +86,7 @@ def read_normals(path: Path, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarr
         UnirenderError: the file has no normals, or they are of another size, or some inside the mask have no length.
     """
     if path.is_dir() or path.suffix.lower() == ".exr":
-        normal = read_result(path, fov_deg=DEFAULT_FOV_DEG).normal
+        normal = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False).normal
         if normal is None:
             raise UnirenderError(f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z")
     else:

@@ -33,7 +33,13 @@ NUM_SAMPLES = 5
 MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timestep 0, where nothing is left to do
 
 PREDICTION_TYPE = "sample"  # diffusers' name of x0
-SCHEDULERS = ("DDIMScheduler", "UniPCMultistepScheduler", "DPMSolverMultistepScheduler")  # the last without sde
+NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
+CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
+OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
+SCHEDULERS = (
+    *("DDIMScheduler", "DDIMParallelScheduler"),
+    *("UniPCMultistepScheduler", "DPMSolverMultistepScheduler"),  # the last without sde
+)
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 Cameras = Camera | Sequence[Camera] | None
@@ -85,19 +91,29 @@ def check_scheduler(scheduler: Any) -> None:
     """Looks whether several steps can be taken with a scheduler: any other would give wrong maps without a word.
 
     Raises:
-        UnirenderError: it takes what the network predicts, x0, for something else; or it draws noise of its own, which
-            no seed would fix, or wants its input scaled.
+        UnirenderError: it takes what the network predicts, x0, for something else, or changes it; its noise schedule is
+            not the network's, which ends in noise alone; or it is of another kind, which may draw noise of its own,
+            that no seed would fix, or want its input scaled.
     """
-    name, config = type(scheduler).__name__, scheduler.config
+    name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
+    kinds = {base.__name__ for base in type(scheduler).__mro__}
+    if kinds.isdisjoint(SCHEDULERS) or "sde" in (config.get("algorithm_type") or ""):
+        raise UnirenderError(
+            f"scheduler: got {name}, expected one of {', '.join(SCHEDULERS)} (not of sde): others draw noise of their "
+            "own or scale their input"
+        )
+    advice = f"make it by {name}.from_config of the config of the checkpoint's own"
     if config.get("prediction_type") != PREDICTION_TYPE:
         raise UnirenderError(
             f"scheduler: got a {name} with prediction_type {config.get('prediction_type')!r}, expected "
-            f"{PREDICTION_TYPE!r}, which the network predicts; make it by {name}.from_config(pipeline.scheduler.config)"
+            f"{PREDICTION_TYPE!r}, which the network predicts; {advice}"
         )
-    if name not in SCHEDULERS or "sde" in config.get("algorithm_type", ""):
-        raise UnirenderError(
-            f"scheduler: got {name}, expected one without noise of its own or a scaled input: {', '.join(SCHEDULERS)}"
-        )
+    wrong = [key for key in (*CHANGING_X0, *OTHER_NOISE, "use_lu_lambdas") if config.get(key)]
+    wrong += [] if config.get("timestep_spacing") == "trailing" else ["timestep_spacing"]
+    wrong += [] if float(scheduler.alphas_cumprod[-1]) < NO_SIGNAL else ["rescale_betas_zero_snr"]
+    if wrong:
+        got = ", ".join(f"{key}={config.get(key)!r}" for key in wrong)
+        raise UnirenderError(f"scheduler: got a {name} with {got}, unlike what the network was trained with; {advice}")
 
 
 def sampler_name(scheduler: Any) -> str:

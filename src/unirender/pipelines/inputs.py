@@ -174,7 +174,7 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
 def _numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     try:
         return np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's
         raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
 
 

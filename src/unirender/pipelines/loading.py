@@ -6,13 +6,14 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
-from diffusers.models.modeling_utils import ModelMixin
-from diffusers.pipelines.pipeline_utils import DiffusionPipeline
+import torch
+from safetensors import SafetensorError, safe_open
 
 from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, shipped_names
 
 INDEX_FILE = "model_index.json"
+OF_FILES = (OSError, SafetensorError, json.JSONDecodeError)
 
 
 def find_pipeline(checkpoint: str | Path | None) -> Path:
@@ -47,29 +48,34 @@ def reading(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # diffusers and safetensors raise half a dozen kinds for a broken file
         cause = textwrap.shorten(str(error), 300).rstrip(".") or type(error).__name__
-        raise UnirenderError(
-            f"{path}: cannot be read as a checkpoint ({cause}); if the files are damaged, copy the folder again"
-        ) from error
+        advice = "; if the files are damaged, copy the folder again" if isinstance(error, OF_FILES) else ""
+        raise UnirenderError(f"{path}: cannot be read as a checkpoint ({cause}){advice}") from error
 
 
-def check_complete(pipeline: DiffusionPipeline) -> None:
-    """Of weights that the file lacks diffusers only warns; it leaves them without values.
+def check_complete(model: torch.nn.Module, folder: Path) -> None:
+    """Of weights that the files lack diffusers only warns, and leaves them as they are made, or without values.
+
+    Args:
+        model: as it was read.
+        folder: with its weights as safetensors, in one file or several.
 
     Raises:
-        ValueError: there are such weights.
+        UnirenderError: there are such weights.
     """
-    for name, part in pipeline.components.items():
-        if not isinstance(part, ModelMixin):
-            continue
-        missing = sorted(key for key, value in part.state_dict().items() if value.is_meta)
-        if missing:
-            raise ValueError(f"{len(missing)} weights of {name} are missing, the first is {missing[0]}")
+    stored: set[str] = set()
+    for file in folder.glob("*.safetensors"):
+        with safe_open(file, framework="pt") as weights:
+            stored.update(weights.keys())
+    if missing := sorted(model.state_dict().keys() - stored):
+        raise UnirenderError(
+            f"{folder}: {len(missing)} weights are missing, the first is {missing[0]}; copy the folder again"
+        )
 
 
 def _check_index(file: Path) -> None:
     try:
         index = json.loads(file.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from error
+        raise OSError(f"{file.name}: {error}") from error
     if not isinstance(index, dict):
-        raise ValueError(f"{file.name}: got {type(index).__name__}, expected a JSON object")
+        raise OSError(f"{file.name}: got {type(index).__name__}, expected a JSON object")

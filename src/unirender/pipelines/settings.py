@@ -1,12 +1,13 @@
 """How the network is asked: the mode, and what follows from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any
 
 import torch
 
+from unirender.camera import Camera
 from unirender.diffusion.sampling import NUM_SAMPLES, Generators, steps_of
 from unirender.errors import UnirenderError
 
@@ -77,6 +78,23 @@ class Sampling:
         own = self.generators(1)
         own = own[0] if isinstance(own, Sequence) else own
         return int(torch.randint(0, 2**62, (), generator=own, device=own.device if own is not None else "cpu"))
+
+
+def list_cameras(cameras: Any, count: int) -> list[Camera]:
+    """One camera for each picture.
+
+    Args:
+        cameras: one for all, one for each, or None for the contract's default.
+        count: of pictures.
+
+    Raises:
+        UnirenderError: something is no camera.
+    """
+    each = list(cameras) if isinstance(cameras, Iterable) else [Camera() if cameras is None else cameras] * count
+    for camera in each:
+        if not isinstance(camera, Camera):
+            raise UnirenderError(f"camera: got {camera!r}, expected a unirender.camera.Camera, like {Camera()}")
+    return each
 
 
 def check_settings(sampling: Mapping[str, Any]) -> None:

@@ -45,7 +45,7 @@ from unirender.pipelines.loading import check_complete, find_pipeline, reading
 from unirender.pipelines.network import Network, Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
-from unirender.pipelines.settings import Sampling, check_settings, same_noise
+from unirender.pipelines.settings import Sampling, check_settings, list_cameras, same_noise
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
@@ -99,7 +99,8 @@ class UniRenderPipeline(DiffusionPipeline):
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
         with reading(path):
             pipeline = super().from_pretrained(str(path), **kwargs)
-            check_complete(pipeline)
+        if "dual_stream" not in kwargs:
+            check_complete(pipeline.dual_stream, path / "dual_stream")
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline
@@ -135,8 +136,8 @@ class UniRenderPipeline(DiffusionPipeline):
         """Inverse rendering.
 
         Args:
-            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (whose EXIF orientation is not
-                looked at).
+            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (its EXIF orientation is
+                not looked at).
             mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
@@ -208,10 +209,7 @@ class UniRenderPipeline(DiffusionPipeline):
         """
         images_srgb = list(images_srgb)
         masks = [None] * len(images_srgb) if masks is None else list(masks)
-        cameras = [cameras or Camera()] * len(images_srgb) if not isinstance(cameras, Sequence) else cameras
-        for camera in cameras:
-            if not isinstance(camera, Camera):
-                raise UnirenderError(f"camera: got {camera!r}, expected a unirender.camera.Camera, like {Camera()}")
+        cameras = list_cameras(cameras, len(images_srgb))
         if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
             raise UnirenderError(
                 f"decompose: got {len(images_srgb)} pictures, {len(masks)} masks and {len(cameras)} cameras, expected "
