@@ -114,8 +114,8 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
 
     Raises:
-        UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels that begin elsewhere
-            than its picture does.
+        UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels of another part
+            than its picture.
     """
     path = Path(path)
     try:

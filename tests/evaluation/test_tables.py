@@ -395,6 +395,18 @@ def test_rounding_on_another_machine_beats_nothing(by: float, verdict: str) -> N
     assert found.verdict == verdict
 
 
+@pytest.mark.parametrize(("differing", "verdict"), [(1, "is level with"), (12, "beats")])
+def test_rounding_does_not_add_to_a_difference(differing: int, verdict: str) -> None:
+    """One object of twenty that differs decides nothing, whichever way the others were rounded."""
+    key = metric_key("albedo", "psnr")
+    records = [
+        Record("inverse", "single-image", method, f"s{i}", f"o{i}", {key: 20.0 + by})
+        for i in range(20)
+        for method, by in (("ours", 0.0), ("sample", 0.01 if i < differing else 1e-6))
+    ]
+    assert compare(records, METRICS["psnr"], key, "sample", "ours").verdict == verdict
+
+
 @pytest.mark.parametrize(("scale", "ranks"), [("aligned_rgb", [1, None, 2]), ("raw", [2, 1, None])])
 def test_an_exact_fit_is_not_ranked_and_is_counted(scale: str, ranks: list[int | None]) -> None:
     variant = Variant(scale=scale)  # type: ignore[arg-type]  # one of the scales

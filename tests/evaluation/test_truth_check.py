@@ -1,11 +1,13 @@
 """The truth check's deliberate errors: found on every object and every base roughness, and named where they are not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
-from unirender_evaluation.truth_check import TruthCheck, twin_roughness
+from unirender_evaluation.truth_check import Check, TruthCheck, look_twice, twin_roughness
 
 
 def flat(albedo: float, normal: tuple[float, float, float] = (0, 0, 1), coverage: float = 1.0) -> Intrinsics:
@@ -68,3 +70,20 @@ def test_a_check_names_the_errors_that_it_missed() -> None:
     assert list(check.missed) == ["roughness", "normal off"]
     assert "raise the suite's spp" in check.missed["roughness"]
     assert "samples" not in check.missed["normal off"]
+
+
+@pytest.mark.parametrize(
+    ("passing", "asked"), [({7: True}, [7]), ({7: False, 8: True}, [7, 8]), ({7: False, 8: False}, [7, 8])]
+)
+def test_a_failure_is_looked_at_once_more(passing: dict[int, bool], asked: list[int]) -> None:
+    """By chance it does not fail again; a wrong truth does."""
+    seen: list[int] = []
+
+    def check(seed: int) -> Check:
+        seen.append(seed)
+        done = object.__new__(Check)
+        object.__setattr__(done, "test", SimpleNamespace(passed=passing[seed]))
+        return done
+
+    assert look_twice(check, 7).test.passed is passing[asked[-1]]
+    assert seen == asked

@@ -74,6 +74,14 @@ def test_weights_that_are_missing_are_refused(folder: Path, quickly: bool) -> No
         UniRenderPipeline.from_pretrained(folder, low_cpu_mem_usage=quickly)
 
 
+def test_weights_in_another_format_are_not_missing(folder: Path) -> None:
+    """An old folder: diffusers reads it if asked to, and says itself what it lacks."""
+    make_pipeline().save_pretrained(folder.parent / "old", safe_serialization=False)
+    assert not list((folder.parent / "old").rglob("*.safetensors"))
+    loaded = UniRenderPipeline.from_pretrained(folder.parent / "old", use_safetensors=False)
+    assert loaded.size == make_pipeline().size
+
+
 def test_a_config_of_another_network_is_refused(folder: Path) -> None:
     widen(folder / CONFIG)
     with pytest.raises(UnirenderError, match=r"mine: cannot be read as a checkpoint \(.*expected shape"):

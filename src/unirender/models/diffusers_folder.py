@@ -57,7 +57,7 @@ def load_weights(kind: Any, folder: Path) -> Any:
         )
     except Exception as error:  # diffusers, transformers and safetensors raise half a dozen kinds for a broken file
         raise UnirenderError(
-            f"{folder}: cannot be read as {kind.__name__} with weights as safetensors ({_line(error)})"
+            f"{folder}: cannot be read as {kind.__name__} with weights as safetensors ({one_line(error)})"
         ) from error
     if missing := sorted(info["missing_keys"]):  # both libraries only warn of them, and leave them at random
         raise UnirenderError(
@@ -85,7 +85,7 @@ def load_tokenizer(kind: Any, folder: Path) -> Any:
     try:
         return kind.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # half a dozen kinds for a broken file
-        raise UnirenderError(f"{folder}: cannot be read as a tokenizer ({_line(error)})") from error
+        raise UnirenderError(f"{folder}: cannot be read as a tokenizer ({one_line(error)})") from error
 
 
 @contextlib.contextmanager
@@ -102,5 +102,6 @@ def silent() -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _line(error: Exception) -> str:
-    return textwrap.shorten(str(error), 200)
+def one_line(error: Exception) -> str:
+    """What an error of diffusers, transformers or safetensors says, for a message of ours."""
+    return textwrap.shorten(str(error), 200).rstrip(".") or type(error).__name__

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,10 +9,11 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from unirender.errors import UnirenderError
+from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
 
 INDEX_FILE = "model_index.json"
-OF_FILES = (OSError, SafetensorError, json.JSONDecodeError)
+OF_FILES = (OSError, SafetensorError)
 
 
 def find_pipeline(checkpoint: str | Path | None) -> Path:
@@ -47,9 +47,8 @@ def reading(path: Path) -> Iterator[None]:
     except (UnirenderError, MemoryError):
         raise
     except Exception as error:  # diffusers and safetensors raise half a dozen kinds for a broken file
-        cause = textwrap.shorten(str(error), 300).rstrip(".") or type(error).__name__
         advice = "; if the files are damaged, copy the folder again" if isinstance(error, OF_FILES) else ""
-        raise UnirenderError(f"{path}: cannot be read as a checkpoint ({cause}){advice}") from error
+        raise UnirenderError(f"{path}: cannot be read as a checkpoint ({one_line(error)}){advice}") from error
 
 
 def check_complete(model: torch.nn.Module, folder: Path) -> None:
@@ -57,7 +56,7 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
 
     Args:
         model: as it was read.
-        folder: with its weights as safetensors, in one file or several.
+        folder: with its weights as safetensors, in one file or several; of other files nothing is said.
 
     Raises:
         UnirenderError: there are such weights.
@@ -66,7 +65,8 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
     for file in folder.glob("*.safetensors"):
         with safe_open(file, framework="pt") as weights:
             stored.update(weights.keys())
-    if missing := sorted(model.state_dict().keys() - stored):
+    missing = sorted(model.state_dict().keys() - stored) if stored else []
+    if missing:
         raise UnirenderError(
             f"{folder}: {len(missing)} weights are missing, the first is {missing[0]}; copy the folder again"
         )

@@ -99,8 +99,8 @@ class UniRenderPipeline(DiffusionPipeline):
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
         with reading(path):
             pipeline = super().from_pretrained(str(path), **kwargs)
-        if "dual_stream" not in kwargs:
-            check_complete(pipeline.dual_stream, path / "dual_stream")
+            if "dual_stream" not in kwargs:
+                check_complete(pipeline.dual_stream, path / "dual_stream")
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline
