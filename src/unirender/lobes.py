@@ -86,6 +86,17 @@ def lobe_matrix(
     return _weights(n, v, alpha[:, None], texel_directions(shape), False) * texel_solid_angles(*shape).reshape(-1)
 
 
+def cosine_matrix(n: Float[np.ndarray, "3 p"], shape: tuple[int, int]) -> Float[np.ndarray, "p m"]:
+    """What irradiance / pi takes of the texels of any light of `shape`: times its radiance `[m 3]` it is d.
+
+    Args:
+        n: unit normals.
+        shape: rows and columns of the light.
+    """
+    weights = np.maximum(n.T @ texel_directions(shape), 0) * texel_solid_angles(*shape).reshape(-1)
+    return (weights / np.pi).astype(np.float32)
+
+
 def _alike(n: Float[np.ndarray, "3 p"]) -> Iterator[Int[np.ndarray, " g"]]:
     """Groups of similar normals, by their position in the picture of a ball."""
     column, row = np.floor(2 * n[:2])

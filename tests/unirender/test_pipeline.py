@@ -1,5 +1,6 @@
 """The pipeline with an untrained model: shapes, sizes, seeds, anchoring, errors. Scores are the benchmark's task."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
 from unirender.options import MOST_STEPS
 from unirender.pipelines.closure import close_decomposition
-from unirender.pipelines.derived_light import derived_specular
+from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 from unirender.pipelines.editing import (
     LOBE_FLOOR,
     SMALL_CHANGE,
@@ -54,6 +55,12 @@ def picture(height: int = SIZE, width: int = SIZE) -> tuple[np.ndarray, np.ndarr
     mask = ((x - width / 2) ** 2 + (y - height / 2) ** 2 < (0.45 * min(height, width)) ** 2)[..., None]
     image = np.clip(rng.uniform(0.2, 0.8, 3) + 0.2 * np.sin(x / 5.0)[..., None], 0, 1)
     return image.astype(np.float32), mask.astype(np.float32)
+
+
+def example() -> tuple[np.ndarray, np.ndarray]:
+    """The picture of README."""
+    rgba = np.asarray(Image.open(Path(__file__).parents[2] / "docs/_static/example.png"), np.float32) / 255
+    return rgba[..., :3], rgba[..., 3:]
 
 
 def scene(size: int = SIZE) -> Intrinsics:
@@ -268,6 +275,28 @@ def test_missing_light_is_derived_or_left_to_the_model(pipeline: UniRenderPipeli
     assert np.isfinite(without_albedo).all()
     with pytest.raises(UnirenderError, match="normal missing"):
         pipeline.render(given.replace(normal=None))
+
+
+def test_the_light_of_a_closed_decomposition_agrees_with_it_and_edits_keep_the_networks() -> None:
+    image, mask = example()
+    pipeline = UniRenderPipeline.from_pretrained()
+    closed, plain = (pipeline.decompose(image, mask, closed=on) for on in (True, False))
+    assert plain.network_light is None
+    assert plain.as_predicted is plain.intrinsics
+    assert closed.network_light is not None
+    np.testing.assert_allclose(closed.network_light, get(plain.intrinsics, "environment"), rtol=0, atol=1e-5)
+    assert closed.as_predicted.environment is closed.network_light
+    d = get(closed.intrinsics, "diffuse")
+    ratio = {
+        name: float(derived_diffuse(closed.intrinsics, light).sum() / d.sum())
+        for name, light in (("own", get(closed.intrinsics, "environment")), ("network", closed.network_light))
+    }
+    assert 0.85 < ratio["own"] < 1.1, ratio
+    assert ratio["network"] < 0.8, ratio  # the twin: a mean in log radiance is too dark
+    given = replace(closed, network_light=None)
+    first, second = (pipeline.edit(image, mask, metallic=1.0, decomposition=found) for found in (closed, given))
+    assert np.array_equal(get(first.intrinsics, "environment"), get(closed.intrinsics, "environment"))
+    assert 0 < np.abs(first.image_linear - second.image_linear).max() < 0.05  # what the network is told, little by much
 
 
 def test_edit_changes_what_was_asked_for(pipeline: UniRenderPipeline) -> None:

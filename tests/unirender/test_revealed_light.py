@@ -1,4 +1,4 @@
-"""The light that s reveals: a blurred estimate of a known light comes nearer to it by the s of that light."""
+"""The light that s and d reveal: a blurred estimate of a known light comes nearer to it by what that light does."""
 
 import functools
 
@@ -9,9 +9,9 @@ from scipy.ndimage import gaussian_filter
 from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, resample_environment
-from unirender.lobes import grid_lobes, lobe_matrix
-from unirender.pipelines.derived_light import derived_specular
-from unirender.pipelines.revealed_light import revealed_light
+from unirender.lobes import cosine_matrix, grid_lobes, lobe_matrix
+from unirender.pipelines.derived_light import derived_diffuse, derived_specular
+from unirender.pipelines.revealed_light import agreeing_light, revealed_light
 
 SHAPE = (16, 32)
 OLD, WIDER = 0.4, 0.8
@@ -109,3 +109,40 @@ def test_lobe_matrix_times_a_light_is_its_lobes() -> None:
     assert lobes.shape == (5, SHAPE[0] * SHAPE[1])
     expected = grid_lobes(normal, view, alpha, lamp(), SHAPE, tails=False)
     np.testing.assert_allclose(lobes @ lamp().reshape(-1, 3), expected, rtol=1e-4)
+
+
+def dim(factor: float = 0.5) -> Intrinsics:
+    """The ball lit as it is, with a predicted light that is blurred and too dark."""
+    lit = ball()
+    return lit.replace(
+        diffuse=derived_diffuse(lit, lamp()), environment=(factor * get(lit, "environment")).astype(np.float32)
+    )
+
+
+def test_the_agreeing_light_lights_the_ball_as_its_s_and_d_say() -> None:
+    given = dim()
+    found = agreeing_light(given)
+    assert found.shape == get(given, "environment").shape
+    for name, of, most in (("specular", derived_specular, 0.45), ("diffuse", derived_diffuse, 0.1)):
+        wanted = get(given, name)
+        before, after = (np.abs(of(given, light) - wanted).sum() for light in (get(given, "environment"), found))
+        assert after < most * before, name
+    assert distance(found, WIDER) < 0.1 * distance(get(given, "environment"), WIDER)
+
+
+def test_d_says_left_from_right_where_s_is_black() -> None:
+    """A light from the left alone, predicted as one from all around, on a surface that hardly shines."""
+    directions = environment_directions(*SHAPE)
+    left = (np.maximum(-directions[..., :1], 0) * np.ones(3)).astype(np.float32)
+    rough = ball().replace(roughness=get(ball(), "mask"), environment=np.full_like(left, left.mean()))
+    given = rough.replace(specular=derived_specular(rough, left), diffuse=derived_diffuse(rough, left))
+    for light, least, most in ((get(given, "environment"), -0.01, 0.01), (agreeing_light(given), 0.5, 1.0)):
+        sides = [light[directions[..., 0] * side > 0].sum() for side in (-1, 1)]
+        assert least < (sides[0] - sides[1]) / sum(sides) < most
+
+
+def test_cosine_matrix_times_a_light_is_d() -> None:
+    given = ball()
+    there = get(given, "mask")[..., 0] > 0.5
+    lit = cosine_matrix(get(given, "normal")[there].T, SHAPE) @ lamp().reshape(-1, 3)
+    np.testing.assert_allclose(lit, derived_diffuse(given, lamp())[there], rtol=0.05, atol=0)

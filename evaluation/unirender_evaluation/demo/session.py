@@ -133,7 +133,7 @@ def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
         UnirenderError: the picture or its mask is not usable.
     """
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
-    return Subject(picture, decomposition, render(pipeline, decomposition.intrinsics))
+    return Subject(picture, decomposition, render(pipeline, decomposition.as_predicted))
 
 
 def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> View:
@@ -145,14 +145,14 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
     Raises:
         UnirenderError: a number is outside its range, or the light is not usable.
     """
-    before = subject.maps
+    before = subject.decomposition.as_predicted
     edited, remarks, derived = before, [], ()
     if controls.metallic is not None:
         edited = edited.replace(metallic=as_material("metallic", controls.metallic, subject.mask))
     if controls.roughness is not None:
         edited = edited.replace(roughness=as_material("roughness", controls.roughness, subject.mask))
     if controls.light is not None or controls.turn_deg % 360:
-        predicted = before.require("environment")["environment"]
+        predicted = subject.maps.require("environment")["environment"]
         light = turned(predicted if controls.light is None else as_environment(controls.light), controls.turn_deg)
         edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
         derived = ("specular", "diffuse")
@@ -168,6 +168,8 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
             )
     rendered = subject.rendered if edited is before else render(pipeline, edited, derived)
     image = anchor(subject.image_linear, subject.rendered, rendered) if controls.anchored else rendered
+    if edited.environment is before.environment:
+        edited = edited.replace(environment=subject.maps.environment)
     return View(image, rendered, edited, tuple(remarks))
 
 

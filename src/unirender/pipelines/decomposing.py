@@ -12,7 +12,7 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
 from unirender.pipelines.rendering import render_any_size
-from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics
+from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics, with_agreeing_light
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
 
@@ -53,7 +53,8 @@ def decompose_views(
         views: any sizes and cameras.
         how: steps, samples and noise.
         material: `scalar` or `map`.
-        closed: whether albedo, s and d are changed so that their rendering is the picture; one more batch.
+        closed: whether albedo, s and d are changed so that their rendering is the picture, one more batch, and then the
+            light so that it agrees with s and d.
         tile: whether pictures larger than the network's square get the detail of tiles; a batch for every few tiles.
         calibration: lines by which roughness and metallic are read.
     """
@@ -78,7 +79,8 @@ def decompose_views(
             [close_decomposition(sample, view.image_linear, next(rendered)) for sample in own]
             for view, own in zip(views, samples, strict=True)
         ]
-    return [combine(tuple(own)) for own in samples]
+    combined = [combine(tuple(own)) for own in samples]
+    return [with_agreeing_light(found) for found in combined] if closed else combined
 
 
 def _one(how: Sampling, picture: int) -> Sampling:

@@ -1,6 +1,6 @@
 """What the pipeline returns, and how predictions become `Intrinsics`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,6 +9,7 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import constant_map, masked_mean
 from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.revealed_light import agreeing_light
 
 PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")
 
@@ -18,11 +19,16 @@ class Decomposition:
     """What a picture was taken apart into.
 
     Attributes:
-        intrinsics: all maps at the picture's size, the light at the model's, the mask as given.
+        intrinsics: all maps at the picture's size, the light at the model's, the mask as given. Where the decomposition
+            is closed, the light is the one that agrees with its s and d (`unirender.pipelines.revealed_light`).
         roughness: coverage-weighted mean over the object.
         metallic: the same.
         std: per map, standard deviation over the samples; None in mode `mean` or with one sample.
-        samples: each sample's intrinsics, where there are several; `intrinsics` is their mean.
+        samples: each sample's intrinsics, where there are several; `intrinsics` is their mean. Each has its own
+            light as the network predicts it.
+        network_light: the light as the network predicts it, [eh ew 3], which its own renderings of these maps are told:
+            a mean in log radiance, and so darker than s and d say. None: the light of `intrinsics`; set it to None
+            where you put another light there.
     """
 
     intrinsics: Intrinsics
@@ -30,6 +36,14 @@ class Decomposition:
     metallic: float
     std: dict[str, np.ndarray] | None = None
     samples: tuple[Intrinsics, ...] = ()
+    network_light: Float[np.ndarray, "eh ew 3"] | None = None
+
+    @property
+    def as_predicted(self) -> Intrinsics:
+        """The maps with the network's own light, from which edits and relightings start."""
+        return (
+            self.intrinsics if self.network_light is None else self.intrinsics.replace(environment=self.network_light)
+        )
 
 
 @dataclass(frozen=True)
@@ -69,6 +83,13 @@ def predicted_intrinsics(
         value = np.clip(sized[name], 0, 1)
         sized[name] = constant_map(masked_mean(value, mask), mask) if material == "scalar" else value
     return Intrinsics(**sized, environment=maps["environment"], mask=mask, camera=camera)
+
+
+def with_agreeing_light(found: Decomposition) -> Decomposition:
+    """The decomposition with the light that agrees with its s and d, beside the one that the network predicts."""
+    maps = found.intrinsics
+    light = maps.require("environment")["environment"]
+    return replace(found, intrinsics=maps.replace(environment=agreeing_light(maps)), network_light=light)
 
 
 def combine(samples: tuple[Intrinsics, ...]) -> Decomposition:

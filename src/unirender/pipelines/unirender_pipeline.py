@@ -143,14 +143,15 @@ class UniRenderPipeline(DiffusionPipeline):
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
             num_inference_steps: of `sample`; 20 if None.
             num_samples: of `sample`; 5 if None.
-            generator: a CPU generator for the noise; None: a fixed noise in mode `mean` (an expectation depends on no
-                draw), torch's global state in mode `sample`.
+            generator: a CPU generator for the noise; None: a fixed noise in mode `mean` (whose one step hardly depends
+                on it: roughness and metallic by some 0.01), torch's global state in mode `sample`.
             sampler: of `sample`: `ddim` or `unipc`; None: the pipeline's scheduler.
             size: side of the square at which the network runs, a multiple of `size_multiple`; None: the model's own.
             tile: add the detail of tiles to albedo and normal where the picture is larger than that square.
             material: one number per object or maps; None: as the checkpoint was trained.
-            closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`); False
-                gives what the network predicts (materials by the checkpoint's calibration, if it has one).
+            closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`), and
+                the light so that it agrees with s and d (`unirender.pipelines.revealed_light`); False gives what the
+                network predicts (materials by the checkpoint's calibration, if it has one).
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
@@ -202,7 +203,7 @@ class UniRenderPipeline(DiffusionPipeline):
             size: side of the network's square.
             tile: add the detail of tiles.
             material: one number per object or maps.
-            closed: change albedo, s and d so that their rendering is the picture.
+            closed: change albedo, s, d and the light, as for `decompose`.
 
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
@@ -315,7 +316,7 @@ class UniRenderPipeline(DiffusionPipeline):
         check_settings(sampling)
         picture, cover = as_picture(image_srgb, mask)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
-        before = decomposition.intrinsics
+        before = decomposition.as_predicted
         edited, bounded, coarse = before, 0.0, None
         if metallic is not None:
             edited = edited.replace(metallic=as_material("metallic", metallic, cover))
@@ -325,6 +326,7 @@ class UniRenderPipeline(DiffusionPipeline):
             coarse = too_coarse(before, target)
             edited = edited.replace(roughness=target, specular=specular)
         image = self._rerender(picture, cover, before, edited, anchored, sampling)
+        edited = edited.replace(environment=decomposition.intrinsics.environment)
         return EditResult(image, edited, decomposition, bounded, coarse)
 
     def relight(
@@ -369,7 +371,7 @@ class UniRenderPipeline(DiffusionPipeline):
         if environment is not None:
             environment = as_environment(environment)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
-        before = decomposition.intrinsics
+        before = decomposition.as_predicted
         if environment is not None:
             edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False, shadows=shadows)
         else:
