@@ -22,6 +22,9 @@ from unirender.errors import UnirenderError
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
+MOST_ALIASING = 0.005  # share of a texel's energy that may come of how two grids lie to one another
+
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     """Unit directions of the texels, camera axes."""
@@ -63,12 +66,14 @@ def rotate_environment(
 ) -> Float[np.ndarray, "h w 3"]:
     """The light turned by `rotation`: the new radiance from R x is the old one from x. Bilinear resampling."""
     directions = environment_directions(*environment.shape[:2])
+    # At the pole of row 0 a direction has no azimuth: texels keep that of their column, as the last row's by rounding.
+    directions[0] += np.float32(POLE_STEP) * directions[1] * np.array([1, 0, 1], dtype=np.float32)
     return sample_environment(environment, directions @ np.asarray(rotation, dtype=np.float32))
 
 
-def mirror_environment(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.ndarray, "*n h w 3"]:
     """The light seen in a mirror that flips x; exact."""
-    return environment[:, ::-1].copy()
+    return environment[..., ::-1, :].copy()
 
 
 def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
@@ -80,7 +85,11 @@ def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, 
 def resample_environment(
     environment: Float[np.ndarray, "h w 3"], shape: tuple[int, int]
 ) -> Float[np.ndarray, "h2 w2 3"]:
-    """The environment at another resolution; energy-preserving where it shrinks, bilinear where it grows."""
+    """The environment at another resolution; energy-preserving where it shrinks, bilinear where it grows.
+
+    Where it grows by a factor that is no whole number, texels of the old map would be met by more or fewer of the new
+    one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
+    """
     height, width = environment.shape[:2]
     rows, columns = resampling_operators((height, width), shape)
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
@@ -100,19 +109,30 @@ def resampling_operators(source: tuple[int, int], target: tuple[int, int]) -> tu
     (h, w), (h2, w2) = source, target
     _check_shape(source)
     _check_shape(target)
-    if h2 < h:
-        theta = (np.arange(64 * h) + 0.5) * np.pi / (64 * h)  # midpoint rule over the polar angle
+    if _is_integrated((h2 - 1) / (h - 1)):
+        count = 64 * max(h, h2)
+        theta = (np.arange(count) + 0.5) * np.pi / count  # midpoint rule over the polar angle
         old, new = hat_weights(theta * (h - 1) / np.pi, h), hat_weights(theta * (h2 - 1) / np.pi, h2)
         rows = weighted_means(new, np.sin(theta)) @ old
     else:
         rows = hat_weights(np.arange(h2) * (h - 1) / (h2 - 1), h)
-    if w2 < w:
-        u = (np.arange(64 * w) + 0.5) / (64 * w)
+    if _is_integrated(w2 / w):
+        count = 64 * max(w, w2)
+        u = (np.arange(count) + 0.5) / count
         old, new = hat_weights(u * w - 0.5, w, wrap=True), hat_weights(u * w2 - 0.5, w2, wrap=True)
-        columns = weighted_means(new, np.ones(64 * w)) @ old
+        columns = weighted_means(new, np.ones(count)) @ old
     else:
         columns = hat_weights((np.arange(w2) + 0.5) * w / w2 - 0.5, w, wrap=True)
     return csr_array(rows, dtype=np.float32), csr_array(columns, dtype=np.float32)
+
+
+def _is_integrated(growth: float) -> bool:
+    """Whether a map whose steps become `growth` times finer is integrated instead of sampled.
+
+    Samples of a hat at `growth` points a step sum to what it holds but for a part that moves with where they fall, up
+    to 2 sinc(growth)^2 (Poisson's sum): none for whole numbers. Below 2 that part moves slowly and adds up.
+    """
+    return growth != 1 and (growth < 2 or 2 * float(np.sinc(growth)) ** 2 > MOST_ALIASING)
 
 
 def hat_weights(position: Float[np.ndarray, " m"], n: int, wrap: bool = False) -> "csr_array":

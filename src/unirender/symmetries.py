@@ -49,7 +49,9 @@ def quarter_turn(maps: Mapping[str, np.ndarray], turns: int = 1) -> Maps:
     turned: Maps = {}
     for name, value in maps.items():
         if name == "environment":
-            turned[name] = rotate_environment(value, turn_rotation(turns))
+            lights = value.reshape(-1, *value.shape[-3:])
+            rotated = [rotate_environment(light, turn_rotation(turns)) for light in lights]
+            turned[name] = np.stack(rotated).reshape(value.shape)
             continue
         if value.shape[-3] != value.shape[-2]:
             raise UnirenderError(f"{name}: got {value.shape[-3]}x{value.shape[-2]}, expected a square frame to turn")

@@ -1,5 +1,7 @@
 """Light factors, mirror images and turns: group laws, what moves with what, and errors."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -80,3 +82,11 @@ def test_intrinsics_change_through_their_maps(maps: dict[str, np.ndarray]) -> No
 def test_a_frame_that_is_not_square_cannot_turn() -> None:
     with pytest.raises(UnirenderError, match="square"):
         quarter_turn({"image": np.ones((4, 6, 3), np.float32)})
+
+
+@pytest.mark.parametrize("change", [mirror, quarter_turn])
+def test_a_batch_of_lights_changes_as_each_of_them(change: Callable[..., dict[str, np.ndarray]]) -> None:
+    lights = np.random.default_rng(1).random((2, 8, 16, 3)).astype(np.float32)
+    together = change({"environment": lights})["environment"]
+    for light, changed in zip(lights, together, strict=True):
+        np.testing.assert_array_equal(changed, change({"environment": light})["environment"])
