@@ -8,7 +8,8 @@ Two named samplers of diffusers, both without noise of their own: `ddim`, of fir
 predictor and corrector of second order. Both end with a jump from the last timestep, 1/n of the way up, to E[x0 | x_t]:
 this part of the error is of first order in either, and what is left of the spread in it is lost. At T the signal is
 zero and log-SNR, UniPC's variable, is minus infinity; diffusers puts alpha_bar = 2^-24 there, which moves a result by
-2^-12 at most. DDIM steps by 1000 // n timesteps: where n does not divide 1000 it is off by less than one timestep.
+2^-12 at most. DDIM of diffusers strides by 1000 // n timesteps. Where n does not divide 1000 its timesteps lie further
+apart than that, and what is amiss adds up over the steps: such steps are made here (`_ddim_step`).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -36,8 +37,9 @@ PREDICTION_TYPE = "sample"  # diffusers' name of x0
 NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
 CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
 OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
+DDIM = ("DDIMScheduler", "DDIMParallelScheduler")
 SCHEDULERS = (
-    *("DDIMScheduler", "DDIMParallelScheduler"),
+    *DDIM,
     *("UniPCMultistepScheduler", "DPMSolverMultistepScheduler"),  # the last without sde
 )
 
@@ -144,10 +146,35 @@ def denoise(
         return predict(noise, t)
     scheduler.set_timesteps(steps, device=noise.device)
     x_t = noise * scheduler.init_noise_sigma
-    for t in progress(scheduler.timesteps):
+    uneven = _strides_unevenly(scheduler, steps)
+    following = [*scheduler.timesteps[1:], None]
+    for t, next_t in zip(progress(scheduler.timesteps), following, strict=False):
         x_0 = predict(x_t, t.expand(len(x_t)))
-        x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
+        if uneven:
+            x_t = _ddim_step(scheduler, x_0, x_t, t, next_t)
+        else:
+            x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
     return x_t
+
+
+def _strides_unevenly(scheduler: Any, steps: int) -> bool:
+    """Whether it is a DDIM whose timesteps are not 1000 // steps apart, as its `step` takes them to be."""
+    is_ddim = any(base.__name__ in DDIM for base in type(scheduler).__mro__)
+    return is_ddim and scheduler.config.num_train_timesteps % steps != 0
+
+
+def _ddim_step(
+    scheduler: Any,
+    x_0: Float[Tensor, "b c h w"],
+    x_t: Float[Tensor, "b c h w"],
+    t: Int[Tensor, ""],
+    following: Int[Tensor, ""] | None,
+) -> Float[Tensor, "b c h w"]:
+    """DDIM's step without noise (Song, Meng and Ermon 2021, eq. 12) to any earlier timestep; None: to x0."""
+    end = scheduler.final_alpha_cumprod
+    now, then = scheduler.alphas_cumprod[t], end if following is None else scheduler.alphas_cumprod[following]
+    noise = (x_t - now.sqrt() * x_0) / (1 - now).sqrt()
+    return then.sqrt() * x_0 + (1 - then).sqrt() * noise
 
 
 def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = None) -> Float[Tensor, "b c h w"]:
