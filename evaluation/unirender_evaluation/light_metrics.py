@@ -27,7 +27,7 @@ SHAPE = (16, 32)
 CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
 CONE_SHAPE = (46, 90)  # directions and quadrature of the cones: 4 degrees
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-LARGEST_SCALE = 1e4
+LARGEST_SCALE = 1e4  # of k, either way, times that of equal energy
 UNIFORM = 1e-3  # relative differences between cones below which a light has no brightest direction
 
 SCALED_LOG_RMSE = Metric(
@@ -85,7 +85,8 @@ def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]
         return metrics.log_rmse(p * math.exp(log_scale), t, w)
 
     limit = math.log(LARGEST_SCALE)
-    grid = np.linspace(-limit, limit, 41)
+    equal = math.log(max(float((w * t).sum()), LOG_EPSILON) / float((w * p).sum()))  # ln k of equal energy
+    grid = equal + np.linspace(-limit, limit, 41)
     start = grid[int(np.argmin([error(k) for k in grid]))]
     step = grid[1] - grid[0]
     best: Any = minimize_scalar(error, bounds=(start - step, start + step), method="bounded")

@@ -92,8 +92,12 @@ class Stage:
         return self.mitsuba.image(self.scene, material, SWEEP_SPP)
 
     def shaded(self, maps: Intrinsics, shader: Shader, light: Light) -> Image:
-        """Found maps shaded again under one of the lights; kept, since several tests look at one picture."""
-        surface = maps.replace(specular=None, diffuse=None, environment=None, mask=self.mask)
+        """Found maps shaded again under one of the lights, through the suite's camera.
+
+        Pictures are kept, since several tests look at one.
+        """
+        camera = self.suite.spec.camera
+        surface = maps.replace(specular=None, diffuse=None, environment=None, mask=self.mask, camera=camera)
         digest = hashlib.sha256(f"{shader} {light}".encode())
         for name in ("albedo", "normal", "roughness", "metallic"):
             digest.update(surface.require(name)[name].tobytes())

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from tiny_suites import make_suite
 
+from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
@@ -71,6 +72,16 @@ def test_closed_loop_of_true_maps(suite: Suite) -> None:
         good, bad = test.run(true_maps, stage), test.run(test.twin, stage)
         assert good > 50
         assert test.fails(bad, good)
+
+
+def test_the_loop_looks_through_the_suites_camera(suite: Suite) -> None:
+    """Whatever camera a method puts beside its maps, and whoever was asked before."""
+    values = []
+    for camera in (suite.spec.camera, Camera(90.0)):
+        stage = Stage(suite, suite.scenes[0])
+        maps = stage.true_maps(suite.spec.base).replace(camera=camera)
+        values.append(stage.shaded(maps, "composite", "input"))
+    assert np.array_equal(*values)
 
 
 @pytest.mark.long
