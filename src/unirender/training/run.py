@@ -14,6 +14,7 @@ from unirender.options import Device, DType, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
+from unirender.training.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.training.validation import Validate
@@ -163,8 +164,10 @@ class Train:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
+        out = self.out or cache_dir() / "runs" / self.preset
+        check_out(out)
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        pipeline = train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
+        pipeline = train(self, config, out, validate)
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0

@@ -42,6 +42,7 @@ from unirender.training.source import BatchSource
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
+from unirender.training.writing import writing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -329,4 +330,6 @@ class Trainer:
             return
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        replace_file(self.run.out / "config.json", text + "\n")
+        path = self.run.out / "config.json"
+        with writing(path):
+            replace_file(path, text + "\n")

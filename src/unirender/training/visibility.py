@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.training.writing import check_out, writing
 
 if TYPE_CHECKING:
     import torch
@@ -83,6 +84,7 @@ class TrainVisibility:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
+        check_out(self.out)
         print(f"{train_visibility(self)}: trained")
         return 0
 
@@ -149,7 +151,6 @@ class _Run:
         elif self.log.is_file():
             self.log.unlink()  # of a run that was killed before its first state
         if not self.step:
-            options.out.mkdir(parents=True, exist_ok=True)
             self._tell(validate(self.net, held_out, options.seed))  # before anything was learned
 
     def _resume(self, state: Mapping[str, Any]) -> None:
@@ -164,7 +165,8 @@ class _Run:
         self.ema.load_state_dict(state["ema"])
         self.step = int(state["step"])
         lines = [line for line in self.log.read_text().splitlines(keepends=True) if line.endswith("\n")]
-        replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
+        with writing(self.log):
+            replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
 
     def train_step(self) -> None:
         """One step of the optimiser."""
@@ -198,15 +200,18 @@ class _Run:
         shown = channels_last(VisibilityNet())
         self.ema.copy_to(shown)
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
-        replace_file(self.options.out / WEIGHTS_FILE, save(halves))
+        with writing(path := self.options.out / WEIGHTS_FILE):
+            replace_file(path, save(halves))
         means = dict(zip(("bce", "log_error"), map(_mean, zip(*self.losses, strict=True)), strict=True))
         self.losses.clear()
         self._tell(means | validate(shown, self.held_out, self.options.seed))
 
     def _tell(self, values: Mapping[str, float]) -> None:
         line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
-        with self.log.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        with writing(self.log):
+            self.options.out.mkdir(parents=True, exist_ok=True)
+            with self.log.open("a") as file:
+                file.write(json.dumps(line) + "\n")
         print(" ".join(f"{key} {value:.4g}" for key, value in line.items()), flush=True)
 
 
