@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import causes, interrupted, parse
+from unirender.command_line import Ended, causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.lean_imports import lean_imports
@@ -207,15 +207,11 @@ class NoticeHandler(logging.Handler):
         notice(record.getMessage())
 
 
-class Ended(KeyboardInterrupt):
-    """The signal `args[0]` came."""
-
-
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
     Exits with 0, 1 (failure), 2 (usage), 130 (interrupted), 141 (who read its output left: `unirender ... | head`), 143
-    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`).
+    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`, `unirender.training.stopping`).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv

@@ -22,6 +22,7 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import nn
 
+from unirender.command_line import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.files import replace_file
@@ -164,7 +165,7 @@ class Trainer:
             say: is told where a run stands that is not new.
 
         Raises:
-            KeyboardInterrupt: it was asked to stop.
+            Ended: it was asked to stop.
         """
         self.source = source
         resumed = self.resume(source, report)
@@ -202,16 +203,17 @@ class Trainer:
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 now = time.monotonic()
                 seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)
-                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.asked))
+                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.signal))
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
                     clock["log"], logged = now, self.step
                     rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
-                    self.log.tell(rates | self.log.means(), report)
-                if main and (stopping or due("save", self.run.save_minutes)):
+                    with request.unheard():
+                        self.log.tell(rates | self.log.means(), report)
+                if main and (stopping is not None or due("save", self.run.save_minutes)):
                     self.save(source)
-                if stopping:
-                    raise KeyboardInterrupt
+                if stopping is not None:
+                    raise Ended(stopping)
                 if main and due("picture", self.run.picture_minutes):
                     look()
                 if refreshing:

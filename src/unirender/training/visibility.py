@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.writing import check_out, writing
 
@@ -93,7 +94,8 @@ def train_visibility(options: TrainVisibility) -> Path:
     """Runs the training; returns the file of the averaged weights.
 
     Raises:
-        UnirenderError: broken data, the folder holds a run of other options or data, or the run was asked to stop.
+        UnirenderError: broken data, or the folder holds a run of other options or data.
+        Ended: it was asked to stop.
     """
     from unirender.training.stopping import stopping_gently
     from unirender.training.visibility_data import read_items
@@ -105,10 +107,11 @@ def train_visibility(options: TrainVisibility) -> Path:
         while run.step < options.steps and not stop.asked:
             run.train_step()
             if time.monotonic() - saved > SAVE_SECONDS or run.step == options.steps or stop.asked:
-                run.keep()
+                with stop.unheard():
+                    run.keep()
                 saved = time.monotonic()
-    if run.step < options.steps:
-        raise UnirenderError(f"{options.out}: stopped at step {run.step}; run the same command again to go on")
+    if stop.signal is not None and run.step < options.steps:
+        raise Ended(stop.signal)
     return options.out / WEIGHTS_FILE
 
 
