@@ -175,6 +175,7 @@ class Train:
 
 def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
+    import diffusers
     import torch
     from rich.console import Console
 
@@ -214,9 +215,10 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     tell = notice if processes.is_main else lambda text: None
-    start = read_start(config.model, options.init, options.init_from, tell)
+    diffusers.utils.logging.disable_progress_bar()  # of loading: small files
+    start = read_start(config.model, options.init, options.init_from)
     trainer = Trainer(config, run, device, dtype, processes, start.vae)
-    start.apply(trainer)
+    start.apply(trainer, tell)
     del start  # Stable Diffusion's U-Net is no longer needed
     if options.gradient_checkpointing:
         trainer.model.enable_gradient_checkpointing()

@@ -28,6 +28,7 @@ from unirender.errors import UnirenderError
 from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
+from unirender.training.beginning import Beginning, check_beginning
 from unirender.training.checkpoint import differences, load_state, plain, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
@@ -111,6 +112,7 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
         self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
+        self.begun_with: Beginning | None = {}  # None: a state of an earlier version, which does not say
         self.source: BatchSource | None = None  # of the batches, once it trains
 
     @property
@@ -291,13 +293,14 @@ class Trainer:
             "parts": self.split.all_parts,
             "unlogged": dict(self.log.waiting),
             "continues": self.continues,
+            "begun_with": self.begun_with,
         }
 
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
         """Continues from the folder's state, if it has one; `report` is told where that cannot be exact.
 
         Raises:
-            UnirenderError: the state is broken or belongs to another config.
+            UnirenderError: the state is broken, belongs to another config, or was begun with other weights.
         """
         state = load_state(self.run.out)
         if state is None:
@@ -307,6 +310,9 @@ class Trainer:
                 f"{self.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
                 "another --out"
             )
+        begun = state.get("begun_with")
+        check_beginning(self.run.out, begun, self.begun_with or {})
+        self.begun_with = begun
         self.step, self.seconds = state["step"], state["seconds"]
         self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
         self.model.load_state_dict(state["model"])
