@@ -64,7 +64,7 @@ def test_a_place_where_nothing_can_be_written_is_refused_before_anything_is_buil
     assert stopped.value.code == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(
-        f"{out}: cannot be written ({tmp_path / 'file'} is a file), expected a folder; choose another --out"
+        f"{out}: cannot be written ({tmp_path / 'file'} is no folder), expected a folder; choose another --out"
     )
     assert (tmp_path / "file").read_text() == "kept"
 

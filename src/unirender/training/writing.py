@@ -16,7 +16,7 @@ def unusable(folder: Path) -> str | None:
     try:
         place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         if not place.is_dir():
-            return f"{place} is a file"
+            return f"{place} is no folder"
         with tempfile.TemporaryFile(dir=place):  # of which nothing stays
             return None
     except OSError as error:
