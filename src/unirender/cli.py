@@ -65,7 +65,7 @@ class Doctor:
     """Show what was found on this machine: LLVM, Mitsuba, torch, caches, checkpoints, LPIPS weights."""
 
     def run(self) -> int:
-        """Returns the exit status: 1 where something is missing."""
+        """Returns the exit status: 1 where something is missing or does not work."""
         from rich.console import Console
         from rich.table import Table
 
@@ -73,6 +73,7 @@ class Doctor:
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.paths import cache_dir
         from unirender.shipped import shipped_names
+        from unirender.training.writing import unusable
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 
@@ -80,14 +81,16 @@ class Doctor:
         rows = [("unirender", unirender.__version__, "ok"), *doctor()]
         rows.append(("torch device", f"{device}, {str(resolve_dtype('auto', device)).removeprefix('torch.')}", "ok"))
         shipped = shipped_names()
-        rows.append(("checkpoints", ", ".join(shipped) or "missing", "ok" if shipped else "error"))
+        rows.append(("checkpoints", ", ".join(shipped) or "missing", "ok" if shipped else "fail"))
         rows.append(("LPIPS backbones", ", ".join(available()), "ok"))
-        rows.append(("cache", str(cache_dir()), "ok"))
+        reason = unusable(cache_dir())
+        wrong = f": cannot be written ({reason}); set UNIRENDER_CACHE to another folder"
+        rows.append(("cache", f"{cache_dir()}{wrong if reason else ''}", "fail" if reason else "ok"))
         table = Table("what", "found", "status")
         for row in rows:
             table.add_row(*(str(cell) for cell in row))
         Console().print(table)
-        return 1 if any(row[2] == "error" for row in rows) else 0
+        return 1 if any(row[2] == "fail" for row in rows) else 0
 
 
 Command = (
