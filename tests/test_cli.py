@@ -411,6 +411,23 @@ def test_doctor_finds_a_working_backend(capsys: pytest.CaptureFixture[str]) -> N
     assert "tiny" in text
 
 
+def test_doctor_finds_what_does_not_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr("unirender_reference.backend.doctor", lambda: [("kernel", "sum(0..4) = 10", "ok")])
+    assert run("doctor") == 0
+    capsys.readouterr()
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "file" / "cache"))
+    assert run("doctor") == 1
+    assert "cannot be written" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "new"))
+    assert run("doctor") == 0
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setattr("unirender_reference.backend.doctor", lambda: [("kernel", "sum(0..4) = 11", "fail")])
+    assert run("doctor") == 1
+
+
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys, unirender.cli\n"

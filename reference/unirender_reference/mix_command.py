@@ -79,5 +79,5 @@ class MixMeshes:
             console.print(f"refused  {reason}", markup=False)
         if report.too_large:
             console.print(f"not used: {report.too_large:,} with more than {self.max_faces:,} triangles (--max-faces)")
-        console.print(f"{report.made:,} meshes made, {self.count - report.made:,} were there: {self.out}", markup=False)
+        console.print(f"{report.made:,} meshes made, {report.there:,} were there: {self.out}", markup=False)
         return 1 if report.refused else 0

@@ -29,12 +29,14 @@ class MixReport:
     """What came of a run.
 
     Attributes:
-        made: mixes that it made; the others were there.
+        made: mixes that it made.
+        there: mixes that were there, asked for or not.
         refused: why files that it read cannot be used, and folders not be listed, a sentence each.
         too_large: files that it read that have too many triangles.
     """
 
     made: int
+    there: int
     refused: Sequence[str]
     too_large: int
 
@@ -69,13 +71,14 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
             shutil.rmtree(leftover, ignore_errors=True)
         for leftover in out.glob(f".{MANIFEST}.*"):
             leftover.unlink(missing_ok=True)
+        there = sum(folder.is_dir() for folder in out.glob("mix-*"))
         for number in range(options.count):
             folder = out / f"mix-{options.seed}-{number:05d}"
             if not folder.is_dir():
                 _write(folder, drawn, options.seed, number)
                 made += 1
             progress(number + 1)
-    return MixReport(made, [*unreadable, *drawn.refused.values()], len(drawn.too_large))
+    return MixReport(made, there, [*unreadable, *drawn.refused.values()], len(drawn.too_large))
 
 
 def _check_places(files: Sequence[MeshFile], out: Path) -> None:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import causes, interrupted, parse
+from unirender.command_line import Ended, causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.lean_imports import lean_imports
@@ -65,7 +65,7 @@ class Doctor:
     """Show what was found on this machine: LLVM, Mitsuba, torch, caches, checkpoints, LPIPS weights."""
 
     def run(self) -> int:
-        """Returns the exit status: 1 where something is missing."""
+        """Returns the exit status: 1 where something is missing or does not work."""
         from rich.console import Console
         from rich.table import Table
 
@@ -73,6 +73,7 @@ class Doctor:
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.paths import cache_dir
         from unirender.shipped import shipped_names
+        from unirender.training.writing import unusable
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 
@@ -80,14 +81,16 @@ class Doctor:
         rows = [("unirender", unirender.__version__, "ok"), *doctor()]
         rows.append(("torch device", f"{device}, {str(resolve_dtype('auto', device)).removeprefix('torch.')}", "ok"))
         shipped = shipped_names()
-        rows.append(("checkpoints", ", ".join(shipped) or "missing", "ok" if shipped else "error"))
+        rows.append(("checkpoints", ", ".join(shipped) or "missing", "ok" if shipped else "fail"))
         rows.append(("LPIPS backbones", ", ".join(available()), "ok"))
-        rows.append(("cache", str(cache_dir()), "ok"))
+        reason = unusable(cache_dir())
+        wrong = f": cannot be written ({reason}); set UNIRENDER_CACHE to another folder"
+        rows.append(("cache", f"{cache_dir()}{wrong if reason else ''}", "fail" if reason else "ok"))
         table = Table("what", "found", "status")
         for row in rows:
             table.add_row(*(str(cell) for cell in row))
         Console().print(table)
-        return 1 if any(row[2] == "error" for row in rows) else 0
+        return 1 if any(row[2] == "fail" for row in rows) else 0
 
 
 Command = (
@@ -207,15 +210,11 @@ class NoticeHandler(logging.Handler):
         notice(record.getMessage())
 
 
-class Ended(KeyboardInterrupt):
-    """The signal `args[0]` came."""
-
-
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
     Exits with 0, 1 (failure), 2 (usage), 130 (interrupted), 141 (who read its output left: `unirender ... | head`), 143
-    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`).
+    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`, `unirender.training.stopping`).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv

@@ -62,6 +62,10 @@ def _unknown_words(command: Any, argv: Sequence[str], unknown: Sequence[str], pr
     return f"{', '.join(options or unknown)}: {wrong} `{path}`{meant} `{path} --help` lists what it takes"
 
 
+class Ended(KeyboardInterrupt):
+    """The signal `args[0]` came."""
+
+
 def interrupted(error: BaseException) -> bool:
     """Whether an error is Ctrl-C, or comes of it: Dr.Jit's loops wrap it."""
     return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))

@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import io
 import json
+import socket
 import struct
 import sys
 import tempfile
@@ -24,6 +25,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender_evaluation.demo import jobs, panels, server, session
+from unirender_evaluation.demo.address import check_address
 from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.demo.downloads import archives
 from unirender_evaluation.demo.session import Controls, Subject
@@ -299,6 +301,35 @@ def test_options_outside_their_range_are_refused(wrong: dict[str, Any]) -> None:
     Demo().check()
     with pytest.raises(UsageError, match=r"--\w"):
         Demo(**wrong).check()
+
+
+def test_an_address_is_looked_at_before_the_model_is_loaded(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unknown(*arguments: object, **options: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    def said(*arguments: str) -> str:
+        with pytest.raises(SystemExit) as stop:
+            main(["demo", *arguments])
+        assert stop.value.code == 1
+        found = capsys.readouterr()
+        assert found.out == ""  # not even that the model is being loaded
+        return found.err
+
+    monkeypatch.setattr("unirender_evaluation.demo.command.find_spec", lambda name: name)  # gradio may be missing here
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = str(listener.getsockname()[1])
+        for host in ("127.0.0.1", "0.0.0.0"):
+            assert f"--port {port}: cannot be listened on (Address already in use)" in said(
+                "--port", port, "--host", host
+            )
+    check_address("127.0.0.1", int(port))  # the twin
+    assert "--host 192.0.2.1: is no address of this machine" in said(
+        "--host", "192.0.2.1", "--port", port
+    )  # of RFC 5737
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    assert "--host nosuch.invalid: cannot be looked up (Name or service" in said("--host", "nosuch.invalid")
 
 
 def test_without_gradio_the_command_says_what_to_install(

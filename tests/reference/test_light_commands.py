@@ -133,6 +133,21 @@ def test_a_wrong_command_line(command: Lights | Exposure) -> None:
         command.run()
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"holdout": 2}, "--holdout: of a folder of lights, expected --pool beside it"),
+        ({"share": 1.0}, "--share: of a folder of lights that seeds draw from, expected --pool and --draw beside it"),
+        ({"share": 1.0, "draw": (0,)}, "--share: .* expected --pool and --draw"),
+        ({"share": 1.0, "pool": Path("lights")}, "--share: .* expected --pool and --draw"),
+        ({"share": 1.0, "holdout": 2, "draw": (0,)}, "--holdout and --share: "),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(options: dict, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        Lights(**options).run()
+
+
 def test_a_folder_without_lights(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="no maps or photographs for the train side"):
         Lights(pool=tmp_path).run()

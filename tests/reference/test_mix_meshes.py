@@ -323,6 +323,17 @@ def test_one_process_writes_at_a_time(tmp_path):
         mix_meshes(MixMeshes((str(meshes),), out, count=1))
 
 
+def test_all_that_were_there_are_counted(tmp_path, capsys):
+    meshes = folder_of_boxes(tmp_path)
+    for count, said in (
+        (6, "6 meshes made, 0 were there"),
+        (4, "0 meshes made, 6 were there"),
+        (7, "1 meshes made, 6"),
+    ):
+        assert MixMeshes((str(meshes),), tmp_path / "out", count=count).run() == 0
+        assert said in capsys.readouterr().out
+
+
 def test_refused_meshes_are_named_and_others_take_their_place(tmp_path, capsys):
     meshes = folder_of_boxes(tmp_path)
     (meshes / "broken.obj").write_text("v 0 0 0\n")

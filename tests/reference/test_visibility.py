@@ -82,6 +82,44 @@ def test_what_a_gutter_hides_is_what_its_other_side_covers() -> None:
     assert np.array_equal(visible, again)
 
 
+def box() -> MeshObject:
+    """Seen from the front: its front face alone, whose edges cut pixels in parts."""
+    corners, faces, normals = [], [], []
+    half = np.array([0.62, 0.54, np.sqrt(1 - 0.62**2 - 0.54**2)])
+    for axis in range(3):
+        for side in (-1, 1):
+            u, v = np.roll(np.eye(3), -axis, axis=0)[1:]  # with n = axis a right-handed frame
+            n, first = side * np.eye(3)[axis], len(corners)
+            corners += [(n + a * u + side * b * v) * half for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+            normals += [n] * 4
+            faces += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
+    return MeshObject(
+        name="box",
+        family="mesh",
+        vertices=np.asarray(corners, np.float32),
+        faces=np.asarray(faces, np.int32),
+        normals=np.asarray(normals, np.float32),
+        uv=None,
+        albedo=np.full(3, 0.5, np.float32),
+    )
+
+
+def test_what_misses_the_object_along_its_silhouette_does_not_count() -> None:
+    renderer = Renderer(box(), resolution=SIZE)
+    mask = renderer.geometry(25).require("mask")["mask"][..., 0]
+    surface = mask >= COVERED
+    visible = trace_visible(renderer, surface, seed=1)
+    z = environment_directions(*DIRECTIONS).reshape(-1, 3)[:, 2]
+    edge = mask[surface] < 0.9
+    assert edge.mean() > 0.1  # of the front face, two thirds of each pixel
+    for pixels in (edge, ~edge):
+        assert visible[pixels][:, z > 0.01].all()
+        assert not visible[pixels][:, z < -0.01].any()
+    corner = np.zeros_like(surface)
+    corner[0, 0] = True  # of the picture, where nothing is
+    assert trace_visible(renderer, corner, seed=1).all()
+
+
 def test_a_data_set_of_it_is_read_back(tmp_path: Path) -> None:
     command = Dataset(out=tmp_path / "data", vary="visibility", objects=2, resolution=16, workers=1, turn_objects=True)
     assert command.run() == 0

@@ -1,13 +1,15 @@
 """How sure a checkpoint is of materials: the line, what reads by it, and the command that fits it."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from synthetic_shards import group_members, write_dataset, write_shard
-from tiny_models import MODEL, SIZE, make_pipeline
+from tiny_models import MODEL, SIZE, TRAIN, make_pipeline
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
@@ -18,6 +20,7 @@ from unirender.shipped import checkpoint_folder
 from unirender.training.calibrate import Calibrate, Line, fit, object_of, readings, write_calibrated
 from unirender.training.data import GroupDataset
 from unirender.training.start import read_start
+from unirender.training.trainer import RunConfig, Trainer
 
 
 @pytest.fixture(scope="module")
@@ -247,16 +250,26 @@ def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path)
 def test_training_on_says_that_the_line_is_not_inherited(
     checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    read_start(MODEL, checkpoint)
+    config = dataclasses.replace(TRAIN, model=MODEL)
+    trainer = Trainer(config, RunConfig(tmp_path / "run", steps=1), torch.device("cpu"), torch.float32)
+    read_start(MODEL, checkpoint).apply(trainer)
     assert "calibration" not in capsys.readouterr().err
     (tmp_path / "lined").mkdir()
     write_calibrated(checkpoint, tmp_path / "lined", "lined", {"roughness": Line(0.5, 0.2, 0.1, 0.05, 0.01)}, {})
-    read_start(MODEL, tmp_path / "lined")
+    read_start(MODEL, tmp_path / "lined").apply(trainer)
     assert "run `unirender calibrate` on the new ones" in capsys.readouterr().err
     told: list[str] = []  # of several processes the first one alone says it
-    read_start(MODEL, tmp_path / "lined", tell=told.append)
+    start = read_start(MODEL, tmp_path / "lined")
+    start.apply(trainer, told.append)
     assert len(told) == 1
     assert capsys.readouterr().err.count("calibrate") == 0
+    wider = dataclasses.replace(MODEL, cross_attention_dim=2 * MODEL.cross_attention_dim)
+    other = dataclasses.replace(TRAIN, model=wider)
+    with pytest.raises(UnirenderError, match="expected the same network"):
+        start.apply(
+            Trainer(other, RunConfig(tmp_path / "run", steps=1), torch.device("cpu"), torch.float32), told.append
+        )
+    assert len(told) == 1  # nothing of weights that are refused
 
 
 def test_what_ships_has_lines_that_a_pipeline_takes() -> None:

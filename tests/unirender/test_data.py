@@ -331,6 +331,22 @@ def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
         GroupDataset(altered)
 
 
+def test_a_shard_of_another_size_is_noticed_although_it_was_packed(tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "data", size=16)
+    manifest = folder / "manifest.json"
+    entries = json.loads(manifest.read_text())["shards"]
+    entries = [entry | {"bytes": (folder / entry["name"]).stat().st_size} for entry in entries]
+    manifest.write_text(json.dumps({"shards": entries}))
+    GroupDataset(folder)
+    first = folder / entries[0]["name"]
+    first.write_bytes(first.read_bytes()[:-512])
+    said = (
+        rf"{first.name}: has {entries[0]['bytes'] - 512:,} bytes, expected the {entries[0]['bytes']:,} of the manifest"
+    )
+    with pytest.raises(UnirenderError, match=said):
+        GroupDataset(folder)
+
+
 def _broken(tmp_path: Path, change) -> Path:
     members = group_members("basis", 16, 1, (40,), (0, 50, 100), 7)
     change(members)
@@ -346,6 +362,10 @@ def _broken(tmp_path: Path, change) -> Path:
         (lambda m: m.pop("l0.m050_r040.exr"), "full basis grid"),
         (lambda m: m.update({"l0.m050_r040.exr": b"no exr"}), "not a readable OpenEXR"),
         (lambda m: m.update({"l0.mystery.exr": b""}), "unknown member"),
+        (
+            lambda m: m.update({"visible.npy": b""}),
+            "has no pictures but visible.npy.* `unirender train-visibility` learns",
+        ),
         (lambda m: m.update({"l0.maps.exr": m["l0.m050_r040.exr"]}), "is missing"),
     ],
 )

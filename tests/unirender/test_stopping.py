@@ -1,5 +1,6 @@
 """Asked to stop, a training ends its step and saves; asked twice, it leaves at once."""
 
+import errno
 import os
 import signal
 import threading
@@ -11,6 +12,8 @@ import torch
 from tiny_models import TRAIN, make_batch
 from torch import Tensor
 
+from unirender import cli
+from unirender.command_line import Ended
 from unirender.training.checkpoint import load_state
 from unirender.training.stopping import SIGNALS, stopping_gently
 from unirender.training.trainer import RunConfig, Trainer
@@ -63,6 +66,36 @@ def test_the_step_is_ended_and_saved_and_nothing_is_lost(number: int, tmp_path: 
     rest, whole = fit(tmp_path / "stopped", Source()), fit(tmp_path / "whole", Source())
     assert rest == whole[2:]  # bit for bit
     assert len(whole) == STEPS
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_the_status_tells_the_signal(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a shell reports it, and a batch system that starts the run again looks for."""
+    monkeypatch.setattr(cli, "run", lambda command: fit(tmp_path, Source(2, (number,))))
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["train", "--data", "data"])
+    assert stopped.value.code == 128 + number
+
+
+def test_a_terminal_that_has_closed_takes_nothing_of_the_run(tmp_path: Path) -> None:
+    def closed(line: dict[str, Any]) -> None:
+        if line["step"] == 2:
+            raise OSError(errno.EIO, "Input/output error")
+
+    for number, step in ((signal.SIGTERM, None), (signal.SIGHUP, 2)):  # of the first it is no consequence
+        trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=STEPS, log_every=1), torch.device("cpu"), torch.float32)
+        with pytest.raises(Ended if step else OSError):
+            trainer.fit(Source(2, (number,)), closed)
+        state = load_state(tmp_path)
+        assert (None if state is None else state["step"]) == step
+
+
+def test_nohup_is_respected(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert len(fit(tmp_path, Source(2, (signal.SIGHUP,)))) == STEPS
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_who_asks_twice_is_not_made_to_wait(tmp_path: Path) -> None:

@@ -6,17 +6,20 @@ import io
 import json
 import math
 import os
+import re
+import shutil
 import threading
 import time
 from pathlib import Path
 from typing import Any, Literal
 
+import diffusers
 import numpy as np
 import pytest
 import torch
 from rich.console import Console
 from synthetic_shards import write_dataset
-from tiny_models import TRAIN, make_batch
+from tiny_models import TRAIN, make_batch, make_pipeline
 from torch import Tensor, nn
 
 from unirender.diffusion.sampling import infer_attributes, infer_image
@@ -528,6 +531,55 @@ def test_a_pipeline_tells_the_runs_that_it_continues(tmp_path: Path) -> None:
     (folders[-1] / "training.json").write_text("[")
     with pytest.raises(UnirenderError, match="cannot be read as the record of a training"):
         read_history(folders[-1])
+
+
+def test_a_resume_with_another_beginning_is_refused(tmp_path: Path) -> None:
+    """What the state holds goes before all weights: another --init would be read and do nothing."""
+    for seed in (0, 1):
+        make_pipeline(seed).save_pretrained(tmp_path / f"{seed}")
+
+    def resumed(name: str, init: Path | None) -> Trainer:
+        trainer = Trainer(TRAIN, RunConfig(tmp_path / name, steps=2), CPU, torch.float32)
+        read_start(TRAIN.model, init).apply(trainer)
+        trainer.resume(SyntheticSource())
+        return trainer
+
+    for name, init in (("chance", None), ("first", tmp_path / "0")):
+        resumed(name, init).save(SyntheticSource())
+        again = resumed(name, init)  # the same command line
+        assert again.begun_with == resumed(name, None).begun_with  # who asks for nothing
+        again.save(SyntheticSource())
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copytree(tmp_path / "0", tmp_path / "elsewhere" / "moved")
+    resumed("first", tmp_path / "elsewhere" / "moved")  # the same weights
+    for name, before, to_do in (
+        ("chance", "random weights", "leave --init out"),
+        ("first", f"--init {tmp_path / '0'}", f"repeat --init {tmp_path / '0'}"),
+    ):
+        said = f"begun with {before}, not with --init {tmp_path / '1'}; {to_do} to go on with it, or pass another --out"
+        with pytest.raises(UnirenderError, match=re.escape(said)):
+            resumed(name, tmp_path / "1")
+    shutil.rmtree(tmp_path / "0")
+    shutil.copytree(tmp_path / "1", tmp_path / "0")
+    resumed("first", tmp_path / "0")  # the same command line, whatever has become of the folder
+
+    state = load_state(tmp_path / "first")
+    assert state is not None
+    save_state(tmp_path / "first", {key: value for key, value in state.items() if key != "begun_with"})
+    older = resumed("first", tmp_path / "elsewhere" / "moved")
+    assert older.begun_with is None
+    older.save(SyntheticSource())
+    resumed("first", tmp_path / "1")
+
+
+def test_loading_what_a_run_begins_with_shows_no_bars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    diffusers.utils.logging.enable_progress_bar()
+    data = write_dataset(tmp_path / "data", size=64)
+    make_pipeline(0).save_pretrained(tmp_path / "other")
+    options = Train(data, out=tmp_path / "run", init=tmp_path / "other", steps=1)
+    with pytest.raises(UnirenderError, match="expected the same network"):
+        train(options, options.check(), tmp_path / "run")
+    assert "Loading" not in capsys.readouterr().err
 
 
 def test_another_prior_begins_with_its_own_picture(tmp_path: Path) -> None:

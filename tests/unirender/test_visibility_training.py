@@ -3,6 +3,7 @@
 import io
 import json
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,14 @@ from safetensors.torch import load_file
 from seen_shapes import CAMERA, ball, gutter
 from synthetic_shards import write_shard
 
+from unirender import cli
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.training.checkpoint import load_state
+from unirender.training.stopping import SIGNALS
 from unirender.training.visibility import TrainVisibility, rate, split, terms, train_visibility
 from unirender.training.visibility_data import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
 
@@ -175,6 +179,24 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     assert steps == [0, 1, 2, 3, 4]
     with pytest.raises(UnirenderError, match="other options or data"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
+    number: int, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from unirender.training import visibility
+
+    def asked(*arguments: object) -> float:
+        os.kill(os.getpid(), number)
+        return rate(*arguments)  # type: ignore[arg-type] - as it is called
+
+    monkeypatch.setattr(visibility, "rate", asked)
+    with pytest.raises(SystemExit) as stopped:
+        cli.main(["train-visibility", "--data", str(folder), "--out", str(tmp_path / "run"), "--batch-size", "1"])
+    assert stopped.value.code == 128 + number
+    assert capsys.readouterr().err.endswith("unirender: interrupted; run the same command again to go on\n")
+    assert load_state(tmp_path / "run")["step"] == 1  # pyright: ignore[reportOptionalSubscript] - it was saved
 
 
 def test_options_are_checked(tmp_path: Path) -> None:

@@ -57,6 +57,9 @@ class Demo:
         self.check()
         if find_spec("gradio") is None:  # which `served` imports, after it has told it to be quiet
             raise UnirenderError("demo: gradio is not installed; pip install 'unirender[demo]'")
+        from unirender_evaluation.demo.address import check_address
+
+        check_address(self.host, self.port)
         from unirender_evaluation.demo.jobs import start
         from unirender_evaluation.demo.server import serve
         from unirender_evaluation.demo.uploads import Limits

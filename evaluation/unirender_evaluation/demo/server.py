@@ -86,7 +86,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
             )
         except OSError as error:
             raise UnirenderError(
-                f"demo: cannot listen on {host}:{port}, expected a free port of this machine; choose another --port"
+                f"demo: cannot listen on {host}:{port} ({error}); choose another --port, or --host"
             ) from error
         try:
             yield address

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
+from unirender_reference.measure.output import check_file, write_file
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -48,6 +49,7 @@ class Check:
             raise UsageError("--twins runs every perturbation: leave --perturb out")
         if self.json is not None and not self.json.absolute().parent.is_dir():
             raise UsageError(f"--json: got {self.json}, expected a file in an existing folder")
+        check_file("--json", self.json)
         return self._twins(names) if self.twins else self._table(names)
 
     def _table(self, names: tuple[str, ...]) -> int:
@@ -108,7 +110,7 @@ class Check:
 
     def _write(self, rows: list[dict[str, object]]) -> None:
         if self.json is not None:
-            self.json.write_text(json.dumps(rows, indent=2) + "\n")
+            write_file("--json", self.json, json.dumps(rows, indent=2) + "\n")
 
 
 def _console() -> "Console":

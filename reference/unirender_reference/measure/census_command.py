@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
+from unirender_reference.measure.output import check_file, write_file
 
 if TYPE_CHECKING:
     from unirender_reference.measure.census import BadPixel, ObjectCensus
@@ -43,6 +44,7 @@ class Census:
                 raise UsageError(f"--{name}: got {getattr(self, name)}, expected 0 or more")
         if self.json is not None and not self.json.absolute().parent.is_dir():
             raise UsageError(f"--json: got {self.json}, expected a file in an existing folder")
+        check_file("--json", self.json)
         from unirender_reference.measure.census import KINDS, run_census, timed
 
         workers = self.workers or os.cpu_count() or 1
@@ -59,7 +61,7 @@ class Census:
             console.print(self._breakdown(bad))
         console.print(self._summary(censuses, written, seconds, workers), highlight=False)
         if self.json is not None:
-            self.json.write_text(json.dumps([asdict(pixel) for pixel in bad], indent=2) + "\n")
+            write_file("--json", self.json, json.dumps([asdict(pixel) for pixel in bad], indent=2) + "\n")
         return 1 if written else 0
 
     def _breakdown(self, bad: list["BadPixel"]) -> object:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_reference.measure.output import check_file, png_bytes, write_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -50,12 +51,13 @@ class Sheet:
             )
         if not self.out.absolute().parent.is_dir():
             raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into")
+        check_file("--out", self.out)
         style = LIGHT if self.background == "light" else DARK
         rows, labels = [], []
         for spec in self.specs():
             rows.append(buffer_tiles(render_sample(spec, self.spp), style.background))
             labels.append(_label(spec))
-        table_sheet(rows, labels, COLUMNS, style).save(self.out, format="PNG", optimize=True)
+        write_file("--out", self.out, png_bytes(table_sheet(rows, labels, COLUMNS, style)))
         print(f"{self.out}: {len(rows)} objects x {len(COLUMNS)} buffers, {self.spp} spp")
         return 0
 

@@ -9,13 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_reference.measure.output import check_file, png_bytes, write_file, writing
 
 if TYPE_CHECKING:
+    from PIL import Image
     from rich.table import Table
 
     from unirender_reference.lights import Light, LightPool
     from unirender_reference.lights.pool import Split
 
+HOLDOUT, SHARE = 8, 0.5
 MOST_COMPARED = 1000  # lights that are compared across the splits
 MOST_SHOWN = 120  # lights on a sheet
 THUMBNAIL, COLUMNS = (80, 160), 6
@@ -32,10 +35,10 @@ class Lights:
     pool: Path | None = None
     """Your folder of HDR, EXR or PFM maps and photographs: every file is read, and listed or refused with its reason.
     With `--draw`: a pool that seeds draw from."""
-    holdout: int = 8
+    holdout: int = HOLDOUT
     """Every so many-th place of that folder is for test."""
-    share: float = 0.5
-    """Of the seeds that draw from that folder, in (0, 1]."""
+    share: float = SHARE
+    """Of the seeds that draw from that folder, in (0, 1]; with `--pool` and `--draw`."""
     export: Path | None = None
     """New folder for the lights shown: an EXR (float32, on the contract's grid) and a PNG preview of each."""
     sheet: Path | None = None
@@ -56,8 +59,9 @@ class Lights:
                     shown.kept.append((split, light))
                 if folder is not None:
                     _export(folder, light)
-            if self.sheet is not None:
-                _write_sheet(self.sheet, shown.kept[:MOST_SHOWN])
+            if self.sheet is not None and not shown.kept:
+                reasons = "; ".join(failure["reason"] for failure in shown.failures[:1])
+                raise UnirenderError(f"{self.sheet}: no lights to show, expected at least one; {reasons}")
         found = {"kinds": kind_rows(), "lights": shown.rows, "failures": shown.failures, "notes": []}
         count = len(shown.rows)
         if not self.draw and self.split is None:
@@ -71,6 +75,8 @@ class Lights:
             print(json.dumps(found, indent=2))
         else:
             self._print(found)
+        if self.sheet is not None:
+            write_file("--sheet", self.sheet, png_bytes(_sheet(shown.kept[:MOST_SHOWN])))
         return 1 if shown.failures else 0
 
     def _check(self) -> None:
@@ -80,8 +86,17 @@ class Lights:
             raise UsageError(
                 f"--holdout {self.holdout}, --share {self.share:g}: expected at least 2, and a share in (0, 1]"
             )
+        given = {"--holdout": self.holdout != HOLDOUT, "--share": self.share != SHARE}
+        useless = {"--holdout": self.pool is None, "--share": self.pool is None or not self.draw}
+        if found := [option for option in given if given[option] and useless[option]]:
+            raise UsageError(
+                f"{' and '.join(found)}: of a folder of lights{' that seeds draw from' if '--share' in found else ''}, "
+                f"expected {'--pool and --draw' if '--share' in found else '--pool'} beside it"
+            )
         if self.export is not None and self.export.exists():
             raise UnirenderError(f"{self.export}: is there already, expected a new folder; give another name")
+        check_file("--export", self.export)
+        check_file("--sheet", self.sheet)
 
     def _sides(self) -> "dict[Split, LightPool | None]":
         """The sides that were asked for, each with its part of the user's folder if there is one.
@@ -163,12 +178,13 @@ def _new_folder(path: Path | None) -> Iterator[Path | None]:
     if path is None:
         yield None
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-        folder = Path(scratch) / path.name
-        folder.mkdir()
-        yield folder
-        folder.rename(path)
+    with writing(f"--export {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
+            folder = Path(scratch) / path.name
+            folder.mkdir()
+            yield folder
+            folder.rename(path)
 
 
 def _export(folder: Path, light: "Light") -> None:
@@ -186,18 +202,14 @@ def _export(folder: Path, light: "Light") -> None:
     Image.fromarray(pixels(environment_preview(light.environment))).save(path.with_suffix(".png"))
 
 
-def _write_sheet(path: Path, lights: "list[tuple[Split, Light]]") -> None:
+def _sheet(lights: "list[tuple[Split, Light]]") -> "Image.Image":
     """Thumbnails of the lights, each over its name, split and what it is."""
     from unirender.lighting import resample_environment
     from unirender_reference.lights.summary import about
     from unirender_reference.sheets import captioned_sheet, environment_preview
 
-    if not lights:
-        raise UnirenderError(f"{path}: no lights to show, expected at least one; see the reasons above")
     tiles = [environment_preview(resample_environment(light.environment, THUMBNAIL)) for _, light in lights]
-    sheet = captioned_sheet(tiles, [f"{light.name}\n{side}, {about(light)}" for side, light in lights], COLUMNS)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sheet.save(path, format="PNG", optimize=True)
+    return captioned_sheet(tiles, [f"{light.name}\n{side}, {about(light)}" for side, light in lights], COLUMNS)
 
 
 def _kinds_table(rows: list[dict[str, Any]]) -> "Table":

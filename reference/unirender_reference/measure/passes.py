@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_reference.measure.output import writing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,7 +29,7 @@ class Passes:
     """
 
     out: Path
-    """Folder for the two files; made if it is not there."""
+    """New folder for the two files."""
     object: int = 14
     """Seed of the procedural object and of its light."""
     split: Literal["train", "test"] = "train"
@@ -54,6 +55,8 @@ class Passes:
         """Returns the exit status: 1 where a sum is not the render."""
         from rich.console import Console
 
+        from unirender.files import new_folder
+
         if self.resolution < 8 or self.spp < 8 or self.object < 0:
             raise UsageError(
                 f"--resolution {self.resolution}, --spp {self.spp}, --object {self.object}: expected at least 8 "
@@ -62,12 +65,12 @@ class Passes:
         for name, value in (("roughness", self.roughness), ("metallic", self.metallic)):
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a value in [0, 1], or None for the object's own map")
-        renders = self.render()
-        try:
-            self.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UnirenderError(f"{self.out}: cannot be made ({error.strerror}), expected a folder") from error
-        self.write(renders)
+        if self.out.is_dir() and any(self.out.iterdir()):
+            raise UnirenderError(f"{self.out}: exists and is not empty, expected a new folder; choose another --out")
+        with new_folder(self.out) as folder:
+            renders = self.render()
+            with writing(str(self.out)):
+                self.write(renders, folder)
         console = Console()
         sums = renders.z_tests()
         console.print(_effects_table(renders))
@@ -114,7 +117,7 @@ class Passes:
             material=(self.roughness, self.metallic),
         )
 
-    def write(self, renders: "Renders") -> None:
+    def write(self, renders: "Renders", folder: Path) -> None:
         """Writes the two files."""
         from unirender.exr import write_exr
         from unirender_reference.render import renderer_provenance
@@ -128,8 +131,8 @@ class Passes:
             "seed": str(self.seed),
             "exposure_factor": repr(renders.factor),
         }
-        write_exr(self.out / "passes.exr", renders.channels(), half=False, attributes=attributes)
-        _sheet(renders).save(self.out / "passes.png", format="PNG", optimize=True)
+        write_exr(folder / "passes.exr", renders.channels(), half=False, attributes=attributes)
+        _sheet(renders).save(folder / "passes.png", format="PNG", optimize=True)
 
 
 @dataclass(frozen=True)

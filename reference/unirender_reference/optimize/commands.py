@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_reference.measure.output import writing
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.option_checks import require_least
@@ -131,18 +132,19 @@ class Optimize:
         with live_report(Console(stderr=True, quiet=not self.progress)) as report:
             began = time.perf_counter()
             start = None if predict is None else self._start(views, obj, predict, report)
-            optimize(
-                views,
-                obj if start is None else None,
-                self.config,
-                self.out,
-                start,
-                report,
-                place,
-                pictures=self.pictures,
-                threads=self.threads,
-                began=began,
-            )
+            with writing(str(self.out), "mend that and run the same command again to go on"):
+                optimize(
+                    views,
+                    obj if start is None else None,
+                    self.config,
+                    self.out,
+                    start,
+                    report,
+                    place,
+                    pictures=self.pictures,
+                    threads=self.threads,
+                    began=began,
+                )
         record = json.loads((self.out / SOLUTION_FILE).read_text(encoding="utf-8"))
         figures = ", ".join(f"{name.removesuffix('_psnr_db')} {db:.2f} dB" for name, db in record["figures"].items())
         print(
@@ -234,9 +236,10 @@ class Optimize:
             again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
             meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(self.single)}
-            write_result(folder, found, meta, again.image_linear)
-            again.strip.save(folder / "views.png")
-            (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
+            with writing(str(self.out)):
+                write_result(folder, found, meta, again.image_linear)
+                again.strip.save(folder / "views.png")
+                (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
         print(f"{self.out}: {seconds:.1f} s; masked PSNR of the picture, rendered again: {again.psnr_db:.2f} dB")
         return 0
 

@@ -101,6 +101,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     from unirender.shipped import checkpoint_folder
     from unirender.training.card import CARD_FILE, card_text
     from unirender.training.export import TRAINING_FILE, read_history
+    from unirender.training.writing import writing
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     folders = [checkpoint_folder(path) for path in checkpoints]
@@ -120,13 +121,14 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         vae = None if first.vae is None else _fresh(first.vae, first.vae.state_dict(), torch.float32)
         model = _fresh(first.dual_stream, total, getattr(torch, store))
         pipeline = UniRenderPipeline(model, first.scheduler, vae, material=first.config["material"])
-        pipeline.save_pretrained(new, safe_serialization=True)
-        for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
-            weights.chmod(0o644)
         facts = averaged_facts(histories, [_label(folder) for folder in folders], shares) | {"stored_as": store}
         facts.setdefault("train", {"model": {"codec": model.config["codec"]}})  # the card's licence depends on it
-        (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
-        (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
+        with writing(out, "free some space or choose another --out"):
+            pipeline.save_pretrained(new, safe_serialization=True)
+            for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
+                weights.chmod(0o644)
+            (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+            (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
 
 
 def averaged_facts(

@@ -115,6 +115,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.training.data import GroupDataset
     from unirender.training.export import read_history
     from unirender.training.facts import dataset_facts
+    from unirender.training.writing import writing
 
     checkpoint = checkpoint_folder(options.checkpoint)
     pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None).to(resolve_device("auto"))
@@ -139,7 +140,8 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
         if not kept:
             raise _NothingKept
         about = {"data": dataset_facts(options.data, data), "pictures": options.pictures, "seed": options.seed}
-        write_calibrated(checkpoint, folder, options.out.name, kept, about)
+        with writing(options.out, "free some space or choose another --out"):
+            write_calibrated(checkpoint, folder, options.out.name, kept, about)
         return kept
     return {}
 

@@ -1,5 +1,6 @@
 """The training state on disk: one file, written aside, synced and renamed, so that a killed run loses nothing older."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -12,20 +13,31 @@ import torch
 
 from unirender.errors import UnirenderError
 from unirender.training.presets import TrainConfig
+from unirender.training.writing import writing
 
 STATE_FILE = "state.pt"
 PROLONGABLE = "steps"  # a resumed run may be given another length
 
 
 def save_state(folder: Path, state: dict[str, Any]) -> Path:
-    """Writes tensors, numbers, strings, lists and dicts to `folder/state.pt`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Writes tensors, numbers, strings, lists and dicts to `folder/state.pt`.
+
+    Raises:
+        UnirenderError: it cannot be written; the state that was there stays.
+    """
     path, partial = folder / STATE_FILE, folder / f"{STATE_FILE}.partial"
-    with partial.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    with writing(path):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with partial.open("wb") as file:
+                torch.save(state, file)
+                file.flush()
+                os.fsync(file.fileno())
+            partial.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise
     return path
 
 

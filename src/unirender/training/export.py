@@ -16,6 +16,7 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.checkpoint import replace_folder
 from unirender.training.facts import training_facts
+from unirender.training.writing import writing
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
@@ -68,17 +69,25 @@ def export_pipeline(
 
     Other files, by name, stand in `beside`. The folder is moved into place when it is complete. Weights are stored as
     `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
+
+    Raises:
+        UnirenderError: it cannot be written; what was there stays.
     """
     partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
-    pipeline.save_pretrained(partial, safe_serialization=True)
-    for path in partial.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
-        path.chmod(0o644)
     facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}
-    (partial / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
-    for name, text in beside.items():
-        (partial / name).write_text(text)
     chosen = json.loads(beside[SCORES_FILE]) if SCORES_FILE in beside else None
-    (partial / CARD_FILE).write_text(card_text(folder.name, facts, chosen), encoding="utf-8")
-    return replace_folder(folder, partial)
+    try:
+        with writing(folder):
+            pipeline.save_pretrained(partial, safe_serialization=True)
+            for path in partial.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
+                path.chmod(0o644)
+            (partial / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
+            for name, text in beside.items():
+                (partial / name).write_text(text)
+            (partial / CARD_FILE).write_text(card_text(folder.name, facts, chosen), encoding="utf-8")
+            return replace_folder(folder, partial)
+    except UnirenderError:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise

@@ -89,7 +89,7 @@ def list_shards(folder: str | Path) -> dict[Path, str | None]:
     the manifest gives it no groups, is left out.
 
     Raises:
-        UnirenderError: there is none, or one that the manifest lists is missing.
+        UnirenderError: there is none, or one that the manifest lists is missing or of another size.
     """
     folder = Path(folder)
     parts = [folder] if _is_data(folder) else sorted(part for part in folder.glob("*/") if _is_data(part))
@@ -108,9 +108,10 @@ def _own_shards(folder: Path) -> dict[Path, str | None]:
     """Those that lie in the folder itself.
 
     Raises:
-        UnirenderError: a broken manifest, or one that lists a shard that is missing.
+        UnirenderError: a broken manifest, or one that lists a shard that is missing or of another size.
     """
     listed: dict[str, str] = {}
+    sizes: dict[str, int] = {}
     empty: set[str] = set()
     manifest = folder / "manifest.json"
     if manifest.exists():
@@ -118,6 +119,7 @@ def _own_shards(folder: Path) -> dict[Path, str | None]:
             journal = _journal_entries(folder / "shards.jsonl")  # first: the manifest takes its lines over
             entries = journal + json.loads(manifest.read_text())["shards"]
             listed = {entry["name"]: entry["sha256"] for entry in entries}
+            sizes = {entry["name"]: int(entry["bytes"]) for entry in entries if "bytes" in entry}
             empty = {entry["name"] for entry in entries if entry.get("groups") == 0}
         except (ValueError, KeyError, TypeError) as error:
             raise UnirenderError(f"{manifest}: not a readable manifest ({error!r}); remake the dataset") from error
@@ -125,6 +127,12 @@ def _own_shards(folder: Path) -> dict[Path, str | None]:
     missing = sorted(set(listed) - set(present))
     if missing:
         raise UnirenderError(f"{folder}: shards {', '.join(missing)} of the manifest are missing; remake the dataset")
+    for name in sorted(sizes.keys() & present.keys()):
+        if (size := present[name].stat().st_size) != sizes[name]:
+            raise UnirenderError(
+                f"{present[name]}: has {size:,} bytes, expected the {sizes[name]:,} of the manifest; run the same "
+                "`unirender dataset` again, which renders it anew"
+            )
     return {path: listed.get(name) for name, path in present.items() if name not in empty}
 
 
@@ -238,6 +246,11 @@ class _Packer:
             if name in ("json", "shared.exr"):
                 continue
             match = _LIGHT.fullmatch(name)
+            if name == "visible.npy":
+                raise UnirenderError(
+                    f"{where}: has no pictures but {name}, which directions the object hides; `unirender "
+                    "train-visibility` learns from that, `unirender train` from data of another --vary"
+                )
             if match is None:
                 raise UnirenderError(f"{where}: unknown member {name!r}; was it written by another version?")
             light = int(match["light"])

@@ -13,6 +13,7 @@ from unirender.diffusion.sampling import infer_attributes, infer_image
 from unirender.models.conditioning import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
+from unirender.training.writing import writing
 
 SHEET_ROWS = 4  # samples of a sheet
 COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "environment")
@@ -35,10 +36,11 @@ def training_sheet(loss: LossFunction, batch: Maps, rows: int = SHEET_ROWS) -> U
 
 def save_sheet(path: Path, sheet: UInt8[np.ndarray, "h w 3"]) -> None:
     """Writes a PNG; it appears complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial.png")
-    Image.fromarray(sheet).save(partial)
-    partial.replace(path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(sheet).save(partial)  # which takes back what it cannot end
+        partial.replace(path)
 
 
 def _line(maps: Maps, row: int, mask: Float[Tensor, "1 H W"]) -> UInt8[np.ndarray, "H 7*W 3"]:

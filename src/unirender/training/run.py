@@ -14,6 +14,7 @@ from unirender.options import Device, DType, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
+from unirender.training.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.training.validation import Validate
@@ -163,8 +164,10 @@ class Train:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
+        out = self.out or cache_dir() / "runs" / self.preset
+        check_out(out)
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        pipeline = train(self, config, self.out or cache_dir() / "runs" / self.preset, validate)
+        pipeline = train(self, config, out, validate)
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
@@ -172,6 +175,7 @@ class Train:
 
 def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
+    import diffusers
     import torch
     from rich.console import Console
 
@@ -211,9 +215,10 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     tell = notice if processes.is_main else lambda text: None
-    start = read_start(config.model, options.init, options.init_from, tell)
+    diffusers.utils.logging.disable_progress_bar()  # of loading: small files
+    start = read_start(config.model, options.init, options.init_from)
     trainer = Trainer(config, run, device, dtype, processes, start.vae)
-    start.apply(trainer)
+    start.apply(trainer, tell)
     del start  # Stable Diffusion's U-Net is no longer needed
     if options.gradient_checkpointing:
         trainer.model.enable_gradient_checkpointing()

@@ -13,6 +13,7 @@ from typing import Any
 from unirender.files import replace_file
 from unirender.training.live import Report
 from unirender.training.processes import Processes
+from unirender.training.writing import writing
 
 LOG_FILE = "log.jsonl"
 OVERFLOW = "above_x_max_"  # prefix of entries that are left out where they are zero
@@ -42,9 +43,10 @@ class RunLog:
         """Writes a line, and reports it."""
         if not self.processes.is_main:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        with writing(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a") as file:
+                file.write(json.dumps(line) + "\n")
         report(line)
 
     def forget_after(self, step: int) -> None:
@@ -53,4 +55,5 @@ class RunLog:
             return
         lines = self.path.read_text().splitlines(keepends=True)
         kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
-        replace_file(self.path, "".join(kept))
+        with writing(self.path):
+            replace_file(self.path, "".join(kept))

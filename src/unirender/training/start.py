@@ -5,7 +5,7 @@ A state in the run's folder goes before all of them.
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffu
 from unirender.options import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
+from unirender.training.beginning import Beginning, beginning
 from unirender.training.export import read_history
 from unirender.training.presets import ModelConfig
 from unirender.training.trainer import Trainer
@@ -37,11 +38,13 @@ class Start:
         folder: of the pipeline.
         pipeline: trained before.
         diffusion: Stable Diffusion.
+        named: how the run's state knows it again.
     """
 
     folder: Path | None = None
     pipeline: UniRenderPipeline | None = None
     diffusion: StableDiffusion | None = None
+    named: Beginning = field(default_factory=dict)
 
     @property
     def vae(self) -> AutoencoderKL | None:
@@ -49,8 +52,12 @@ class Start:
         found = self.diffusion or self.pipeline
         return found.vae if found else None
 
-    def apply(self, trainer: Trainer) -> None:
+    def apply(self, trainer: Trainer, tell: Callable[[str], None] = notice) -> None:
         """Gives a trainer the weights.
+
+        Args:
+            trainer: that has not begun.
+            tell: is told what of the beginning is not taken over.
 
         Raises:
             UnirenderError: its network is another one.
@@ -59,23 +66,21 @@ class Start:
             begin_with_diffusion(trainer, self.diffusion)
         elif self.pipeline is not None and self.folder is not None:
             begin_with_network(trainer, self.pipeline.dual_stream, read_history(self.folder))
+            if self.pipeline.config["calibration"]:
+                own = "its calibration is that of its own weights"
+                tell(f"{self.folder}: {own}; run `unirender calibrate` on the new ones")
         else:
             load_features(trainer.model)
+        trainer.begun_with = self.named
 
 
-def read_start(
-    config: ModelConfig,
-    init: Path | None = None,
-    init_from: Path | None = None,
-    tell: Callable[[str], None] = notice,
-) -> Start:
+def read_start(config: ModelConfig, init: Path | None = None, init_from: Path | None = None) -> Start:
     """Reads what a run begins with, and looks whether the network can begin with it.
 
     Args:
         config: the network.
         init: folder of a trained pipeline, or the name of a shipped one.
         init_from: Stable Diffusion folder.
-        tell: is told what of the beginning is not taken over.
 
     Raises:
         UnirenderError: a folder cannot be used, or belongs to another network.
@@ -83,10 +88,10 @@ def read_start(
     if init_from is not None:
         diffusion = load_stable_diffusion(init_from)
         diffusion.check(dataclasses.asdict(config))
-        return Start(diffusion=diffusion)
+        return Start(diffusion=diffusion, named=beginning("--init-from", init_from, init_from, weights=False))
     if init is None:
         return Start()
-    init = checkpoint_folder(init)
+    given, init = init, checkpoint_folder(init)
     pipeline = UniRenderPipeline.from_pretrained(init)
     codec = pipeline.dual_stream.config["codec"]
     if codec != config.codec:
@@ -100,9 +105,7 @@ def read_start(
             f"{init}: its weights are those of {_KINDS[unified]}, expected {_KINDS[config.unified]}; choose the preset "
             "that the weights were trained with, or begin without --init"
         )
-    if pipeline.config["calibration"]:
-        tell(f"{init}: its calibration is that of its own weights; run `unirender calibrate` on the new ones")
-    return Start(init, pipeline)
+    return Start(init, pipeline, named=beginning("--init", given, init))
 
 
 def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequence[dict[str, Any]] = ()) -> None:

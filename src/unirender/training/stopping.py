@@ -1,7 +1,7 @@
 """Asked to stop, a training ends its step and saves: nothing of it is lost, and no weight is left half way.
 
-An interrupt from the keyboard and the SIGTERM of a batch system that wants its machine back are such a request. Who
-asks a second time is not made to wait.
+An interrupt from the keyboard, the SIGTERM of a batch system that wants its machine back and the SIGHUP of a terminal
+that closes are such a request. Who asks a second time is not made to wait.
 """
 
 import contextlib
@@ -11,19 +11,32 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from unirender.command_line import Ended
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass
 class StopRequest:
-    """Whether somebody asked."""
+    """The signal by which somebody asked; None: nobody has."""
 
-    asked: bool = False
+    signal: int | None = None
+
+    @property
+    def asked(self) -> bool:
+        """Whether somebody asked."""
+        return self.signal is not None
+
+    @contextlib.contextmanager
+    def unheard(self) -> Iterator[None]:
+        """For a block that prints: where the terminal has closed, nobody reads it, and that is no error."""
+        with contextlib.suppress(OSError) if self.signal == signal.SIGHUP else contextlib.nullcontext():
+            yield
 
 
 @contextlib.contextmanager
 def stopping_gently() -> Iterator[StopRequest]:
-    """Inside, the first of `SIGNALS` is a request, and the second a `KeyboardInterrupt`.
+    """Inside, the first of `SIGNALS` is a request, and the second an `Ended`. One that nohup has ignored stays ignored.
 
     In a thread other than the main one, where no signal arrives, nothing changes.
     """
@@ -34,10 +47,12 @@ def stopping_gently() -> Iterator[StopRequest]:
 
     def hear(number: int, frame: FrameType | None) -> None:
         if request.asked:
-            raise KeyboardInterrupt
-        request.asked = True
+            raise Ended(number)
+        request.signal = number
 
-    before = {number: signal.signal(number, hear) for number in SIGNALS}
+    hung_up_for_nobody = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    heard = [number for number in SIGNALS if not (number == signal.SIGHUP and hung_up_for_nobody)]
+    before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield request
     finally:

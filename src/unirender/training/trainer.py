@@ -22,11 +22,13 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import nn
 
+from unirender.command_line import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
+from unirender.training.beginning import Beginning, check_beginning
 from unirender.training.checkpoint import differences, load_state, plain, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
@@ -42,6 +44,7 @@ from unirender.training.source import BatchSource
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
+from unirender.training.writing import writing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +112,7 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
         self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
+        self.begun_with: Beginning | None = {}  # None: a state of an earlier version, which does not say
         self.source: BatchSource | None = None  # of the batches, once it trains
 
     @property
@@ -163,7 +167,7 @@ class Trainer:
             say: is told where a run stands that is not new.
 
         Raises:
-            KeyboardInterrupt: it was asked to stop.
+            Ended: it was asked to stop.
         """
         self.source = source
         resumed = self.resume(source, report)
@@ -201,16 +205,17 @@ class Trainer:
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 now = time.monotonic()
                 seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)
-                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.asked))
+                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.signal))
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
                     clock["log"], logged = now, self.step
                     rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
-                    self.log.tell(rates | self.log.means(), report)
-                if main and (stopping or due("save", self.run.save_minutes)):
+                    with request.unheard():
+                        self.log.tell(rates | self.log.means(), report)
+                if main and (stopping is not None or due("save", self.run.save_minutes)):
                     self.save(source)
-                if stopping:
-                    raise KeyboardInterrupt
+                if stopping is not None:
+                    raise Ended(stopping)
                 if main and due("picture", self.run.picture_minutes):
                     look()
                 if refreshing:
@@ -288,13 +293,14 @@ class Trainer:
             "parts": self.split.all_parts,
             "unlogged": dict(self.log.waiting),
             "continues": self.continues,
+            "begun_with": self.begun_with,
         }
 
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
         """Continues from the folder's state, if it has one; `report` is told where that cannot be exact.
 
         Raises:
-            UnirenderError: the state is broken or belongs to another config.
+            UnirenderError: the state is broken, belongs to another config, or was begun with other weights.
         """
         state = load_state(self.run.out)
         if state is None:
@@ -304,6 +310,9 @@ class Trainer:
                 f"{self.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
                 "another --out"
             )
+        begun = state.get("begun_with")
+        check_beginning(self.run.out, begun, self.begun_with or {})
+        self.begun_with = begun
         self.step, self.seconds = state["step"], state["seconds"]
         self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
         self.model.load_state_dict(state["model"])
@@ -329,4 +338,6 @@ class Trainer:
             return
         run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
         text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        replace_file(self.run.out / "config.json", text + "\n")
+        path = self.run.out / "config.json"
+        with writing(path):
+            replace_file(path, text + "\n")

@@ -21,7 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
+from unirender.training.writing import check_out, writing
 
 if TYPE_CHECKING:
     import torch
@@ -83,6 +85,7 @@ class TrainVisibility:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
+        check_out(self.out)
         print(f"{train_visibility(self)}: trained")
         return 0
 
@@ -91,7 +94,8 @@ def train_visibility(options: TrainVisibility) -> Path:
     """Runs the training; returns the file of the averaged weights.
 
     Raises:
-        UnirenderError: broken data, the folder holds a run of other options or data, or the run was asked to stop.
+        UnirenderError: broken data, or the folder holds a run of other options or data.
+        Ended: it was asked to stop.
     """
     from unirender.training.stopping import stopping_gently
     from unirender.training.visibility_data import read_items
@@ -103,10 +107,11 @@ def train_visibility(options: TrainVisibility) -> Path:
         while run.step < options.steps and not stop.asked:
             run.train_step()
             if time.monotonic() - saved > SAVE_SECONDS or run.step == options.steps or stop.asked:
-                run.keep()
+                with stop.unheard():
+                    run.keep()
                 saved = time.monotonic()
-    if run.step < options.steps:
-        raise UnirenderError(f"{options.out}: stopped at step {run.step}; run the same command again to go on")
+    if stop.signal is not None and run.step < options.steps:
+        raise Ended(stop.signal)
     return options.out / WEIGHTS_FILE
 
 
@@ -149,7 +154,6 @@ class _Run:
         elif self.log.is_file():
             self.log.unlink()  # of a run that was killed before its first state
         if not self.step:
-            options.out.mkdir(parents=True, exist_ok=True)
             self._tell(validate(self.net, held_out, options.seed))  # before anything was learned
 
     def _resume(self, state: Mapping[str, Any]) -> None:
@@ -164,7 +168,8 @@ class _Run:
         self.ema.load_state_dict(state["ema"])
         self.step = int(state["step"])
         lines = [line for line in self.log.read_text().splitlines(keepends=True) if line.endswith("\n")]
-        replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
+        with writing(self.log):
+            replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
 
     def train_step(self) -> None:
         """One step of the optimiser."""
@@ -198,15 +203,18 @@ class _Run:
         shown = channels_last(VisibilityNet())
         self.ema.copy_to(shown)
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
-        replace_file(self.options.out / WEIGHTS_FILE, save(halves))
+        with writing(path := self.options.out / WEIGHTS_FILE):
+            replace_file(path, save(halves))
         means = dict(zip(("bce", "log_error"), map(_mean, zip(*self.losses, strict=True)), strict=True))
         self.losses.clear()
         self._tell(means | validate(shown, self.held_out, self.options.seed))
 
     def _tell(self, values: Mapping[str, float]) -> None:
         line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
-        with self.log.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        with writing(self.log):
+            self.options.out.mkdir(parents=True, exist_ok=True)
+            with self.log.open("a") as file:
+                file.write(json.dumps(line) + "\n")
         print(" ".join(f"{key} {value:.4g}" for key, value in line.items()), flush=True)
 
 

@@ -1,6 +1,7 @@
 """`unirender optimize`: folders in other units with and without a mesh, pictures, and what it refuses."""
 
 import dataclasses
+import errno
 import json
 import logging
 import os
@@ -286,6 +287,40 @@ def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCa
     write_png(tmp_path / "flat.png", np.full((12, 16, 3), 0.5))
     with pytest.raises(UnirenderError, match="have no normal"):
         read_normals(tmp_path / "flat.png", half)
+
+
+@pytest.mark.parametrize("kind", ["folder", "picture"])
+def test_a_full_disk_is_one_sentence(
+    kind: str, data: Path, solution: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    out = tmp_path / "out"
+    if kind == "folder":
+        monkeypatch.setattr("unirender_reference.optimize.state.RunFolder.record", full)
+        chosen = command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK)
+        to_do = "run the same command again to go on"
+    else:
+        view = rendered_views(solution, 1, 0, 20).seen[0]
+        write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+        monkeypatch.setattr("unirender.files.write_result", full)
+        few = [
+            "--fov",
+            "36",
+            "--no-progress",
+            "--single.steps",
+            "1",
+            "--single.noise",
+            "0.1",
+            "--single.fine-steps",
+            "1",
+        ]
+        chosen = command(tmp_path / "one.png", "--out", out, "--single.light-rows", "8", *few)
+        to_do = "choose another place"
+    with pytest.raises(UnirenderError, match=rf"out: cannot be written \(No space left on device\); .*{to_do}$"):
+        chosen.run()
+    assert out.exists() == (kind == "folder")
 
 
 @pytest.mark.slow

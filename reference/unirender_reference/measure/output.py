@@ -1,0 +1,83 @@
+"""Where a command puts a file that was asked for: looked at before the work begins, and written complete or not at all.
+
+What is no plain file, such as `/dev/stdout` or a pipe, is written to as it is.
+"""
+
+import contextlib
+import io
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from unirender.errors import UnirenderError
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+
+def check_file(option: str, path: Path | None) -> None:
+    """Looks whether a file can be written; its folder need not be there yet. Nothing of the try stays.
+
+    Args:
+        option: that names it.
+        path: of the file; None: there is none to be written.
+
+    Raises:
+        UnirenderError: it cannot.
+    """
+    if path is None or _is_special(path):
+        return
+    if path.is_dir():
+        raise UnirenderError(f"{option} {path}: is a folder, expected the name of a file")
+    with writing(f"{option} {path}"):
+        place = next(folder for folder in path.absolute().parents if folder.exists())
+        with tempfile.TemporaryFile(dir=place):
+            pass
+
+
+def write_file(option: str, path: Path, content: str | bytes) -> None:
+    """Writes a file, and its folder where there is none.
+
+    Raises:
+        UnirenderError: it cannot be written; what was there stays.
+    """
+    from unirender.files import replace_file
+
+    with writing(f"{option} {path}"):
+        if _is_special(path):
+            with path.open("wb") as file:
+                file.write(content if isinstance(content, bytes) else content.encode())
+        else:
+            replace_file(path.resolve(), content)
+
+
+def png_bytes(sheet: "Image.Image") -> bytes:
+    """A sheet as the content of a PNG."""
+    stored = io.BytesIO()
+    sheet.save(stored, format="PNG", optimize=True)
+    return stored.getvalue()
+
+
+@contextlib.contextmanager
+def writing(what: str, to_do: str = "choose another place") -> Iterator[None]:
+    """For a block that writes, and reads nothing of the user's.
+
+    Raises:
+        UnirenderError: it cannot.
+    """
+    try:
+        yield
+    except UnirenderError:
+        raise
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, OSError):  # numpy raises another one while it handles it
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
+            raise
+        raise UnirenderError(f"{what}: cannot be written ({cause.strerror or cause}); {to_do}") from error
+
+
+def _is_special(path: Path) -> bool:
+    return path.exists() and not path.is_file() and not path.is_dir()
