@@ -47,7 +47,7 @@ def score(
 
     Raises:
         UnirenderError: the two are of different kinds or sizes, a picture is not finite linear floats with the channels
-            last, a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score; or a picture
+            last, a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score; a picture
             or colour map is smaller than SSIM's window (11 pixels a side), or than what LPIPS takes (31).
     """
     from unirender_evaluation.scoring import score_image, score_maps

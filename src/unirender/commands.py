@@ -38,7 +38,7 @@ class Decompose:
     input: tyro.conf.OmitArgPrefixes[InputOptions]
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are as predicted."""
+    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     frames: bool = False
@@ -194,7 +194,7 @@ class Edit:
     anchored: bool = True
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are as predicted."""
+    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
@@ -240,7 +240,7 @@ class Relight:
     anchored: bool = True
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture; otherwise the maps are as predicted."""
+    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     shadows: bool = False

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
-MOST_ALIASING = 0.005  # share of a texel's energy that may come of how two grids lie to one another
+MOST_ALIASING = 0.005  # share of a texel's energy, away from the poles, that may come of how two grids lie together
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:

@@ -282,10 +282,10 @@ def test_the_light_of_a_closed_decomposition_agrees_with_it_and_edits_keep_the_n
     pipeline = UniRenderPipeline.from_pretrained()
     closed, plain = (pipeline.decompose(image, mask, closed=on) for on in (True, False))
     assert plain.network_light is None
-    assert plain.as_predicted is plain.intrinsics
+    assert plain.with_network_light is plain.intrinsics
     assert closed.network_light is not None
     np.testing.assert_allclose(closed.network_light, get(plain.intrinsics, "environment"), rtol=0, atol=1e-5)
-    assert closed.as_predicted.environment is closed.network_light
+    assert closed.with_network_light.environment is closed.network_light
     d = get(closed.intrinsics, "diffuse")
     ratio = {
         name: float(derived_diffuse(closed.intrinsics, light).sum() / d.sum())
@@ -293,7 +293,9 @@ def test_the_light_of_a_closed_decomposition_agrees_with_it_and_edits_keep_the_n
     }
     assert 0.85 < ratio["own"] < 1.1, ratio
     assert ratio["network"] < 0.8, ratio  # the twin: a mean in log radiance is too dark
-    given = replace(closed, network_light=None)
+    own = closed.intrinsics.replace(environment=2 * get(closed.intrinsics, "environment"))
+    given = replace(closed, intrinsics=own)
+    assert given.with_network_light is own  # a light that somebody puts there counts
     first, second = (pipeline.edit(image, mask, metallic=1.0, decomposition=found) for found in (closed, given))
     assert np.array_equal(get(first.intrinsics, "environment"), get(closed.intrinsics, "environment"))
     assert 0 < np.abs(first.image_linear - second.image_linear).max() < 0.05  # what the network is told, little by much

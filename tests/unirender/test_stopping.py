@@ -117,3 +117,12 @@ def test_in_another_thread_nothing_changes() -> None:
     thread.start()
     thread.join()
     assert seen == [False, True]
+
+
+def test_a_terminal_that_closes_while_something_is_printed_is_no_error() -> None:
+    with stopping_gently() as request, request.unheard():
+        os.kill(os.getpid(), signal.SIGHUP)
+        raise OSError(errno.EIO, "nobody reads")
+    assert request.signal == signal.SIGHUP
+    with pytest.raises(OSError, match="nobody"), stopping_gently() as request, request.unheard():
+        raise OSError(errno.EIO, "nobody reads")  # the twin: nobody hung up

@@ -135,3 +135,10 @@ def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
         raise ZeroDivisionError
     with pytest.raises(UnirenderError, match="said already"), writing(tmp_path):
         raise UnirenderError("said already")
+
+
+def test_a_link_to_nothing_is_no_place(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "gone")
+    assert "link to nothing" in (unusable(tmp_path / "link" / "run") or "")
+    (tmp_path / "gone").mkdir()
+    assert unusable(tmp_path / "link" / "run") is None

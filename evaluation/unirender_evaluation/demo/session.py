@@ -72,7 +72,7 @@ class Controls:
     Attributes:
         metallic: of the whole object, [0, 1]; None: as predicted.
         roughness: the same.
-        light: lat-long radiance in camera axes, any scale; None: the predicted light.
+        light: lat-long radiance in camera axes, any scale; None: the one that was found, which agrees with s and d.
         turn_deg: by which the light is turned about +y, from +z towards +x.
         anchored: whether the change is applied to the picture; else the plain render is shown.
     """
@@ -133,7 +133,7 @@ def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
         UnirenderError: the picture or its mask is not usable.
     """
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
-    return Subject(picture, decomposition, render(pipeline, decomposition.as_predicted))
+    return Subject(picture, decomposition, render(pipeline, decomposition.with_network_light))
 
 
 def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> View:
@@ -145,15 +145,15 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
     Raises:
         UnirenderError: a number is outside its range, or the light is not usable.
     """
-    before = subject.decomposition.as_predicted
+    before = subject.decomposition.with_network_light
     edited, remarks, derived = before, [], ()
     if controls.metallic is not None:
         edited = edited.replace(metallic=as_material("metallic", controls.metallic, subject.mask))
     if controls.roughness is not None:
         edited = edited.replace(roughness=as_material("roughness", controls.roughness, subject.mask))
     if controls.light is not None or controls.turn_deg % 360:
-        predicted = subject.maps.require("environment")["environment"]
-        light = turned(predicted if controls.light is None else as_environment(controls.light), controls.turn_deg)
+        own = subject.maps.require("environment")["environment"]
+        light = turned(own if controls.light is None else as_environment(controls.light), controls.turn_deg)
         edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
         derived = ("specular", "diffuse")
         remarks.append("Under a light that was changed, nothing casts a shadow.")
@@ -189,7 +189,7 @@ def turned(environment: Environment, turn_deg: float) -> Environment:
 
 
 def check(seen: View, spp: int = SPP) -> Check:
-    """Mitsuba shades the maps that the model rendered, under the same light.
+    """Mitsuba shades the maps that the model rendered, under the light that is shown with them.
 
     Raises:
         UnirenderError: Mitsuba cannot run here, or the light is not usable.

@@ -4,6 +4,7 @@ What is no plain file, such as `/dev/stdout` or a pipe, is written to as it is.
 """
 
 import contextlib
+import errno
 import io
 import tempfile
 from collections.abc import Iterator
@@ -14,6 +15,9 @@ from unirender.errors import UnirenderError
 
 if TYPE_CHECKING:
     from PIL import Image
+
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def check_file(option: str, path: Path | None) -> None:
@@ -77,6 +81,23 @@ def writing(what: str, to_do: str = "choose another place") -> Iterator[None]:
         if cause is None:
             raise
         raise UnirenderError(f"{what}: cannot be written ({cause.strerror or cause}); {to_do}") from error
+
+
+@contextlib.contextmanager
+def full_disk(folder: Path) -> Iterator[None]:
+    """For a block that also reads: of what goes wrong in it, only that there is no room is the folder's.
+
+    Raises:
+        UnirenderError: there is none.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise UnirenderError(
+            f"{folder}: cannot be written ({error.strerror}); free some space and run the same command again to go on"
+        ) from error
 
 
 def _is_special(path: Path) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.output import writing
+from unirender_reference.measure.output import full_disk, writing
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.option_checks import require_least
@@ -132,7 +132,7 @@ class Optimize:
         with live_report(Console(stderr=True, quiet=not self.progress)) as report:
             began = time.perf_counter()
             start = None if predict is None else self._start(views, obj, predict, report)
-            with writing(str(self.out), "mend that and run the same command again to go on"):
+            with full_disk(self.out):
                 optimize(
                     views,
                     obj if start is None else None,

@@ -148,7 +148,7 @@ def denoise(
     x_t = noise * scheduler.init_noise_sigma
     uneven = _strides_unevenly(scheduler, steps)
     following = [*scheduler.timesteps[1:], None]
-    for t, next_t in zip(progress(scheduler.timesteps), following, strict=False):
+    for t, next_t in zip(progress(scheduler.timesteps), following, strict=True):
         x_0 = predict(x_t, t.expand(len(x_t)))
         if uneven:
             x_t = _ddim_step(scheduler, x_0, x_t, t, next_t)
@@ -158,7 +158,7 @@ def denoise(
 
 
 def _strides_unevenly(scheduler: Any, steps: int) -> bool:
-    """Whether it is a DDIM whose timesteps are not 1000 // steps apart, as its `step` takes them to be."""
+    """Whether it is a DDIM whose timesteps (trailing) are not 1000 // steps apart, as its `step` takes them to be."""
     is_ddim = any(base.__name__ in DDIM for base in type(scheduler).__mro__)
     return is_ddim and scheduler.config.num_train_timesteps % steps != 0
 

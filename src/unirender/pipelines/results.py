@@ -1,6 +1,6 @@
 """What the pipeline returns, and how predictions become `Intrinsics`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,11 +24,12 @@ class Decomposition:
         roughness: coverage-weighted mean over the object.
         metallic: the same.
         std: per map, standard deviation over the samples; None in mode `mean` or with one sample.
-        samples: each sample's intrinsics, where there are several; `intrinsics` is their mean. Each has its own
-            light as the network predicts it.
+        samples: each sample's intrinsics, where there are several, with its light as the network predicts it;
+            `intrinsics` is their mean, but for the light: the mean of theirs, about which `std` is, is `network_light`.
         network_light: the light as the network predicts it, [eh ew 3], which its own renderings of these maps are told:
-            a mean in log radiance, and so darker than s and d say. None: the light of `intrinsics`; set it to None
-            where you put another light there.
+            a mean in log radiance, and so darker than s and d say. None: it is the light of `intrinsics`.
+        agreeing_light: the light that `intrinsics` got in its place. Where you have put another one there, that one
+            counts (`with_network_light`).
     """
 
     intrinsics: Intrinsics
@@ -37,13 +38,13 @@ class Decomposition:
     std: dict[str, np.ndarray] | None = None
     samples: tuple[Intrinsics, ...] = ()
     network_light: Float[np.ndarray, "eh ew 3"] | None = None
+    agreeing_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
 
     @property
-    def as_predicted(self) -> Intrinsics:
-        """The maps with the network's own light, from which edits and relightings start."""
-        return (
-            self.intrinsics if self.network_light is None else self.intrinsics.replace(environment=self.network_light)
-        )
+    def with_network_light(self) -> Intrinsics:
+        """The maps, closed or not, with the network's own light, from which edits and relightings start."""
+        theirs = self.intrinsics.environment is not self.agreeing_light
+        return self.intrinsics if theirs else self.intrinsics.replace(environment=self.network_light)
 
 
 @dataclass(frozen=True)
@@ -88,8 +89,10 @@ def predicted_intrinsics(
 def with_agreeing_light(found: Decomposition) -> Decomposition:
     """The decomposition with the light that agrees with its s and d, beside the one that the network predicts."""
     maps = found.intrinsics
-    light = maps.require("environment")["environment"]
-    return replace(found, intrinsics=maps.replace(environment=agreeing_light(maps)), network_light=light)
+    light, agreeing = maps.environment, agreeing_light(maps)
+    if agreeing is light:  # nothing of the surface is seen
+        return found
+    return replace(found, intrinsics=maps.replace(environment=agreeing), network_light=light, agreeing_light=agreeing)
 
 
 def combine(samples: tuple[Intrinsics, ...]) -> Decomposition:

@@ -32,7 +32,7 @@ DIFFUSE_WEIGHT = 3.0  # c: a cosine tells directions apart less than a lobe does
 SIDE = 64  # pixels along the longer side at which s and d are compared: their light has 16 x 32 texels
 MOST_SHAPE = (32, 64)  # rows and columns at which a finer light is looked at; it keeps its own detail
 PRIOR = 0.3  # p, of what the texels' lobes sum to on average
-FLOOR = 0.02  # radiance added to both sides of each ratio, so that dark light does not decide
+FLOOR = 0.02  # radiance added to both sides of each ratio: light well below it does not decide, and stays as predicted
 
 
 def revealed_light(intrinsics: Intrinsics) -> Float[np.ndarray, "eh ew 3"]:

@@ -316,7 +316,7 @@ class UniRenderPipeline(DiffusionPipeline):
         check_settings(sampling)
         picture, cover = as_picture(image_srgb, mask)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
-        before = decomposition.as_predicted
+        before = decomposition.with_network_light
         edited, bounded, coarse = before, 0.0, None
         if metallic is not None:
             edited = edited.replace(metallic=as_material("metallic", metallic, cover))
@@ -371,7 +371,7 @@ class UniRenderPipeline(DiffusionPipeline):
         if environment is not None:
             environment = as_environment(environment)
         decomposition = decomposition or self.decompose(picture, cover, **sampling)
-        before = decomposition.as_predicted
+        before = decomposition.with_network_light
         if environment is not None:
             edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False, shadows=shadows)
         else:

@@ -30,12 +30,16 @@ def check_beginning(out: Path, begun: Beginning | None, asked: Beginning) -> Non
     """Looks whether a run that is resumed was begun with what it is now asked to begin with.
 
     The same place or the same weights will do: one command line goes on whatever becomes of the folder that it names,
-    and the folder may be moved. Who asks for nothing goes on, too.
+    and the folder may be moved. Weights of which no hash is known (`beginning`) may be any, and who asks for nothing
+    goes on, too.
 
     Raises:
         UnirenderError: it was begun with something else.
     """
-    if begun is None or not asked or any(begun.get(key) == value for key, value in asked.items() if key in KNOWN_BY):
+    if begun is None or not asked:
+        return
+    unknown = begun.get("option") == asked["option"] and "sha256" not in asked
+    if unknown or any(begun.get(key) == value for key, value in asked.items() if key in KNOWN_BY):
         return
     before = f"{begun['option']} {begun['name']}" if begun else "random weights"
     repeat = f"repeat {begun['option']} {begun['name']}" if begun else f"leave {asked['option']} out"

@@ -30,8 +30,11 @@ class StopRequest:
     @contextlib.contextmanager
     def unheard(self) -> Iterator[None]:
         """For a block that prints: where the terminal has closed, nobody reads it, and that is no error."""
-        with contextlib.suppress(OSError) if self.signal == signal.SIGHUP else contextlib.nullcontext():
+        try:
             yield
+        except OSError:
+            if self.signal != signal.SIGHUP:  # which may have come inside the block
+                raise
 
 
 @contextlib.contextmanager

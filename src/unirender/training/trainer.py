@@ -216,10 +216,11 @@ class Trainer:
                     self.save(source)
                 if stopping is not None:
                     raise Ended(stopping)
-                if main and due("picture", self.run.picture_minutes):
-                    look()
-                if refreshing:
-                    self._refresh(source, report)
+                with request.unheard():
+                    if main and due("picture", self.run.picture_minutes):
+                        look()
+                    if refreshing:
+                        self._refresh(source, report)
         if main:
             self.save(source)
         look()

@@ -17,6 +17,9 @@ def unusable(folder: Path) -> str | None:
         place = next(path for path in (folder, *folder.absolute().parents) if path.exists())
         if not place.is_dir():
             return f"{place} is no folder"
+        links = (path for path in (folder, *folder.absolute().parents) if path.is_symlink())
+        if (dangling := next((path for path in links if not path.exists()), None)) is not None:
+            return f"{dangling} is a link to nothing"
         with tempfile.TemporaryFile(dir=place):  # of which nothing stays
             return None
     except OSError as error:
