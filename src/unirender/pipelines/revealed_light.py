@@ -75,7 +75,7 @@ def _revealed(intrinsics: Intrinsics, by: tuple[str, ...], steps: int) -> Float[
     seen = [(lobe_matrix(normal, view, alpha, shape), maps["specular"][there], 1.0)]
     if "diffuse" in by:
         seen.append((cosine_matrix(normal, shape), maps["diffuse"][there], DIFFUSE_WEIGHT))
-    total = sum(weight * takes.sum(axis=0) for takes, _, weight in seen)[:, None]
+    total = np.sum([weight * takes.sum(axis=0) for takes, _, weight in seen], axis=0)[:, None]
     prior = PRIOR * total.mean()
     light = resample_environment(environment, shape).reshape(-1, 3)
     gain = np.ones_like(light)
