@@ -29,6 +29,7 @@ VOCABULARY = {
         "score",
         "surface_light",
         "symmetries",
+        "writing",
     )
 }
 HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage", "gradio")

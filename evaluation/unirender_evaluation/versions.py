@@ -88,6 +88,8 @@ FROM_RECORDS = (
     "table*",
     "verdict",
 )
+# Of the shared vocabulary's folder: the command line, and what is said where a file cannot be written.
+OUTSIDE = ("__main__", "cli", "command_line", "commands", "options", "shipped", "writing")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
@@ -149,7 +151,7 @@ PARTS: Mapping[str, Part] = {
         {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
-            *(f"unirender/{name}.py" for name in ("__main__", "cli", "command_line", "commands", "options", "shipped")),
+            *(f"unirender/{name}.py" for name in OUTSIDE),
             *(
                 f"unirender_evaluation/{name}.py"
                 for name in (

@@ -73,7 +73,7 @@ class Doctor:
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.paths import cache_dir
         from unirender.shipped import shipped_names
-        from unirender.training.writing import unusable
+        from unirender.writing import unusable
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 

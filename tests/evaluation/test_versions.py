@@ -60,7 +60,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
     [
         ("core", "unirender", ("composite.py", "lighting.py", "intrinsics.py", "symmetries.py")),
         ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "methods.py", "tasks.py", "predictions.py")),
-        (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/sampling.py")),
+        (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
         (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),

@@ -4,7 +4,7 @@ import torch
 from tiny_models import TRAIN, make_batch
 from torch import Tensor
 
-from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.diffusion.schedule import make_scheduler
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel

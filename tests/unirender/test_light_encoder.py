@@ -16,7 +16,7 @@ from tiny_models import SIZE, TRAIN, make_batch, make_model
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import extras_by_camera, infer_attributes, infer_image
+from unirender.diffusion.inference import extras_by_camera, infer_attributes, infer_image
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model

@@ -11,7 +11,7 @@ from tiny_models import MODEL, make_batch, make_model
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import infer_attributes
+from unirender.diffusion.inference import infer_attributes
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model

@@ -10,7 +10,7 @@ from synthetic_shards import sphere
 from tiny_models import SIZE, make_batch, make_model, make_pipeline
 from torch import Tensor
 
-from unirender.diffusion.sampling import infer_image
+from unirender.diffusion.inference import infer_image
 from unirender.diffusion.schedule import make_scheduler
 from unirender.intrinsics import Intrinsics
 from unirender.models.conditioning import TRIPLETS, Conditioning

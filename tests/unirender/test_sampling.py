@@ -14,13 +14,11 @@ from torch import Tensor
 
 from unirender.camera import Camera
 from unirender.diffusion import sampling
+from unirender.diffusion.inference import extras_by_camera, infer_attributes, infer_image
 from unirender.diffusion.sampling import (
     MOST_STEPS,
     denoise,
     draw_noise,
-    extras_by_camera,
-    infer_attributes,
-    infer_image,
     make_sampler,
 )
 from unirender.diffusion.schedule import last_timestep, make_scheduler

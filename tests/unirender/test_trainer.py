@@ -22,7 +22,7 @@ from synthetic_shards import write_dataset
 from tiny_models import TRAIN, make_batch, make_pipeline
 from torch import Tensor, nn
 
-from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline

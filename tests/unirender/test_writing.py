@@ -23,7 +23,7 @@ from unirender.training.pictures import save_sheet
 from unirender.training.processes import ALONE
 from unirender.training.run_log import RunLog
 from unirender.training.trainer import RunConfig, Trainer
-from unirender.training.writing import unusable, writing
+from unirender.writing import unusable, writing
 
 NO_SPACE = "No space left on device"
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.output import check_file, png_bytes, write_file, writing
+from unirender.writing import writing
+from unirender_reference.measure.output import ELSEWHERE, check_file, png_bytes, write_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -60,8 +61,8 @@ class Lights:
                 if folder is not None:
                     _export(folder, light)
             if self.sheet is not None and not shown.kept:
-                reasons = "; ".join(failure["reason"] for failure in shown.failures[:1])
-                raise UnirenderError(f"{self.sheet}: no lights to show, expected at least one; {reasons}")
+                first = "".join(f"; {failure['reason']}" for failure in shown.failures[:1])
+                raise UnirenderError(f"{self.sheet}: no lights to show, expected at least one{first}")
         found = {"kinds": kind_rows(), "lights": shown.rows, "failures": shown.failures, "notes": []}
         count = len(shown.rows)
         if not self.draw and self.split is None:
@@ -178,7 +179,7 @@ def _new_folder(path: Path | None) -> Iterator[Path | None]:
     if path is None:
         yield None
         return
-    with writing(f"--export {path}"):
+    with writing(f"--export {path}", ELSEWHERE):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
             folder = Path(scratch) / path.name

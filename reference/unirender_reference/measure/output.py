@@ -6,17 +6,17 @@ What is no plain file, such as `/dev/stdout` or a pipe, is written to as it is.
 import contextlib
 import errno
 import io
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
+from unirender.writing import unusable, writing
 
 if TYPE_CHECKING:
     from PIL import Image
 
-
+ELSEWHERE = "choose another place"
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -34,10 +34,8 @@ def check_file(option: str, path: Path | None) -> None:
         return
     if path.is_dir():
         raise UnirenderError(f"{option} {path}: is a folder, expected the name of a file")
-    with writing(f"{option} {path}"):
-        place = next(folder for folder in path.absolute().parents if folder.exists())
-        with tempfile.TemporaryFile(dir=place):
-            pass
+    if (reason := unusable(path.absolute().parent)) is not None:
+        raise UnirenderError(f"{option} {path}: cannot be written ({reason}); {ELSEWHERE}")
 
 
 def write_file(option: str, path: Path, content: str | bytes) -> None:
@@ -48,7 +46,7 @@ def write_file(option: str, path: Path, content: str | bytes) -> None:
     """
     from unirender.files import replace_file
 
-    with writing(f"{option} {path}"):
+    with writing(f"{option} {path}", ELSEWHERE):
         if _is_special(path):
             with path.open("wb") as file:
                 file.write(content if isinstance(content, bytes) else content.encode())
@@ -61,26 +59,6 @@ def png_bytes(sheet: "Image.Image") -> bytes:
     stored = io.BytesIO()
     sheet.save(stored, format="PNG", optimize=True)
     return stored.getvalue()
-
-
-@contextlib.contextmanager
-def writing(what: str, to_do: str = "choose another place") -> Iterator[None]:
-    """For a block that writes, and reads nothing of the user's.
-
-    Raises:
-        UnirenderError: it cannot.
-    """
-    try:
-        yield
-    except UnirenderError:
-        raise
-    except Exception as error:
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, OSError):  # numpy raises another one while it handles it
-            cause = cause.__cause__ or cause.__context__
-        if cause is None:
-            raise
-        raise UnirenderError(f"{what}: cannot be written ({cause.strerror or cause}); {to_do}") from error
 
 
 @contextlib.contextmanager

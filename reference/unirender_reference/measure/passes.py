@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.output import writing
+from unirender.writing import writing
+from unirender_reference.measure.output import ELSEWHERE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -69,7 +70,7 @@ class Passes:
             raise UnirenderError(f"{self.out}: exists and is not empty, expected a new folder; choose another --out")
         with new_folder(self.out) as folder:
             renders = self.render()
-            with writing(str(self.out)):
+            with writing(self.out, ELSEWHERE):
                 self.write(renders, folder)
         console = Console()
         sums = renders.z_tests()

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.output import full_disk, writing
+from unirender.writing import writing
+from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.option_checks import require_least
@@ -236,7 +237,7 @@ class Optimize:
             again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
             meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(self.single)}
-            with writing(str(self.out)):
+            with writing(self.out, ELSEWHERE):
                 write_result(folder, found, meta, again.image_linear)
                 again.strip.save(folder / "views.png")
                 (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")

@@ -18,15 +18,11 @@ from typing import Any, Literal
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from unirender.camera import Camera
 from unirender.diffusion.schedule import last_timestep
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
-from unirender.models.dual_stream import DualStreamModel, Encoded
-from unirender.models.priors import Maps
 
 Mode = Literal["mean", "sample"]
 SAMPLE_STEPS = 20  # the paper's
@@ -44,7 +40,6 @@ SCHEDULERS = (
 )
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
-Cameras = Camera | Sequence[Camera] | None
 
 Predict = Callable[[Float[Tensor, "b c h w"], Int[Tensor, " b"]], Float[Tensor, "b c h w"]]
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
@@ -195,147 +190,3 @@ def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = Non
         for _ in range(shape[0] // len(generators))
     ]
     return torch.stack([row.to(like) for row in rows])
-
-
-@torch.no_grad()
-def infer_attributes(
-    model: DualStreamModel,
-    conditioning: Conditioning,
-    scheduler: Any,
-    image_linear: Float[Tensor, "b 3 H W"],
-    mask: Float[Tensor, "b 1 H W"],
-    *,
-    steps: int = 1,
-    generator: Generators = None,
-    camera: Cameras = None,
-    progress: Progress = iter,
-) -> Maps:
-    """Inverse rendering: p(attributes | image).
-
-    Args:
-        image_linear: premultiplied, linear; clipped to [0, 1] as a camera does.
-        mask: coverage.
-        steps: of the scheduler.
-        generator: of the noise; see `draw_noise`.
-        camera: of all rows, or one for each.
-        progress: wraps the iteration over timesteps.
-
-    Returns:
-        Maps as `Packing.unpack` gives them: float32, in physical units.
-    """
-    image = conditioning.encode_image(image_linear).to(model.dtype)
-    given = torch.zeros(len(image), len(TRIPLETS), dtype=torch.bool, device=image.device)
-    extras = extras_by_camera(conditioning, mask, given, None, camera).to(image)
-    clean = torch.zeros(len(image), dtype=torch.long, device=image.device)
-    condition: Tensor | Encoded = image
-
-    def predict(x_t: Tensor, t: Tensor) -> Tensor:
-        nonlocal condition
-        output = model(
-            x_t.to(image),
-            condition,
-            t,
-            clean,
-            extras.attributes,
-            extras.image,
-            light=extras.light,
-            image_rows=None,
-        )
-        condition = output.encoded_image  # the same at every step
-        return output.attributes.to(x_t)
-
-    noise = draw_noise((len(image), conditioning.attribute_channels, *image.shape[-2:]), image_linear, generator)
-    return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress).float())
-
-
-@torch.no_grad()
-def infer_image(
-    model: DualStreamModel,
-    conditioning: Conditioning,
-    scheduler: Any,
-    maps: Maps,
-    given: Bool[Tensor, "b 6"],
-    *,
-    steps: int = 1,
-    generator: Generators = None,
-    camera: Cameras = None,
-    progress: Progress = iter,
-    derived: Bool[Tensor, "b 6"] | None = None,
-) -> Float[Tensor, "b 3 H W"]:
-    """Rendering: p(image | attributes).
-
-    Args:
-        maps: all maps; those not `given` may hold anything and are replaced by noise.
-        given: which of the six pictures are known; the mask in `maps` always is.
-        steps: of the scheduler.
-        generator: of the noise; see `draw_noise`.
-        camera: of all rows, or one for each.
-        progress: wraps the iteration over timesteps.
-        derived: which of them were derived from a light, without shadows; None: none.
-
-    Returns:
-        Premultiplied linear image in [0, 1].
-    """
-    latents = conditioning.encode_attributes(maps)
-    # Both noises of a row at once: neither depends on how many rows follow.
-    channels = (latents.shape[1], conditioning.codec.channels)
-    noise = draw_noise((len(latents), sum(channels), *latents.shape[-2:]), latents, generator)
-    unknown, x_T = noise.split(channels, dim=1)
-    shown = conditioning.by_triplet(conditioning.in_latents(given))
-    attributes = torch.where(shown, latents, unknown).to(model.dtype)
-    extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera, derived).to(attributes)
-    clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
-    condition: Tensor | Encoded = attributes
-
-    def predict(x_t: Tensor, t: Tensor) -> Tensor:
-        nonlocal condition
-        output = model(
-            condition,
-            x_t.to(attributes),
-            clean,
-            t,
-            extras.attributes,
-            extras.image,
-            image_prior=extras.prior,
-            light=extras.light,
-            attribute_rows=None,
-        )
-        condition = output.encoded_attributes  # the same at every step
-        return output.image.to(x_t)
-
-    return conditioning.decode_image(denoise(predict, x_T, scheduler, steps, progress).float())
-
-
-def extras_by_camera(
-    conditioning: Conditioning,
-    mask: Float[Tensor, "b 1 H W"],
-    given: Bool[Tensor, "b 6"],
-    maps: Maps | None,
-    camera: Cameras,
-    derived: Bool[Tensor, "b 6"] | None = None,
-) -> Extras:
-    """The extra inputs of rows that are seen through one camera, or each through its own."""
-    if camera is None or isinstance(camera, Camera):
-        return conditioning.extras(mask, given, maps, camera, derived)
-    if len(camera) != len(mask):
-        raise ValueError(f"{len(camera)} cameras for {len(mask)} rows, expected one each")
-    if len(set(camera)) == 1:
-        return conditioning.extras(mask, given, maps, camera[0], derived)
-    rows = [
-        conditioning.extras(
-            mask[i : i + 1],
-            given[i : i + 1],
-            None if maps is None else {name: value[i : i + 1] for name, value in maps.items()},
-            own,
-            None if derived is None else derived[i : i + 1],
-        )
-        for i, own in enumerate(camera)
-    ]
-    priors = [row.prior for row in rows if row.prior is not None]
-    lights = [row.light for row in rows if row.light is not None]
-    return Extras(
-        torch.cat([row.attributes for row in rows]),
-        torch.cat([row.image for row in rows]),
-        torch.cat(priors) if priors else None,
-        torch.cat(lights) if lights else None,
-    )

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel

@@ -101,7 +101,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     from unirender.shipped import checkpoint_folder
     from unirender.training.card import CARD_FILE, card_text
     from unirender.training.export import TRAINING_FILE, read_history
-    from unirender.training.writing import writing
+    from unirender.writing import writing
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     folders = [checkpoint_folder(path) for path in checkpoints]

@@ -115,7 +115,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.training.data import GroupDataset
     from unirender.training.export import read_history
     from unirender.training.facts import dataset_facts
-    from unirender.training.writing import writing
+    from unirender.writing import writing
 
     checkpoint = checkpoint_folder(options.checkpoint)
     pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None).to(resolve_device("auto"))

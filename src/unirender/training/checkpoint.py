@@ -13,7 +13,7 @@ import torch
 
 from unirender.errors import UnirenderError
 from unirender.training.presets import TrainConfig
-from unirender.training.writing import writing
+from unirender.writing import writing
 
 STATE_FILE = "state.pt"
 PROLONGABLE = "steps"  # a resumed run may be given another length

@@ -16,7 +16,7 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.checkpoint import replace_folder
 from unirender.training.facts import training_facts
-from unirender.training.writing import writing
+from unirender.writing import writing
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer

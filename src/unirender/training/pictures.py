@@ -9,11 +9,11 @@ from PIL import Image
 from torch import Tensor
 
 from unirender.color import image_srgb
-from unirender.diffusion.sampling import infer_attributes, infer_image
+from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.models.conditioning import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
-from unirender.training.writing import writing
+from unirender.writing import writing
 
 SHEET_ROWS = 4  # samples of a sheet
 COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "environment")

@@ -14,7 +14,7 @@ from unirender.options import Device, DType, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
-from unirender.training.writing import check_out
+from unirender.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.training.validation import Validate
@@ -218,7 +218,8 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     start = read_start(config.model, options.init, options.init_from)
     trainer = Trainer(config, run, device, dtype, processes, start.vae)
-    start.apply(trainer, tell)
+    resumed = (out / STATE_FILE).is_file()
+    start.apply(trainer, (lambda text: None) if resumed else tell)  # what goes on takes the weights of its own state
     del start  # Stable Diffusion's U-Net is no longer needed
     if options.gradient_checkpointing:
         trainer.model.enable_gradient_checkpointing()
@@ -245,7 +246,6 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}{made}")
     if processes.is_main:
         say(f"memory: {memory}")
-    resumed = (out / STATE_FILE).is_file()
     with contextlib.closing(source):
         with (
             live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,

@@ -13,7 +13,7 @@ from typing import Any
 from unirender.files import replace_file
 from unirender.training.live import Report
 from unirender.training.processes import Processes
-from unirender.training.writing import writing
+from unirender.writing import writing
 
 LOG_FILE = "log.jsonl"
 OVERFLOW = "above_x_max_"  # prefix of entries that are left out where they are zero

@@ -44,7 +44,7 @@ from unirender.training.source import BatchSource
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
-from unirender.training.writing import writing
+from unirender.writing import writing
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
-from unirender.training.writing import check_out, writing
+from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:
     import torch

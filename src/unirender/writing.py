@@ -1,4 +1,4 @@
-"""What a training writes, and what is said where it cannot: which file, and why. Light to import."""
+"""What is said where something cannot be written: which file, and why. Light to import."""
 
 import contextlib
 import tempfile
@@ -37,8 +37,8 @@ def check_out(out: Path) -> None:
 
 
 @contextlib.contextmanager
-def writing(path: Path, what_to_do: str = AGAIN) -> Iterator[None]:
-    """For a block that writes `path`, and reads nothing of the user's.
+def writing(what: Path | str, to_do: str = AGAIN) -> Iterator[None]:
+    """For a block that writes what is named, and reads nothing of the user's.
 
     Raises:
         UnirenderError: it cannot be written.
@@ -50,7 +50,7 @@ def writing(path: Path, what_to_do: str = AGAIN) -> Iterator[None]:
     except Exception as error:
         if (reason := _reason(error)) is None:
             raise
-        raise UnirenderError(f"{path}: cannot be written ({reason}); {what_to_do}") from error
+        raise UnirenderError(f"{what}: cannot be written ({reason}); {to_do}") from error
 
 
 def _reason(error: Exception) -> str | None:
