@@ -63,7 +63,7 @@ BOUNDS = (  # keys that no row of a stranger may have
     bounds.CEILING_KEY,
     bounds.REFERENCE_KEY,
     slug(bounds.Shade.name),
-    *(info.key for info in (MITSUBA, *physics_rows.INFOS)),
+    *(info.key for info in (bounds.TRUE_LIGHT, MITSUBA, *physics_rows.INFOS)),
     *map(slug, multiview_methods.NAMES),
 )
 
@@ -294,6 +294,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
     infos = [row.described(len(scenes)) for row in here.rows] + [
         *(row.info for row in _views_rows(config)),
         bounds.ceiling_info(suite),
+        bounds.TRUE_LIGHT,
         reference_row(check, scenes),
         MITSUBA,
         *physics_rows.INFOS,

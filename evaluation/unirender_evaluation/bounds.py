@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import resample_environment
 from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
 from unirender_evaluation.engine import Job, record_of
+from unirender_evaluation.light_metrics import SHAPE as LIGHT_SHAPE
+from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
@@ -106,12 +110,33 @@ def ceiling_values(suite: Suite, task: Task, backbones: Sequence[str] = ()) -> d
     return values
 
 
+TRUE_LIGHT = MethodInfo(
+    "true-light-16-x-32",
+    "True light, 16 x 32 texels",
+    "ceiling",
+    note="what a method scores that finds the light at the resolution that ours has, without an error",
+    config={"bound": "true-light", "shape": list(LIGHT_SHAPE)},
+)
+
+
+def _light_record(task: Task, key: str) -> Record:
+    true = task.truth_maps
+    if true is None or true.environment is None:
+        raise UnirenderError(f"{task.identity}: the suite's truth has no light, expected one")
+    found = true.replace(environment=resample_environment(true.environment, LIGHT_SHAPE))
+    return record_of(task, TRUE_LIGHT, score_light(found, true), key)
+
+
 def ceiling_jobs(suite: Suite, scene: Scene, key_of: KeyOf, backbones: Sequence[str]) -> Iterator[Job]:
-    """The noise ceiling's records of one scene."""
+    """The records of one scene of the bounds that a truth has in itself: the noise ceiling of what is a picture, the
+    coarse true light of what is a light."""
     info = ceiling_info(suite)
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):
-            if task.scores_picture:
+            if task.asks_light:
+                key = key_of(task.identity, TRUE_LIGHT, ())
+                yield Job(key, TRUE_LIGHT.label, partial(_light_record, task, key))
+            elif task.scores_picture:
                 key = key_of(task.identity, info, {LPIPS})
                 yield Job(key, info.label, partial(_ceiling_record, suite, task, info, key, backbones))
 

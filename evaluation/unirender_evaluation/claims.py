@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.metrics import Metric, Variant, metric_key
 from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.table_list import ALL_METRICS
 
 MASKED = Variant("masked", "srgb", "raw")
 
@@ -24,8 +25,13 @@ class Claim:
     remark: str = ""
 
     @property
+    def kind(self) -> Metric:
+        """The metric that it is about."""
+        return ALL_METRICS[self.metric]
+
+    @property
     def key(self) -> str:
-        return metric_key(self.quantity, METRICS[self.metric], MASKED)
+        return metric_key(self.quantity, self.kind, MASKED)
 
 
 OPTIMISED, REFINED = "nvdiffrec-mitsuba", "ours-mitsuba-refinement"
@@ -34,6 +40,7 @@ HELD = "held at 0.5"
 EDITS = ("edit_metallic", "edit_roughness")
 GIVEN = ("given", "given-light")
 LIT = ("from-image-sd", "from-image-hdri")
+LIGHT_BARS = ("uniform-light", "mean-light")
 OURS, ANCHORED = "ours-mean", "ours-mean-anchored"
 PLAIN_COMPOSITE, ANCHORED_COMPOSITE = "composite-of-ours-mean", "composite-of-ours-mean-anchored"
 COMPOSITE, SPLIT_SUM, CEILING = "composite", "composite-split-sum", "noise-ceiling"
@@ -77,6 +84,20 @@ def relight_claims(row: str, protocol: str, expected: str = "beats") -> tuple[Cl
     return (Claim("relighting", protocol, "relit", "psnr", row, "unedited-input", expected),)
 
 
+def light_claims(row: str, expected: str = "beats") -> tuple[Claim, ...]:
+    """Lights found in a picture against the trivial ones: what they make of a matte ball, and where they come from."""
+    return tuple(
+        Claim("light", "light-from-image", quantity, metric, row, bar, expected)
+        for quantity, metric, bars in (
+            ("environment", "log_rmse_scaled", LIGHT_BARS),
+            ("environment", "peak_deg", LIGHT_BARS[1:]),  # uniform light comes from nowhere
+            ("ball_matte", "rmse_relative", LIGHT_BARS),
+            ("ball_glossy", "rmse_relative", LIGHT_BARS),
+        )
+        for bar in bars
+    )
+
+
 def ceiling_claims(row: str) -> tuple[Claim, ...]:
     """The distance to what a noise-free prediction would score."""
     asked = [("rendering", protocol, quantity) for protocol in ("from-image", *GIVEN) for quantity in EDITS]
@@ -97,6 +118,7 @@ OUR_CLAIMS: tuple[Claim, ...] = (
     ),
     *given_claims(OURS),
     *inverse_claims(OURS),
+    *light_claims(OURS),
     *(claim for protocol in LIT for row in (OURS, ANCHORED) for claim in relight_claims(row, protocol)),
 )
 
@@ -109,6 +131,7 @@ def optimisation_claims() -> tuple[Claim, ...]:
     asked = [("rendering", "from-image", quantity, "psnr") for quantity in EDITS]
     asked += [("inverse", "single-image", *what) for what in maps]
     asked += [("relighting", protocol, "relit", "psnr") for protocol in LIT]
+    asked += [("light", "light-from-image", "ball_matte", "rmse_relative")]
     rivals = ((OURS, OPTIMISED), (OURS, OPTIMISED_ON_MESH), (REFINED, OURS), (REFINED, OPTIMISED))
     single = [_of_one_picture(Claim(*question, *pair)) for pair in rivals for question in asked]
     trivial = [*edit_claims(OPTIMISED, "stated"), *inverse_claims(OPTIMISED, "stated")]
@@ -136,7 +159,8 @@ def _of_one_picture(claim: Claim) -> Claim:
 def stranger_claims(row: str) -> tuple[Claim, ...]:
     """What is asked of somebody else's row: to beat every trivial row; its distance to closed forms and ceiling."""
     relighting = (claim for protocol in LIT for claim in relight_claims(row, protocol))
-    return (*edit_claims(row), *given_claims(row), *inverse_claims(row), *relighting, *ceiling_claims(row))
+    maps = (*inverse_claims(row), *light_claims(row))
+    return (*edit_claims(row), *given_claims(row), *maps, *relighting, *ceiling_claims(row))
 
 
 def run_claims(records: Sequence[Record], run: RunInfo) -> list[Claim]:

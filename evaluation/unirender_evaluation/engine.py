@@ -113,8 +113,11 @@ def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[
     A picture is premultiplied and has no mask of its own: the true one is pasted. Maps bring theirs, if they have one.
     """
     from unirender_evaluation import lpips
+    from unirender_evaluation.light_metrics import score_light
     from unirender_evaluation.scoring import score_image, score_maps
 
+    if task.asks_light:
+        return score_light(prediction.maps, task.truth_maps)
     networks = [lpips.load(name) for name in backbones]
     values: dict[str, float] = {}
     if prediction.image is not None and task.truth_image is not None:

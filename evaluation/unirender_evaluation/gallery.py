@@ -44,7 +44,8 @@ class GalleryItem:
         protocol: as in records.
         sample: as in records.
         caption: for people: object and light.
-        mask: true coverage, [0, 1].
+        mask: coverage of truth and predictions, [0, 1]: the true mask, or, where balls are shown, theirs.
+        given_mask: coverage of what was given; None: the same.
         given: what the method saw, name -> picture; a light may have a size of its own.
         truth: name -> picture.
         predictions: method key -> name -> picture; names are those of `truth`.
@@ -72,6 +73,7 @@ class GalleryItem:
     count: int = 1
     leader: str = ""
     figure: str = ""
+    given_mask: Float[np.ndarray, "h w 1"] | None = None
 
     def __post_init__(self) -> None:
         size = self.mask.shape[:2]
@@ -280,14 +282,16 @@ def _prediction(item: GalleryItem, method: str, name: str, run: RunInfo, most: i
 
 
 def _named(name: str, picture: Picture, item: GalleryItem, most: int) -> dict[str, Any]:
-    return {"name": name, "picture": _shown(picture, item, most)}
+    return {"name": name, "picture": _shown(picture, item, most, item.given_mask)}
 
 
-def _shown(picture: Picture, item: GalleryItem, most: int) -> dict[str, Any]:
-    """A picture for the template, at most `most` pixels wide; those of the frame's size carry the mask."""
+def _shown(picture: Picture, item: GalleryItem, most: int, cover: Mask | None = None) -> dict[str, Any]:
+    """A picture for the template, at most `most` pixels wide; those of the frame's size carry the mask `cover`, or the
+    item's."""
     width = picture_size(picture.shape[1], most)
-    if picture.shape[:2] == item.mask.shape[:2]:
-        small, mask = shrink_covered(picture, item.mask, width)
+    cover = item.mask if cover is None else cover
+    if picture.shape[:2] == cover.shape[:2]:
+        small, mask = shrink_covered(picture, cover, width)
     else:
         small, mask = shrink(picture, width), None
     return {"uri": data_uri(small, mask), "width": small.shape[1], "height": small.shape[0]}

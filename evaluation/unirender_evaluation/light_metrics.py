@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
-from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
 from unirender.lighting import (
     environment_directions,
     resample_environment,
@@ -21,6 +21,7 @@ from unirender.lighting import (
     texel_solid_angles,
 )
 from unirender_evaluation import metrics
+from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.metrics import LOG_EPSILON, Metric
 
 SHAPE = (16, 32)
@@ -28,7 +29,7 @@ CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
 CONE_SHAPE = (46, 90)  # directions and quadrature of the cones: 4 degrees
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_SCALE = 1e4  # of k, either way, times that of equal energy
-UNIFORM = 1e-3  # relative differences between cones below which a light has no brightest direction
+ALIKE = 1e-3  # relative difference of two cones, below which neither is the brighter one
 
 SCALED_LOG_RMSE = Metric(
     "log_rmse_scaled",
@@ -50,7 +51,7 @@ PEAK_ANGLE = Metric(
     (),
     1,
     f"between the brightest directions (centroid of the luminance in the cone of {CONE_DEG:g} degrees that holds the "
-    "most); 90 for a uniform light",
+    "most); 90 where apart cones are alike",
 )
 
 
@@ -71,15 +72,29 @@ def light_values(
     }
 
 
+def score_light(found: Intrinsics | None, true: Intrinsics | None) -> dict[str, float]:
+    """Metric key -> value of the light among a method's maps; empty where one of the two has none.
+
+    Args:
+        found: with its `environment`, any resolution.
+        true: the same.
+    """
+    if found is None or true is None or found.environment is None or true.environment is None:
+        return {}
+    return {
+        **light_values(found.environment, true.environment),
+        **ball_values(found.environment, true.environment),
+    }
+
+
 def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:
     """The log-RMSE of `k p` against `t` for the best single factor k, weighted by solid angle.
 
-    Raises:
-        UnirenderError: `p` is black, which no factor makes a light.
+    A black light, which no factor changes, is compared as it is.
     """
-    if not p.max() > 0:
-        raise UnirenderError("light metric: the found light is black, expected some radiance")
     w = texel_solid_angles(*p.shape[:2])[..., None]
+    if not p.max() > 0:
+        return metrics.log_rmse(p, t, w)
 
     def error(log_scale: float) -> float:
         return metrics.log_rmse(p * math.exp(log_scale), t, w)
@@ -95,7 +110,7 @@ def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]
 
 def peak_angle_deg(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:
     """Angle between the brightest directions of two lights, in degrees; 90, the mean over random directions, where one
-    of them is uniform."""
+    of them has none."""
     a, b = brightest_direction(p), brightest_direction(t)
     if a is None or b is None:
         return 90.0
@@ -105,7 +120,7 @@ def peak_angle_deg(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"])
 
 def brightest_direction(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"] | None:
     """Unit centroid of the luminance in the cone of `CONE_DEG` that holds the most of it, weighted by solid angle; None
-    for uniform light.
+    where a cone that does not touch it holds as much, as in uniform light, or in one that is the same all around.
 
     Cones are centred on, and integrated over, the texel directions of a grid of `CONE_SHAPE`, between which the light
     is bilinear.
@@ -113,9 +128,10 @@ def brightest_direction(environment: Float[np.ndarray, "h w 3"]) -> Float[np.nda
     directions, weights, inside = _cones()
     luminance = sample_environment(environment, directions).astype(np.float64) @ LUMINANCE * weights
     means = inside @ luminance
-    if np.ptp(means) <= UNIFORM * means.max():
-        return None
     best = int(np.argmax(means))
+    alike = means >= (1 - ALIKE) * means[best]
+    if (directions[alike] @ directions[best]).min() < math.cos(math.radians(2 * CONE_DEG)):
+        return None
     centroid = (luminance * inside[best]) @ directions.astype(np.float64)
     return centroid / np.linalg.norm(centroid)
 

@@ -136,6 +136,7 @@ METRICS: dict[str, Metric] = {
         Metric("angle_deg", "angle", "deg", False, 0.0, (), 1, "coverage-weighted mean angle between normals"),
         Metric("ciede2000", "CIEDE2000", "", False, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
         Metric("log_rmse", "log-RMSE", "", False, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
+        Metric("rmse_relative", "error", "", False, 0.0, ("scale",), 3, "RMSE over the truth's mean, in mask, HDR"),
     )
 }
 
@@ -243,6 +244,18 @@ def log_rmse(p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Fl
     """Root of the coverage-weighted mean of (ln(p + eps) - ln(t + eps))^2 for radiance >= 0, eps = `LOG_EPSILON`."""
     logs = [np.log(np.maximum(x.astype(np.float64), 0) + LOG_EPSILON) for x in (p, t)]
     return math.sqrt(mse(logs[0], logs[1], w))
+
+
+def rmse_relative(p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"]) -> float:
+    """Root of the coverage-weighted mean of (p - t)^2, over the mean of t, linear.
+
+    Raises:
+        UnirenderError: the truth is black, or as `mse` does.
+    """
+    mean = weighted_mean(t.astype(np.float64).mean(axis=-1, keepdims=True), w)
+    if not mean > 0:
+        raise UnirenderError("metric: the truth is black, expected some light; drop the sample")
+    return math.sqrt(mse(p, t, w)) / mean
 
 
 def ciede2000(

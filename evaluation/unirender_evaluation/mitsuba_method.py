@@ -148,6 +148,8 @@ def mitsuba_jobs(
     mitsuba = MitsubaScene(suite, scene)
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):
+            if task.asks_light:
+                continue  # which Mitsuba is given
             key = key_of(task.identity, MITSUBA, {REFERENCE, LPIPS})
             yield Job(key, MITSUBA.label, partial(_record, task, mitsuba, key, backbones))
 

@@ -13,6 +13,7 @@ ASKED = frozenset(
         ("inverse", "single-image"),
         ("relighting", "from-image-sd"),
         ("relighting", "from-image-hdri"),
+        ("light", "light-from-image"),
     }
 )
 USES = frozenset({OPTIMIZER, REFERENCE})

@@ -20,20 +20,24 @@ from PIL.PngImagePlugin import PngInfo
 from unirender.color import image_srgb
 from unirender.files import replace_file
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import sample_environment
 from unirender_evaluation.engine import Prediction
-from unirender_evaluation.gallery import GalleryItem, Picture, image_picture, map_pictures
+from unirender_evaluation.gallery import GalleryItem, Mask, Picture, image_picture, map_pictures
+from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, balls
 from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.table_formats import format_number
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 
-PRIMARY = {  # table -> quantities whose PSNR ranks its samples; a sample has one of them
-    "rendering": ("edit_metallic", "edit_roughness"),
-    "inverse": ("albedo",),
-    "relighting": ("relit",),
+PRIMARY = {  # table -> metric and quantities that rank its samples; a sample has one of them
+    "rendering": ("psnr", ("edit_metallic", "edit_roughness")),
+    "inverse": ("psnr", ("albedo",)),
+    "relighting": ("psnr", ("relit",)),
+    "light": ("rmse_relative", (MATTE_BALL,)),
 }
-SCORES = (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}"))
+BALLS = {"matte ball": MATTE_BALL, "glossy ball": GLOSSY_BALL}
+SCORES = (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}"), ("rmse_relative", "error {:.2f}"))
 
 
 class Pictures:
@@ -81,7 +85,8 @@ class Pictures:
                 if task is None:
                     continue
                 about = {"leader": leader, "rank": rank, "place": place + 1, "count": len(ranked)}
-                figure = f"PSNR {format_number(score, 1)} dB"
+                metric = METRICS[PRIMARY[table][0]]
+                figure = f"{metric.label} {format_number(score, metric.decimals - 1)} {metric.unit}".rstrip()
                 item = self._item(task, [r for r in asked if r.sample == sample], about | {"figure": figure})
                 found += [] if item is None else [item]
         return found
@@ -129,7 +134,8 @@ class Pictures:
             sample=task.sample,
             caption=f"{task.scene.object} ({task.scene.family}) under {task.scene.light}",
             question=question(task, self.suite),
-            mask=task.mask,
+            mask=_mask(task),
+            given_mask=task.mask,
             given=_given(task),
             truth=truth,
             predictions=predictions,
@@ -142,12 +148,14 @@ class Pictures:
 
 
 def ranking(records: Sequence[Record], table: str, main: str) -> tuple[str, list[tuple[str, float]]]:
-    """(row, its samples with their masked PSNR, worst first) for the records of one protocol."""
-    keys = [metric_key(quantity, METRICS["psnr"]) for quantity in PRIMARY.get(table, ())]
+    """(row, its samples with the score that ranks them, worst first) for the records of one protocol."""
+    metric, quantities = PRIMARY.get(table, ("psnr", ()))
+    keys = [metric_key(quantity, metric) for quantity in quantities]
+    sign = 1 if METRICS[metric].higher_is_better else -1
     for method in dict.fromkeys([main, *(record.method for record in records)]):
         scores = {r.sample: r.values[key] for r in records if r.method == method for key in keys if key in r.values}
         if scores:
-            return method, sorted(scores.items(), key=lambda pair: (pair[1], pair[0]))
+            return method, sorted(scores.items(), key=lambda pair: (sign * pair[1], pair[0]))
     return main, []
 
 
@@ -166,6 +174,8 @@ def question(task: Task, suite: Suite) -> str:
         return ", ".join(f"{name} {old:.1f} → {new:.1f}" for name, old, new in pairs if old != new)
     if "relight" in task.asks:
         return f"relit by {suite.other_light(task.scene).light}"
+    if task.asks_light:
+        return f"the light, {task.scene.light}"
     asked = "render:" if "render" in task.asks else "decompose: true"
     return f"{asked} metallic {material[0]:.1f}, roughness {material[1]:.1f}"
 
@@ -183,17 +193,35 @@ def _given(task: Task) -> dict[str, Picture]:
 
 
 def _pictures(task: Task, image: Float[np.ndarray, "h w 3"] | None, maps: Intrinsics | None) -> dict[str, Picture]:
+    if task.asks_light:
+        return {} if maps is None or maps.environment is None else _balls(maps.environment, task.mask.shape[1])
     pictures = {} if image is None else {"image": image_picture(image, task.mask)}
     if maps is not None:
         pictures |= map_pictures(maps)
     return pictures
 
 
+def _balls(environment: Float[np.ndarray, "h w 3"], size: int) -> dict[str, Picture]:
+    """Display pictures of balls under a light: those that are scored, and a mirror, which shows the light itself."""
+    made = balls(environment, size)
+    normal = ball_normals(size)
+    view = np.array([0, 0, 1], np.float32)
+    mirrored = 2 * normal[..., 2:] * normal - view
+    mirror = sample_environment(environment, mirrored) * ball_mask(size)
+    shown = {**{name: made[quantity] for name, quantity in BALLS.items()}, "mirror ball": mirror}
+    return {name: image_srgb(value) for name, value in shown.items()}
+
+
+def _mask(task: Task) -> Mask:
+    """Of a question's truth and answers as `_pictures` shows them."""
+    return ball_mask(task.mask.shape[1]) if task.asks_light else task.mask
+
+
 def _scores(task: Task, record: Record, names: Iterable[str]) -> dict[str, str]:
     """The headline number of every picture."""
     texts = {}
     for name in names:
-        quantity = task.quantity if name == "image" else name
+        quantity = task.quantity if name == "image" else BALLS.get(name, name)
         values = [(record.values.get(metric_key(quantity, metric)), text) for metric, text in SCORES]
         found = next(((value, text) for value, text in values if value is not None), None)
         if found is not None:

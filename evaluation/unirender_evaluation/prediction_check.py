@@ -11,7 +11,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.conventions import FILE, Conventions
 from unirender_evaluation.methods import Mask
-from unirender_evaluation.predictions import MAP_FILES, SUFFIXES, PredictionFolder
+from unirender_evaluation.predictions import LIGHT_FILES, MAP_FILES, SUFFIXES, PredictionFolder
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
@@ -39,12 +39,13 @@ class Question:
     camera: Camera
     answers: set[str] = field(default_factory=set)
     maps: bool = False
+    light: bool = False
 
     @property
     def files(self) -> str:
         """The names that a file may have."""
         names = [f"{name}.exr|png" for name in sorted(self.answers)]
-        return ", ".join([*names, *(MAP_FILES if self.maps else ())])
+        return ", ".join([*names, *(MAP_FILES if self.maps else ()), *(LIGHT_FILES if self.light else ())])
 
 
 def check_predictions(rows: Iterable[Row], suite: Suite) -> None:
@@ -67,6 +68,9 @@ def questions(suite: Suite) -> dict[str, Question]:
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, list(suite.scenes)):
             question = asked.setdefault(task.folder, Question(suite.mask(task.scene), suite.spec.camera))
+            question.light |= task.asks_light
+            if task.asks_light:
+                continue
             if task.answer != "intrinsics":
                 question.answers.add(task.answer)
             question.maps |= "decompose" in task.asks
@@ -106,7 +110,11 @@ def _visible(folder: Path) -> Iterator[Path]:
 
 
 def _is_answer(path: Path, question: Question) -> bool:
-    if not path.is_file() or path.suffix not in SUFFIXES:
+    if not path.is_file():
+        return False
+    if question.light and path.name in LIGHT_FILES:
+        return True
+    if path.suffix not in SUFFIXES:
         return False
     return path.stem in question.answers or (question.maps and path.name in MAP_FILES)
 
@@ -126,6 +134,8 @@ def _layout_problems(folder: Path, files: list[Path], question: Question) -> Ite
     for answer in sorted(question.answers):
         if {f"{answer}{suffix}" for suffix in SUFFIXES} <= names:
             yield f"{folder}: {answer} is there as EXR and as PNG, expected one of them"
+    if question.light and set(LIGHT_FILES) <= names:
+        yield f"{folder}: {' and '.join(LIGHT_FILES)} are both there, expected one of them"
 
 
 def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
@@ -168,7 +178,9 @@ def _named_truth(path: Path) -> str | None:
 
 def _file_problems(predictions: PredictionFolder, path: Path, question: Question) -> Iterator[str]:
     try:
-        if path.stem in question.answers:
+        if path.name in LIGHT_FILES:
+            predictions.read_light(path)
+        elif path.stem in question.answers:
             predictions.read_picture(path, question.mask)
         else:
             predictions.read_maps(path, question.mask, question.camera)

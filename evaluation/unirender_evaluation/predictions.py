@@ -12,6 +12,7 @@ own name of the picture):
     <picture>/edit_m100_r050.exr|png    the picture with metallic 1.0, roughness 0.5
     <picture>/relight_l1_sd.exr|png     the picture under the object's light 1, its s and d given
     <picture>/relight_l1_hdri.exr|png   the same, the light given
+    <picture>/environment.exr|hdr       the light, lat-long, linear, in camera axes; of the pictures that are relit
     <picture>/render_given.exr|png      the picture from true maps, s and d; `render_given-light`: from maps and light
 
 A mask in `intrinsics.exr` (`mask.Y`) is the method's own, and whole-frame figures of its maps are taken with it.
@@ -35,11 +36,12 @@ from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.png import read_png
-from unirender_evaluation.tasks import Task
+from unirender_evaluation.tasks import LIGHT_ANSWER, Task
 
 PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
 COLOURS = ("albedo", "specular", "diffuse")
 MAP_FILES = ("intrinsics.exr", *(f"{name}.png" for name in PNG_MAPS))
+LIGHT_FILES = (f"{LIGHT_ANSWER}.exr", f"{LIGHT_ANSWER}.hdr")
 SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
@@ -82,13 +84,16 @@ class PredictionFolder:
     def sha256(self) -> str:
         """Over names and contents of all files that are read."""
         digest = hashlib.sha256()
-        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name == FILE) and p.is_file())
+        named = (FILE, *LIGHT_FILES)
+        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name in named) and p.is_file())
         for path in sorted(read):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
     def has(self, task: Task) -> bool:
         """Whether there is an answer to the task."""
+        if task.asks_light:
+            return self._light(task) is not None
         return self._picture(task) is not None or ("decompose" in task.asks and bool(self._map_files(task)))
 
     def answer(self, task: Task) -> tuple[Image | None, Intrinsics | None]:
@@ -97,6 +102,9 @@ class PredictionFolder:
         Raises:
             UnirenderError: a file is broken, has the wrong size, or values outside the contract.
         """
+        if task.asks_light:
+            light = self._light(task)
+            return None, None if light is None else Intrinsics(environment=self.read_light(light))
         path = self._picture(task)
         image = None if path is None else self.read_picture(path, task.mask)
         files = self._map_files(task) if "decompose" in task.asks else []
@@ -115,6 +123,9 @@ class PredictionFolder:
             if task.answer != "intrinsics" and path.is_file():
                 return path
         return None
+
+    def _light(self, task: Task) -> Path | None:
+        return next((p for p in (self.folder / task.folder / name for name in LIGHT_FILES) if p.is_file()), None)
 
     def _map_files(self, task: Task) -> list[Path]:
         return [path for path in (self.folder / task.folder / name for name in MAP_FILES) if path.is_file()]
@@ -135,6 +146,19 @@ class PredictionFolder:
                 image = self.conventions.linear(stored, path.suffix)
             _check_brightness("the picture", image)
         return image if self.conventions.premultiplied else (image * mask).astype(np.float32)
+
+    def read_light(self, path: Path) -> Float[np.ndarray, "eh ew 3"]:
+        """A light on the contract's grid: a map that unirender wrote as it is, another one's pixels taken as areas.
+
+        Raises:
+            UnirenderError: the file is broken, black, not finite, beyond `BRIGHTEST` or not twice as wide as high.
+        """
+        from unirender_reference.lights import load_light
+
+        with _named(path):
+            light = load_light(path, photograph=False, normalise=False).environment
+            _check_brightness("the light", light)
+        return light
 
     def read_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
         """The maps of one file, in the contract's conventions.

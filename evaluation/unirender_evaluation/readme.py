@@ -34,6 +34,7 @@ SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
     ("inverse", "single-image", "main"),
     ("relighting", "from-image-hdri", "main"),
+    ("light", "light-from-image", "main"),
     ("multi-view", "known-mesh", "main"),
     ("physics", "physics", "main"),
 )

@@ -12,10 +12,11 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
-from unirender_evaluation.metrics import METRICS, SCALES, Variant, metric_key
+from unirender_evaluation.metrics import METRICS, SCALES, Metric, Variant, metric_key
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
+from unirender_evaluation.table_list import ALL_METRICS
 
 MASKED = Variant("masked", "srgb", "raw")
 NOT_RUN = "not run"
@@ -37,8 +38,13 @@ class Question:
     b: str
 
     @property
+    def kind(self) -> Metric:
+        """The metric that it is about."""
+        return ALL_METRICS[self.metric]
+
+    @property
     def key(self) -> str:
-        return metric_key(self.quantity, METRICS[self.metric], MASKED)
+        return metric_key(self.quantity, self.kind, MASKED)
 
 
 def run_line(results: Results) -> str:
@@ -65,7 +71,7 @@ def _answer(results: Results, question: Question) -> list[str]:
     shared = sorted(a.keys() & b.keys())
     if not shared:
         return [question.text, *labels, NOT_RUN, NOT_RUN, "", "", "0"]
-    metric = METRICS[question.metric]
+    metric = question.kind
     found = compare(records, metric, question.key, question.a, question.b)
     means = [f"{np.mean([values[sample] for sample in shared]):.{metric.decimals}f}" for values in (a, b)]
     difference, decimals = found.difference, metric.decimals

@@ -11,6 +11,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.light_methods import MeanLight, UniformLight
 from unirender_evaluation.methods import (
     Composite,
     CompositeOf,
@@ -29,7 +30,7 @@ from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
 from unirender_evaluation.suites import Scene, material_key
-from unirender_evaluation.tasks import Task
+from unirender_evaluation.tasks import PROTOCOLS, Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")
@@ -136,7 +137,11 @@ def trivial_rows() -> list[Row]:
         "sphere normal": "from the silhouette alone",
     }
     methods = [UneditedInput(), InputAsAlbedo(), MeanAlbedo(), MeanNormal(), SphereNormal(), ConstantMaterial()]
-    rows = [make_row(m, "trivial", note=notes.get(m.name, "")) for m in methods]
+    of_light = frozenset({("light", "light-from-image")})
+    others = frozenset(PROTOCOLS) - of_light
+    rows = [make_row(m, "trivial", protocols=others, note=notes.get(m.name, "")) for m in methods]
+    lights = {UniformLight(): "white, as bright as the picture", MeanLight(): "mean of training lights by height"}
+    rows += [make_row(m, "trivial", protocols=of_light, note=note) for m, note in lights.items()]
     given = frozenset({("rendering", "given"), ("rendering", "given-light")})
     light_alone = frozenset({("rendering", "given-light")})
     note = "given light: s and d derived without shadows"
@@ -175,7 +180,7 @@ def our_rows(
     anchored = ours("Ours (mean, anchored)", anchored=True, decompositions=shared)
     open_mean = ours("Ours (mean, not closed)", closed=False)
     composites = [CompositeOf(mean, anchored=carried, edited=edited) for carried in (False, True)]
-    decomposes = from_image | {("inverse", "single-image")}
+    decomposes = from_image | {("inverse", "single-image"), ("light", "light-from-image")}
     one: dict[str, Any] = {"steps": 1, "samples": 1, "uses": frozenset({MODEL})}
     many: dict[str, Any] = one | {"steps": SAMPLE_STEPS, "samples": SAMPLE_COUNT, "seed": seed}
     rows = [
@@ -186,7 +191,7 @@ def our_rows(
     ]
     if sample_scenes != 0:
         sampled = ours("Ours (sample)", mode="sample", steps=SAMPLE_STEPS, samples=SAMPLE_COUNT)
-        subset = frozenset({("rendering", "from-image"), ("inverse", "single-image")})
+        subset = decomposes - {("relighting", "from-image-sd"), ("relighting", "from-image-hdri")}
         rows.append(make_row(sampled, "ours", scenes=sample_scenes, protocols=subset, **many))
     return rows
 

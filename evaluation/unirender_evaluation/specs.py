@@ -42,6 +42,7 @@ PROTOCOLS: dict[str, Protocol] = {
             True,
         ),
         Protocol("from-image-hdri", "from the image, HDRI given", "one image and its mask, and the target's HDRI"),
+        Protocol("light-from-image", "from the image", "one image and its mask"),
         Protocol("physics", "physics", "what each test says"),
         Protocol(
             "known-mesh",

@@ -1,11 +1,13 @@
 """Every table that a run fills, and every metric that stands in one."""
 
+from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics_tests import PHYSICS_TABLE
 from unirender_evaluation.specs import TABLES, TableSpec
 
-ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in (MULTIVIEW_TABLE, PHYSICS_TABLE)}}
+OURS = (LIGHT_TABLE, MULTIVIEW_TABLE, PHYSICS_TABLE)
+ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in OURS}}
 ALL_METRICS: dict[str, Metric] = {
     **{column.metric.name: column.metric for spec in ALL_TABLES.values() for column in spec.columns},
     **METRICS,

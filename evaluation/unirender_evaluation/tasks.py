@@ -9,6 +9,7 @@ score against.
     relighting  from-image-sd     picture, s and d under another light    s, d of its own light; the relit picture
                                                                           (the paper's protocol)
     relighting  from-image-hdri   picture, another light                  the relit picture
+    light       light-from-image  picture                                 the light, lat-long in camera axes
 
 A picture is what a camera would store: 8-bit sRGB. No other truth reaches a method; the mask and the camera are inputs
 everywhere. A row that is told more declares it (`rows.Row.told`).
@@ -37,7 +38,9 @@ PROTOCOLS: tuple[tuple[str, str], ...] = (
     ("inverse", "single-image"),
     ("relighting", "from-image-sd"),
     ("relighting", "from-image-hdri"),
+    ("light", "light-from-image"),
 )
+LIGHT_ANSWER = "environment"
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class Task:
     Which questions a run has answered already is looked up without them.
 
     `folder` and `answer` name the file of a predictions folder that answers it: `<folder>/<answer>.exr` or `.png`; for
-    maps `<folder>/intrinsics.exr` or one PNG per map.
+    maps `<folder>/intrinsics.exr` or one PNG per map, for the light `<folder>/environment.exr` or `.hdr`.
     """
 
     table: str
@@ -81,6 +84,11 @@ class Task:
     def scores_picture(self) -> bool:
         """Whether the answer, or a part of it, is a picture."""
         return self.asks != ("decompose",)
+
+    @property
+    def asks_light(self) -> bool:
+        """Whether the answer is the light alone."""
+        return self.answer == LIGHT_ANSWER
 
     @cached_property
     def asked(self) -> Asked:
@@ -151,6 +159,7 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Itera
         ("inverse", "single-image"): _inverse,
         ("relighting", "from-image-sd"): _relights,
         ("relighting", "from-image-hdri"): _relights,
+        ("light", "light-from-image"): _light,
     }
     if (table, protocol) not in makers:
         raise UnirenderError(
@@ -275,4 +284,30 @@ def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> 
         truth_variance=suite.image_variance(target, base),
         truth_twin=suite.ceiling_image(target, base),
         truth_maps=own_light,
+    )
+
+
+def _light(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    sample = f"{scene.key}_{material_key(suite.spec.base)}"
+    yield Task(
+        table="light",
+        protocol=protocol,
+        sample=sample,
+        scene=scene,
+        asks=("decompose",),
+        folder=sample,
+        answer=LIGHT_ANSWER,
+        read=partial(_read_light, suite, scene),
+        geometry=partial(known_mesh, suite, scene),
+        quantity="environment",
+    )
+
+
+def _read_light(suite: Suite, scene: Scene) -> Asked:
+    base = suite.spec.base
+    own = suite.intrinsics(scene, base)
+    return Asked(
+        suite.mask(scene),
+        {"decompose": picture(suite, scene, base)},
+        truth_maps=Intrinsics(environment=own.environment, mask=own.mask, camera=own.camera),
     )

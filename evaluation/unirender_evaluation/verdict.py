@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
-from unirender_evaluation.metrics import METRICS
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import paired_difference
 
@@ -24,14 +23,14 @@ class Finding:
     def __str__(self) -> str:
         c = self.claim
         if self.comparison is None:
-            what = f"{c.table}/{c.protocol} {c.quantity} {METRICS[c.metric].label}"
+            what = f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}"
             return f"{self.why}{what}: {c.a} against {c.b}"
         d = self.comparison.difference
         sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
-        unit = METRICS[c.metric].unit
+        unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
         return (
-            f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {METRICS[c.metric].label}: "
+            f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}: "
             f"{c.a} {self.comparison.verdict} {c.b}, "
             f"difference {d.mean:+.4g} [{d.low:+.4g}, {d.high:+.4g}] {unit} (n {d.n}, {d.clusters} objects{remark})"
         )
@@ -46,7 +45,7 @@ def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) ->
         a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
         common = a.keys() & b.keys()
         if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
-            comparison = compare(chosen, METRICS[claim.metric], claim.key, claim.a, claim.b)
+            comparison = compare(chosen, claim.kind, claim.key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
             found.append(Finding(claim, comparison, comparison.a_beats_b if claimed else None))
         else:

@@ -78,6 +78,7 @@ FROM_RECORDS = (
     "claims",
     "comparisons",
     "docs_tables",
+    "light_tables",
     "merge",
     "protocol",
     "published",
@@ -93,7 +94,7 @@ OUTSIDE = ("__main__", "cli", "command_line", "commands", "options", "shipped", 
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
-VIEWS = ("light_metrics", "multiview_*")
+VIEWS = ("multiview_*",)
 ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-ins do
 MITSUBA_ROW = ("mitsuba_method",)
 # Commands of their own, whose records hold `modules_version` of what measures.

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from reference_scenes import environment
 
-from unirender.errors import UnirenderError
 from unirender.lighting import environment_directions, resample_environment, rotate_environment, texel_solid_angles
 from unirender_evaluation import metrics
 from unirender_evaluation.light_metrics import (
@@ -103,7 +102,9 @@ def test_resolutions_are_brought_together() -> None:
     assert light_values(environment(7), light)["environment.log_rmse_scaled"] > 0.1
 
 
-def test_a_black_light_is_refused() -> None:
-    black = np.zeros((*SHAPE, 3), np.float32)
-    with pytest.raises(UnirenderError, match="the found light is black"):
-        light_values(black, lamp(7.5, 8.0))
+def test_no_factor_changes_a_black_light() -> None:
+    black, true = np.zeros((*SHAPE, 3), np.float32), lamp(7.5, 8.0)
+    values = light_values(black, true)
+    w = texel_solid_angles(*SHAPE)[..., None]
+    assert values["environment.log_rmse_scaled"] == pytest.approx(metrics.log_rmse(black, true, w), rel=1e-6)
+    assert values["environment.peak_deg"] == 90

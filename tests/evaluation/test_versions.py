@@ -66,8 +66,9 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
         (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
-        (MULTIVIEW, "unirender_evaluation", ("light_metrics.py", "multiview_scoring.py", "multiview_settings.py")),
+        (MULTIVIEW, "unirender_evaluation", ("multiview_scoring.py", "multiview_settings.py")),
         ("core", "unirender_evaluation", ("physics.py", "physics_rows.py", "records.py", "suite_spec.py")),
+        ("core", "unirender_evaluation", ("light_balls.py", "light_methods.py", "light_metrics.py")),
     ],
 )
 def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:
@@ -80,7 +81,7 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender_evaluation", ("optimized_method.py", "multiview_scoring.py", "light_metrics.py")),
+        ("core", "unirender_evaluation", ("optimized_method.py", "multiview_scoring.py", "light_tables.py")),
         (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
         (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
     ],

@@ -1,0 +1,30 @@
+"""The light table: how near the light that a method finds in one picture is to the true one."""
+
+from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL
+from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
+from unirender_evaluation.metrics import METRICS, Metric
+from unirender_evaluation.specs import Column, TableSpec
+
+LIGHT, LIGHT_PROTOCOL = "light", "light-from-image"
+
+
+def _column(group: str, quantity: str, metric: Metric, **overrides: str) -> Column:
+    return Column(group, quantity, metric, overrides, published=False)
+
+
+LIGHT_TABLE = TableSpec(
+    LIGHT,
+    "Light",
+    (
+        _column("Environment", "environment", SCALED_LOG_RMSE),
+        _column("Environment", "environment", PEAK_ANGLE),
+        _column("Matte ball", MATTE_BALL, METRICS["rmse_relative"], scale="raw"),
+        _column("Matte ball (aligned)", MATTE_BALL, METRICS["rmse_relative"], scale="aligned"),
+        _column("Glossy ball", GLOSSY_BALL, METRICS["rmse_relative"], scale="raw"),
+        _column("Glossy ball (aligned)", GLOSSY_BALL, METRICS["rmse_relative"], scale="aligned"),
+    ),
+    (LIGHT_PROTOCOL,),
+    "One image in; the light out, as a lat-long map in camera axes. Balls: a white matte one and a glossy one (F = 1, "
+    "roughness 0.5) under the light found, against those under the true one. Aligned: one least-squares factor for "
+    "each ball, since one picture does not tell the light's level from the albedo's.",
+)

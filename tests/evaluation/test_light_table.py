@@ -1,0 +1,246 @@
+"""The light table: balls under a light, the rows that a found light must beat, and lights from folders."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_suites import make_suite
+
+from unirender.camera import Camera
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, write_environment, write_exr
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import environment_directions, resample_environment
+from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
+from unirender_evaluation.engine import answer, score
+from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, ball_values, balls
+from unirender_evaluation.light_methods import MeanLight, UniformLight
+from unirender_evaluation.light_statistics import light_means, light_statistics, write_statistics
+from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.mitsuba_method import mitsuba_jobs
+from unirender_evaluation.prediction_check import PredictionError, check_predictions
+from unirender_evaluation.rows import prediction_rows, trivial_rows
+from unirender_evaluation.suites import Suite
+from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.tables import build_table
+from unirender_evaluation.tasks import Task, tasks
+from unirender_evaluation.training_statistics import training_statistics
+
+RAW, ALIGNED = f"{MATTE_BALL}.rmse_relative@raw", f"{MATTE_BALL}.rmse_relative@aligned"
+GLOSSY_ALIGNED = f"{GLOSSY_BALL}.rmse_relative@aligned"
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("lights"), objects=1)
+
+
+def first(suite: Suite) -> Task:
+    return next(tasks(suite, "light", "light-from-image", list(suite.scenes)))
+
+
+def lamp(x: float, y: float, z: float, sharpness: float = 30.0) -> np.ndarray:
+    """A dim light with one round lamp in that direction."""
+    towards = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+    cosine = environment_directions(16, 32) @ towards
+    return (0.05 + 10 * np.exp(sharpness * (cosine - 1)))[..., None].repeat(3, axis=-1).astype(np.float32)
+
+
+def test_balls_in_uniform_light_are_uniform() -> None:
+    """The matte one has the light's radiance; the glossy one lacks what a lobe sends below its horizon."""
+    made = balls(np.full((16, 32, 3), 0.7, np.float32), 24)
+    inside = ball_mask(24)[..., 0] > 0
+    np.testing.assert_allclose(made[MATTE_BALL][inside], 0.7, rtol=2e-3)
+    assert np.all(made[GLOSSY_BALL][inside] < 0.701)
+    assert made[GLOSSY_BALL][12, 12, 0] == pytest.approx(
+        0.7 * 0.915, rel=0.01
+    )  # A + B of roughness 0.5 seen head on (Karis 2013)
+    assert not made[MATTE_BALL][~inside].any()
+
+
+@pytest.mark.parametrize(("direction", "axis"), [((1, 0, 0.3), 0), ((-1, 0, 0.3), 0), ((0, 1, 0.3), 1)])
+def test_a_lamp_lights_its_own_side(direction: tuple[float, float, float], axis: int) -> None:
+    """By the contract's axes: +x is right, +y is up, as on the object in the picture."""
+    for ball in balls(lamp(*direction), 32).values():
+        place = (ball_normals(32)[..., axis] * ball[..., 0]).sum() / ball[..., 0].sum()
+        assert place * direction[axis] > 0.3
+
+
+def test_the_balls_errors_by_hand() -> None:
+    uniform = np.ones((16, 32, 3), np.float32)
+    same = ball_values(uniform, uniform)
+    assert set(same.values()) == {0.0}
+    twice = ball_values(2 * uniform, uniform)
+    assert twice[RAW] == pytest.approx(1, abs=2e-3)  # |2 t - t| / t
+    assert twice[ALIGNED] == pytest.approx(0, abs=1e-6)
+    tinted = ball_values(uniform * np.array([1.3, 1, 0.7], np.float32), uniform)
+    assert tinted[ALIGNED] > 0.1
+    assert tinted[f"{MATTE_BALL}.rmse_relative@aligned_rgb"] == pytest.approx(0, abs=1e-6)
+
+
+def test_the_further_the_lamp_the_worse() -> None:
+    true = lamp(0, 0.3, 1)
+    errors = [ball_values(lamp(x, 0.3, 1), true) for x in (0.0, 0.2, 0.6, 1.5)]
+    for key in (ALIGNED, GLOSSY_ALIGNED):
+        assert [error[key] for error in errors] == sorted(error[key] for error in errors)
+        assert errors[0][key] == 0
+    # A matte ball hardly tells lamps that a glossy one tells.
+    assert errors[1][GLOSSY_ALIGNED] > 2 * errors[1][ALIGNED]
+
+
+def test_the_question_gives_the_picture_and_keeps_the_light(suite: Suite) -> None:
+    asked = list(tasks(suite, "light", "light-from-image", list(suite.scenes)))
+    assert [task.sample for task in asked] == [f"{scene.key}_m050_r050" for scene in suite.scenes]
+    task = asked[0]
+    assert set(task.inputs["decompose"]) == {"image_srgb", "mask", "camera"}
+    assert task.truth_maps is not None
+    assert task.truth_maps.present == ("environment", "mask")
+    assert not task.scores_picture
+
+
+def test_the_true_light_scores_nothing_and_a_wrong_one_something(suite: Suite) -> None:
+    from unirender_evaluation.engine import Prediction
+
+    task = first(suite)
+    truth = suite.environment(task.scene)
+    exact = score(task, Prediction(maps=Intrinsics(environment=truth)), ())
+    assert exact[RAW] == exact[GLOSSY_ALIGNED] == exact["environment.peak_deg"] == 0
+    assert exact["environment.log_rmse_scaled"] < 1e-3
+    turned = score(task, Prediction(maps=Intrinsics(environment=truth[::-1].copy())), ())
+    assert turned["environment.log_rmse_scaled"] > 0.05
+    assert turned[RAW] > 0.003
+    assert score(task, Prediction(maps=Intrinsics(albedo=np.ones((8, 8, 3)))), ()) == {}  # no light found
+    black = score(task, Prediction(maps=Intrinsics(environment=np.zeros((16, 32, 3)))), ())
+    assert black[RAW] == black[ALIGNED] > 1  # no factor helps
+    assert black["environment.peak_deg"] == 90
+
+
+def test_rows_that_a_light_must_beat(suite: Suite) -> None:
+    task = first(suite)
+    scenes = list(suite.scenes)
+    chosen = {row.info.key for row in trivial_rows() if row.answers(task, scenes)}
+    assert chosen == {"uniform-light", "mean-light"}
+    inverse = next(tasks(suite, "inverse", "single-image", scenes))
+    assert not {row.info.key for row in trivial_rows() if row.answers(inverse, scenes)} & chosen
+    albedo = float(srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32)).mean())
+    grey = np.full((8, 8, 3), 0.5, np.float32)
+    mask = np.zeros((8, 8, 1), np.float32)
+    mask[2:5] = 1
+    found = UniformLight().decompose(grey, mask, Camera()).environment
+    assert found is not None
+    np.testing.assert_allclose(found, srgb_decode(grey).mean() / albedo, rtol=1e-5)
+    mean = MeanLight().decompose(grey, mask, Camera()).environment
+    assert mean is not None
+    assert mean.shape == (16, 32, 3)
+    assert np.ptp(mean, axis=1).max() == 0  # the same all around
+    assert mean[:6].mean() > mean[-6:].mean() > 0  # light comes from above
+    assert "training" in light_statistics()["provenance"]
+
+
+def test_the_mean_light_is_measured(tmp_path: Path) -> None:
+    import io
+    import json
+    import tarfile
+
+    lights = [np.full((16, 32, 3), value, np.float32) for value in (0.2, 0.8)]
+    with tarfile.open(tmp_path / "shard-000000.tar", "w") as tar:
+        for i, light in enumerate(lights):
+            path = write_one(tmp_path, light)
+            info = tarfile.TarInfo(f"a.l{i}.environment.exr")
+            info.size = path.stat().st_size
+            tar.addfile(info, io.BytesIO(path.read_bytes()))
+    (tmp_path / "manifest.json").write_text(json.dumps({"config": {"split": "train", "seed": 3, "resolution": 32}}))
+    assert len(list(light_means(tmp_path))) == 2
+    text = write_statistics(tmp_path, tmp_path / "out.toml")
+    assert "[0.5000, 0.5000, 0.5000]" in text  # rows alike, as bright as the lights' mean
+    assert "2 lights" in text
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(UnirenderError, match="no shard"):
+        write_statistics(empty, tmp_path / "out2.toml")
+    assert not (tmp_path / "out2.toml").exists()
+
+
+def write_one(folder: Path, light: np.ndarray) -> Path:
+    write_environment(folder / "one.exr", light)
+    return folder / "one.exr"
+
+
+def test_a_light_from_a_folder(suite: Suite, tmp_path: Path) -> None:
+    task = first(suite)
+    folder = tmp_path / "mine" / task.folder
+    folder.mkdir(parents=True)
+    truth = suite.environment(task.scene)
+    write_environment(folder / "environment.exr", truth)
+    rows = prediction_rows({"mine": tmp_path / "mine"})
+    check_predictions(rows, suite)
+    assert rows[0].answers(task, list(suite.scenes))
+    assert score(task, answer(rows[0], task), ())[RAW] == 0
+    inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    assert not rows[0].answers(inverse, list(suite.scenes))
+    before = rows[0].info.config["predictions"]
+    # A map from elsewhere: its pixels are areas, its rows lie half a texel from the poles.
+    write_exr(folder / "environment.exr", image_channels(resample_environment(truth, (32, 64))), half=False)
+    rows = prediction_rows({"mine": tmp_path / "mine"})
+    assert rows[0].info.config["predictions"] != before
+    assert 0 < score(task, answer(rows[0], task), ())[RAW] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "light", "message"),
+    [
+        ("environment.exr", np.zeros((16, 32, 3)), "black"),
+        ("environment.exr", np.ones((16, 16, 3)), "twice as wide as high"),
+        ("environment.exr", np.full((16, 32, 3), 1e31), "limit them"),
+    ],
+)
+def test_lights_that_cannot_be_scored_are_named(
+    suite: Suite, tmp_path: Path, name: str, light: np.ndarray, message: str
+) -> None:
+    folder = tmp_path / "mine" / first(suite).folder
+    folder.mkdir(parents=True)
+    write_exr(folder / name, image_channels(light.astype(np.float32)), half=False)
+    with pytest.raises(PredictionError, match=message) as caught:
+        check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+    assert str(folder / name) in str(caught.value)
+
+
+def test_two_lights_for_one_picture_are_refused(suite: Suite, tmp_path: Path) -> None:
+    folder = tmp_path / "mine" / first(suite).folder
+    folder.mkdir(parents=True)
+    write_environment(folder / "environment.exr", lamp(0, 1, 0))
+    (folder / "environment.hdr").write_text("#?RADIANCE")
+    with pytest.raises(PredictionError, match=r"environment.exr and environment.hdr are both there"):
+        check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+
+
+def test_bounds_of_the_light(suite: Suite) -> None:
+    """A row for the true light at our resolution; none for Mitsuba, which is given the light."""
+    scene = suite.scenes[0]
+
+    def key_of(what: str, info: object, uses: object) -> str:
+        return what
+
+    jobs = [job for job in ceiling_jobs(suite, scene, key_of, ()) if job.key.startswith("light/")]
+    assert [job.label for job in jobs] == [TRUE_LIGHT.label]
+    record = jobs[0].make()
+    assert record.values[metric_key(MATTE_BALL, "rmse_relative")] < 0.05
+    asked = [job.key for job in mitsuba_jobs(suite, [scene], scene, key_of, (), None)]
+    assert asked
+    assert not [key for key in asked if key.startswith("light/")]
+
+
+def test_the_table_names_its_columns(suite: Suite) -> None:
+    from unirender_evaluation.records import Record, RunInfo
+
+    record = Record("light", "light-from-image", TRUE_LIGHT.key, "s", "o", ball_values(lamp(0, 1, 0), lamp(0, 1, 1)))
+    run = RunInfo("tiny", "0" * 64, 64, (TRUE_LIGHT,))
+    table = build_table(ALL_TABLES["light"], [record], run, protocol="light-from-image")
+    assert [column.group for column in table.columns] == [
+        "Matte ball",
+        "Matte ball (aligned)",
+        "Glossy ball",
+        "Glossy ball (aligned)",
+    ]
+    assert all(cell.measured is not None for cell in table.rows[0].cells)
