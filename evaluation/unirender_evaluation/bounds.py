@@ -1,5 +1,5 @@
-"""Rows that are no method's: the noise ceiling, the reference with another seed, and Mitsuba's own shading of true
-maps."""
+"""Rows that are no method's: the noise ceiling, the true light at our resolution, the reference with another seed, and
+Mitsuba's own shading of true maps."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from unirender_evaluation.metrics import Metric, Variant, metric_key
+from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL
+from unirender_evaluation.metrics import Metric, Scale, Variant, metric_key
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.table_list import ALL_METRICS
+from unirender_evaluation.tasks import LIGHT
 
 MASKED = Variant("masked", "srgb", "raw")
 
@@ -13,7 +15,7 @@ MASKED = Variant("masked", "srgb", "raw")
 @dataclass(frozen=True)
 class Claim:
     """`a` against `b` on one number. `expected`: "beats" is a claim, "stated" only states the distance. `remark`: what
-    a reader must know beside the figure."""
+    a reader must know beside the figure. `scale`: how the number is aligned, where its metric has such variants."""
 
     table: str
     protocol: str
@@ -23,6 +25,7 @@ class Claim:
     b: str
     expected: str = "beats"
     remark: str = ""
+    scale: Scale = "raw"
 
     @property
     def kind(self) -> Metric:
@@ -31,7 +34,7 @@ class Claim:
 
     @property
     def key(self) -> str:
-        return metric_key(self.quantity, self.kind, MASKED)
+        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
 
 
 OPTIMISED, REFINED = "nvdiffrec-mitsuba", "ours-mitsuba-refinement"
@@ -85,16 +88,18 @@ def relight_claims(row: str, protocol: str, expected: str = "beats") -> tuple[Cl
 
 
 def light_claims(row: str, expected: str = "beats") -> tuple[Claim, ...]:
-    """Lights found in a picture against the trivial ones: what they make of a matte ball, and where they come from."""
+    """Lights found in a picture against the trivial ones: as maps and by the balls under them. What depends on the
+    light's level, which one picture does not tell from the albedo's, is only stated."""
+    questions: tuple[tuple[str, str, Scale, str], ...] = (
+        ("environment", "log_rmse_scaled", "raw", expected),  # the metric itself has a free factor
+        (MATTE_BALL, "rmse_relative", "aligned", expected),
+        (GLOSSY_BALL, "rmse_relative", "aligned", expected),
+        (MATTE_BALL, "rmse_relative", "raw", "stated"),
+    )
     return tuple(
-        Claim("light", "light-from-image", quantity, metric, row, bar, expected)
-        for quantity, metric, bars in (
-            ("environment", "log_rmse_scaled", LIGHT_BARS),
-            ("environment", "peak_deg", LIGHT_BARS[1:]),  # uniform light comes from nowhere
-            ("ball_matte", "rmse_relative", LIGHT_BARS),
-            ("ball_glossy", "rmse_relative", LIGHT_BARS),
-        )
-        for bar in bars
+        Claim(*LIGHT, quantity, metric, row, bar, what, scale=scale)
+        for quantity, metric, scale, what in questions
+        for bar in LIGHT_BARS
     )
 
 
@@ -131,9 +136,13 @@ def optimisation_claims() -> tuple[Claim, ...]:
     asked = [("rendering", "from-image", quantity, "psnr") for quantity in EDITS]
     asked += [("inverse", "single-image", *what) for what in maps]
     asked += [("relighting", protocol, "relit", "psnr") for protocol in LIT]
-    asked += [("light", "light-from-image", "ball_matte", "rmse_relative")]
     rivals = ((OURS, OPTIMISED), (OURS, OPTIMISED_ON_MESH), (REFINED, OURS), (REFINED, OPTIMISED))
     single = [_of_one_picture(Claim(*question, *pair)) for pair in rivals for question in asked]
+    found = [
+        Claim(*LIGHT, ball, "rmse_relative", *pair, "stated", scale="aligned")
+        for pair in rivals
+        for ball in (MATTE_BALL, GLOSSY_BALL)
+    ]
     trivial = [*edit_claims(OPTIMISED, "stated"), *inverse_claims(OPTIMISED, "stated")]
     trivial += [claim for protocol in LIT for claim in relight_claims(OPTIMISED, protocol, "stated")]
     many = [("albedo", "psnr"), ("metallic", "mse"), ("roughness", "mse"), ("relit", "psnr"), ("novel", "psnr")]
@@ -142,7 +151,7 @@ def optimisation_claims() -> tuple[Claim, ...]:
         for other, expected in (("constant-object", "beats"), ("plain-mitsuba-loop", "stated"))
         for what in many
     ]
-    return (*single, *(_of_one_picture(claim) for claim in trivial), *views)
+    return (*single, *found, *(_of_one_picture(claim) for claim in trivial), *light_claims(OPTIMISED, "stated"), *views)
 
 
 def _of_one_picture(claim: Claim) -> Claim:

@@ -18,7 +18,9 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
+from unirender_evaluation.predictions import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record, append_record, write_records
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
@@ -72,7 +74,29 @@ def answer(row: Row, task: Task) -> Prediction:
             maps = result
         else:
             image = result
-    return Prediction(image, maps, time.perf_counter() - start)
+    seconds = time.perf_counter() - start
+    if task.asks_light and row.info.kind == "external":
+        check_light(row, task, maps)
+    return Prediction(image, maps, seconds)
+
+
+def check_light(row: Row, task: Task, maps: Intrinsics | None) -> None:
+    """Refuses a stranger's light that cannot be scored.
+
+    Raises:
+        UnirenderError: it is no lat-long map twice as wide as high, is black, or brighter than `BRIGHTEST`.
+    """
+    light = None if maps is None else maps.environment
+    if light is None:
+        return
+    shape, largest = light.shape, float(light.max())
+    if len(shape) == 3 and shape[0] >= 2 and shape[1] == 2 * shape[0] and 0 < largest <= BRIGHTEST:
+        return
+    raise UnirenderError(
+        f"method {row.info.label!r}, decompose ({task.identity}): got an environment of shape {shape} with radiance up "
+        f"to {largest:.3g}, expected [height, 2 height, 3], at least 2 rows, and radiance in (0, {BRIGHTEST:g}]; "
+        "leave it out where none is found"
+    )
 
 
 def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
@@ -113,7 +137,6 @@ def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[
     A picture is premultiplied and has no mask of its own: the true one is pasted. Maps bring theirs, if they have one.
     """
     from unirender_evaluation import lpips
-    from unirender_evaluation.light_metrics import score_light
     from unirender_evaluation.scoring import score_image, score_maps
 
     if task.asks_light:

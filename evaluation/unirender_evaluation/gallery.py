@@ -45,7 +45,6 @@ class GalleryItem:
         sample: as in records.
         caption: for people: object and light.
         mask: coverage of truth and predictions, [0, 1]: the true mask, or, where balls are shown, theirs.
-        given_mask: coverage of what was given; None: the same.
         given: what the method saw, name -> picture; a light may have a size of its own.
         truth: name -> picture.
         predictions: method key -> name -> picture; names are those of `truth`.
@@ -56,6 +55,7 @@ class GalleryItem:
         count: how many were ranked.
         leader: key of the method whose score ranked them.
         figure: that score, e.g. "PSNR 13.7 dB".
+        given_mask: coverage of what was given, where it is not that of the truth.
     """
 
     table: str

@@ -1,8 +1,8 @@
 """A light by what it does: how a matte and a glossy white ball look under it.
 
 Both balls are seen from afar along the camera's axis, in `SIZE` x `SIZE` pixels, the light far away. The matte one is
-white and Lambertian: its pixels are the irradiance / pi at each normal facing the viewer. The glossy one reflects all
-light (F = 1) by a GGX lobe of roughness `GLOSSY`; mirror directions of a ball's pixels are spread evenly over the
+white and Lambertian: its pixels are the irradiance / pi at each normal that faces the viewer. The glossy one reflects
+all light (F = 1) by a GGX lobe of roughness `GLOSSY`; mirror directions of a ball's pixels are spread evenly over the
 sphere, so that it shows light from everywhere. Closed form, without noise (`unirender.surface_light`).
 
 Such balls are how estimates of light are usually compared, since what matters of a light is what it makes of things
@@ -44,7 +44,7 @@ def ball_values(found: Float[np.ndarray, "h w 3"], true: Float[np.ndarray, "th t
 
 
 def balls(environment: Float[np.ndarray, "h w 3"], size: int) -> Mapping[str, Ball]:
-    """Linear radiance of the matte and of the glossy ball, un-premultiplied, 0 where the mask is."""
+    """Linear radiance of the matte and of the glossy ball, 0 outside `ball_mask`."""
     normal = ball_normals(size)
     there = ball_mask(size)[..., 0] > 0
     n = normal[there]

@@ -5,29 +5,27 @@ from typing import Any
 import numpy as np
 
 from unirender.camera import Camera
-from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.light_statistics import light_statistics
 from unirender_evaluation.methods import Image, Mask, seen_linear
-from unirender_evaluation.training_statistics import training_statistics
+from unirender_reference.optimize.single_config import COLD
 
 
 class UniformLight:
-    """White light from everywhere, as bright as the picture: its mean radiance over the training objects' mean
-    albedo."""
+    """White light from everywhere, as bright as the picture: its mean radiance over the training objects' mean albedo,
+    which is the one that optimisation begins with."""
 
     name = "uniform light"
 
     @property
     def config(self) -> dict[str, Any]:
-        return {"trivial": "uniform-light", "albedo_srgb": training_statistics()["albedo_srgb"]}
+        return {"trivial": "uniform-light", "albedo": COLD["albedo"]}
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
-        albedo = srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32))
         mean = seen_linear(image_srgb, mask).sum(dtype=np.float64) / (3 * mask.sum(dtype=np.float64))
         # In uniform light L a surface sends out nearly albedo x L.
-        light = np.full((*SHAPE, 3), mean / np.mean(albedo), np.float32)
+        light = np.full((*SHAPE, 3), mean / COLD["albedo"], np.float32)
         return Intrinsics(environment=light, mask=mask, camera=camera)
 
 

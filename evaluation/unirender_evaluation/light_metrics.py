@@ -1,5 +1,5 @@
-"""How far a found light is from the true one when its scale is free: log-RMSE at the best scale, and the direction that
-it comes from.
+"""How far a found light is from the true one: log-RMSE at the best scale, and the direction that it comes from, for
+both of which the scale is free; `score_light` adds what it makes of two balls (`light_balls`).
 
 Both lights are brought to 16 x 32 texels first (`lighting.resample_environment`, which keeps the energy). Notation: p
 found, t true, w the texels' solid angles, eps = `metrics.LOG_EPSILON`.
@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
+from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import (
     environment_directions,
@@ -29,7 +30,7 @@ CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
 CONE_SHAPE = (46, 90)  # directions and quadrature of the cones: 4 degrees
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_SCALE = 1e4  # of k, either way, times that of equal energy
-ALIKE = 1e-3  # relative difference of two cones, below which neither is the brighter one
+UNIFORM = 1e-3  # relative differences below which a light has no brightest direction: of all cones, or all around
 
 SCALED_LOG_RMSE = Metric(
     "log_rmse_scaled",
@@ -51,7 +52,7 @@ PEAK_ANGLE = Metric(
     (),
     1,
     f"between the brightest directions (centroid of the luminance in the cone of {CONE_DEG:g} degrees that holds the "
-    "most); 90 where apart cones are alike",
+    "most); 90 for a uniform light",
 )
 
 
@@ -73,28 +74,31 @@ def light_values(
 
 
 def score_light(found: Intrinsics | None, true: Intrinsics | None) -> dict[str, float]:
-    """Metric key -> value of the light among a method's maps; empty where one of the two has none.
+    """Metric key -> value of the light among a method's maps, as it is and with its scale free; empty where one of the
+    two has none.
 
     Args:
-        found: with its `environment`, any resolution.
+        found: with its `environment`, any resolution; what is below 0 (ringing) counts as 0.
         true: the same.
+
+    Raises:
+        UnirenderError: the found light is black.
     """
     if found is None or true is None or found.environment is None or true.environment is None:
         return {}
-    return {
-        **light_values(found.environment, true.environment),
-        **ball_values(found.environment, true.environment),
-    }
+    light = np.maximum(found.environment, 0)
+    return {**light_values(light, true.environment), **ball_values(light, true.environment)}
 
 
 def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:
     """The log-RMSE of `k p` against `t` for the best single factor k, weighted by solid angle.
 
-    A black light, which no factor changes, is compared as it is.
+    Raises:
+        UnirenderError: `p` is black, which no factor makes a light.
     """
-    w = texel_solid_angles(*p.shape[:2])[..., None]
     if not p.max() > 0:
-        return metrics.log_rmse(p, t, w)
+        raise UnirenderError("light metric: the found light is black, expected some radiance")
+    w = texel_solid_angles(*p.shape[:2])[..., None]
 
     def error(log_scale: float) -> float:
         return metrics.log_rmse(p * math.exp(log_scale), t, w)
@@ -120,7 +124,7 @@ def peak_angle_deg(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"])
 
 def brightest_direction(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"] | None:
     """Unit centroid of the luminance in the cone of `CONE_DEG` that holds the most of it, weighted by solid angle; None
-    where a cone that does not touch it holds as much, as in uniform light, or in one that is the same all around.
+    for uniform light, and for one that is the same all around.
 
     Cones are centred on, and integrated over, the texel directions of a grid of `CONE_SHAPE`, between which the light
     is bilinear.
@@ -128,10 +132,10 @@ def brightest_direction(environment: Float[np.ndarray, "h w 3"]) -> Float[np.nda
     directions, weights, inside = _cones()
     luminance = sample_environment(environment, directions).astype(np.float64) @ LUMINANCE * weights
     means = inside @ luminance
-    best = int(np.argmax(means))
-    alike = means >= (1 - ALIKE) * means[best]
-    if (directions[alike] @ directions[best]).min() < math.cos(math.radians(2 * CONE_DEG)):
+    around = np.ptp(environment @ LUMINANCE, axis=1).max() <= UNIFORM * float(environment.max())
+    if around or np.ptp(means) <= UNIFORM * means.max():
         return None
+    best = int(np.argmax(means))
     centroid = (luminance * inside[best]) @ directions.astype(np.float64)
     return centroid / np.linalg.norm(centroid)
 

@@ -2,8 +2,9 @@
 
 A picture is the scene rendered again, all light transport, with a seed of its own and as many samples as the stored
 truth has; a decomposition is the object's own buffers, traced again. It differs from *reference (other seed)* only in
-what it fills: every table, the inverse one included. It is a bound, never ranked: it knows the object, its material and
-the light, so it is asked by scene, past the interface of methods (`engine.answer` is never handed a truth).
+what it fills: every table but that of the light, which it is given, the inverse one included. It is a bound, never
+ranked: it knows the object, its material and the light, so it is asked by scene, past the interface of methods
+(`engine.answer` is never handed a truth).
 
 Where the generator gives another object here than the truth shows (a changed generator; a suite of foreign renders), it
 says nothing.

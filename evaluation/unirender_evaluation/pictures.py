@@ -28,15 +28,16 @@ from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.table_formats import format_number
-from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.tasks import LIGHT, PROTOCOLS, Task, tasks
 
 PRIMARY = {  # table -> metric and quantities that rank its samples; a sample has one of them
     "rendering": ("psnr", ("edit_metallic", "edit_roughness")),
     "inverse": ("psnr", ("albedo",)),
     "relighting": ("psnr", ("relit",)),
-    "light": ("rmse_relative", (MATTE_BALL,)),
+    LIGHT[0]: ("rmse_relative", (MATTE_BALL,)),
 }
 BALLS = {"matte ball": MATTE_BALL, "glossy ball": GLOSSY_BALL}
+BALL_PICTURES = (*BALLS, "mirror ball")
 SCORES = (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}"), ("rmse_relative", "error {:.2f}"))
 
 
@@ -56,7 +57,8 @@ class Pictures:
 
     def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None:
         """Stores what the gallery would show of a prediction; `key` is the record's content key."""
-        wanted = _pictures(task, task.truth_image, task.truth_maps)
+        # Balls are made of every light, whatever the truth: no need to draw the true ones to know their names.
+        wanted = BALL_PICTURES if task.asks_light else _pictures(task, task.truth_image, task.truth_maps)
         made = {n: p for n, p in _pictures(task, prediction.image, prediction.maps).items() if n in wanted}
         write_sheet(self._path(task.identity, method), made, key)
 
@@ -135,7 +137,7 @@ class Pictures:
             caption=f"{task.scene.object} ({task.scene.family}) under {task.scene.light}",
             question=question(task, self.suite),
             mask=_mask(task),
-            given_mask=task.mask,
+            given_mask=task.mask if task.asks_light else None,
             given=_given(task),
             truth=truth,
             predictions=predictions,
@@ -201,15 +203,15 @@ def _pictures(task: Task, image: Float[np.ndarray, "h w 3"] | None, maps: Intrin
     return pictures
 
 
-def _balls(environment: Float[np.ndarray, "h w 3"], size: int) -> dict[str, Picture]:
+def _balls(environment: Float[np.ndarray, "eh ew 3"], size: int) -> dict[str, Picture]:
     """Display pictures of balls under a light: those that are scored, and a mirror, which shows the light itself."""
     made = balls(environment, size)
     normal = ball_normals(size)
     view = np.array([0, 0, 1], np.float32)
     mirrored = 2 * normal[..., 2:] * normal - view
     mirror = sample_environment(environment, mirrored) * ball_mask(size)
-    shown = {**{name: made[quantity] for name, quantity in BALLS.items()}, "mirror ball": mirror}
-    return {name: image_srgb(value) for name, value in shown.items()}
+    shown = (*(made[quantity] for quantity in BALLS.values()), mirror)
+    return {name: image_srgb(value) for name, value in zip(BALL_PICTURES, shown, strict=True)}
 
 
 def _mask(task: Task) -> Mask:

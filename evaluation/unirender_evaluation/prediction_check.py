@@ -18,7 +18,7 @@ from unirender_evaluation.tasks import PROTOCOLS, tasks
 
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 # Of `bench export`, `decompose`.
-IGNORED = ("image.png", "mask.exr", "meta.json", "environment.exr", "environment.png", "mask.png")
+IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
 GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
 
 
@@ -33,7 +33,7 @@ class PredictionError(UnirenderError):
 
 @dataclass
 class Question:
-    """What a suite asks of one picture: the answers' names, and whether maps are among them."""
+    """What a suite asks of one picture: the answers' names, and whether maps and the light are among them."""
 
     mask: Mask
     camera: Camera

@@ -151,7 +151,8 @@ class PredictionFolder:
         """A light on the contract's grid: a map that unirender wrote as it is, another one's pixels taken as areas.
 
         Raises:
-            UnirenderError: the file is broken, black, not finite, beyond `BRIGHTEST` or not twice as wide as high.
+            UnirenderError: the file is broken, black, more negative than ringing is, not finite, beyond `BRIGHTEST` or
+                not twice as wide as high.
         """
         from unirender_reference.lights import load_light
 

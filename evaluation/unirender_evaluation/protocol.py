@@ -35,12 +35,15 @@ def protocol_line(
     """(what, value) pairs in the order in which they are printed."""
     spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
+    frame = [("mask", _mask_text(variant, methods, records)), ("colour", SPACE_TEXT[variant.space])]
     items = [
         ("given", protocol.given),
-        ("variant", variant.label),
-        ("mask", _mask_text(variant, methods, records)),
-        ("colour", SPACE_TEXT[variant.space]),
-        ("scale alignment", SCALE_TEXT[variant.scale]),
+        ("variant", variant.label if protocol.framed else variant.scale),
+        *(frame if protocol.framed else ()),
+        (
+            "scale alignment",
+            SCALE_TEXT[variant.scale] if protocol.framed else SCALE_TEXT[variant.scale].partition(",")[0],
+        ),
         ("exposure", run.exposure),
         ("resolution", f"{run.resolution} x {run.resolution}"),
         ("n", f"{len(samples)} samples of {len(objects)} objects"),

@@ -28,13 +28,14 @@ from unirender_evaluation.results_file import read_results, write_results
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
+from unirender_evaluation.tasks import LIGHT
 
 SHIPPED_SUITE = "tiny"
 SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
     ("inverse", "single-image", "main"),
     ("relighting", "from-image-hdri", "main"),
-    ("light", "light-from-image", "main"),
+    (*LIGHT, "main"),
     ("multi-view", "known-mesh", "main"),
     ("physics", "physics", "main"),
 )

@@ -40,7 +40,7 @@ class Record:
     bootstrap draws.
     """
 
-    table: str  # "rendering", "inverse", "relighting", "physics", "multi-view"
+    table: str  # "rendering", "inverse", "relighting", "light", "physics", "multi-view"
     protocol: str  # key of `tables.PROTOCOLS`, e.g. "from-image", "given", "given-light"
     method: str  # key of a MethodInfo
     sample: str  # key of the suite's sample (and edit, where one input has several)

@@ -168,9 +168,12 @@ def _sheet(item: GalleryItem) -> Sheet:
     if seen is not None:
         names, columns = ["input", *names], [(seen, np.ones_like(seen)), *columns]
     side = picture_size(item.mask.shape[1], SHEET_SIDE)
-    cover = [[_covered(picture, item.mask, side) for picture in line] for line in zip(*columns, strict=True)]
+    masks = [item.mask] * len(columns)
+    if seen is not None and item.given_mask is not None:
+        masks[0] = item.given_mask
+    lines = zip(*columns, strict=True)
+    cover = [[_covered(picture, mask, side) for picture, mask in zip(line, masks, strict=True)] for line in lines]
     if seen is not None:
-        cover[0][0] = _covered(seen, item.mask if item.given_mask is None else item.given_mask, side)
         cover[1][0] = np.zeros_like(cover[1][0])  # nothing below the input
     sheet = np.concatenate([np.concatenate(line, axis=1) for line in cover], axis=0)
     buffer = io.BytesIO()

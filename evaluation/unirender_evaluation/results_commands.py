@@ -60,7 +60,7 @@ class BenchTables:
     files: Files
     """`results.json`, packed by gzip or not, or folders of runs, of one suite."""
     table: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Print only this table (rendering, inverse, relighting, multi-view, physics); repeatable. None: all."""
+    """Print only this table (rendering, inverse, relighting, light, multi-view, physics); repeatable. None: all."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """How numbers are taken: masked or whole, srgb or linear, raw, aligned or aligned_rgb, with - between
     (masked-linear), or all; repeatable. None: whole beside the published values, and masked."""

@@ -30,7 +30,7 @@ from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
 from unirender_evaluation.suites import Scene, material_key
-from unirender_evaluation.tasks import PROTOCOLS, Task
+from unirender_evaluation.tasks import LIGHT, PROTOCOLS, Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")
@@ -137,7 +137,7 @@ def trivial_rows() -> list[Row]:
         "sphere normal": "from the silhouette alone",
     }
     methods = [UneditedInput(), InputAsAlbedo(), MeanAlbedo(), MeanNormal(), SphereNormal(), ConstantMaterial()]
-    of_light = frozenset({("light", "light-from-image")})
+    of_light = frozenset({LIGHT})
     others = frozenset(PROTOCOLS) - of_light
     rows = [make_row(m, "trivial", protocols=others, note=notes.get(m.name, "")) for m in methods]
     lights = {UniformLight(): "white, as bright as the picture", MeanLight(): "mean of training lights by height"}
@@ -180,7 +180,7 @@ def our_rows(
     anchored = ours("Ours (mean, anchored)", anchored=True, decompositions=shared)
     open_mean = ours("Ours (mean, not closed)", closed=False)
     composites = [CompositeOf(mean, anchored=carried, edited=edited) for carried in (False, True)]
-    decomposes = from_image | {("inverse", "single-image"), ("light", "light-from-image")}
+    decomposes = from_image | {("inverse", "single-image"), LIGHT}
     one: dict[str, Any] = {"steps": 1, "samples": 1, "uses": frozenset({MODEL})}
     many: dict[str, Any] = one | {"steps": SAMPLE_STEPS, "samples": SAMPLE_COUNT, "seed": seed}
     rows = [

@@ -26,7 +26,7 @@ NAME = {"minLength": 1}
 # What a field means beyond its type: keywords, and the sentence that an error quotes after "expected".
 FIELDS: Mapping[str, Mapping[str, dict[str, Any]]] = {
     "Record": {
-        "table": {**NAME, "description": "a table: rendering, inverse, relighting, multi-view or physics"},
+        "table": {**NAME, "description": "a table: rendering, inverse, relighting, light, multi-view or physics"},
         "protocol": {**NAME, "description": "what the method was given, one of `definitions.protocols`"},
         "method": {**NAME, "description": "the key of one of `run.methods`"},
         "sample": {**NAME, "description": "the suite's name of the picture or question"},

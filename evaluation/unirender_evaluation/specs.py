@@ -24,6 +24,7 @@ class Protocol:
     given: str  # one sentence
     published: bool = False  # whether the paper's numbers were taken this way
     truth: str = ""  # where it is not the suite's stored truth: what results are scored against
+    framed: bool = True  # whether what is scored fills the picture's frame, so that it has a mask and a colour space
 
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -42,7 +43,7 @@ PROTOCOLS: dict[str, Protocol] = {
             True,
         ),
         Protocol("from-image-hdri", "from the image, HDRI given", "one image and its mask, and the target's HDRI"),
-        Protocol("light-from-image", "from the image", "one image and its mask"),
+        Protocol("light-from-image", "from the image", "one image and its mask", framed=False),
         Protocol("physics", "physics", "what each test says"),
         Protocol(
             "known-mesh",

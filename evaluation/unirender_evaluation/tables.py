@@ -89,8 +89,10 @@ class Table:
         """The title with its protocol, where that says more, and what is counted."""
         same = self.protocol_label.casefold() == self.title.casefold()
         other = [OTHER_AXES[word] for word in (self.variant.space, self.variant.scale) if word in OTHER_AXES]
-        counted = [self.variant.mask, *other, *(() if self.subset == "main" else (self.subset,))]
-        return f"{self.title}{'' if same else f': {self.protocol_label}'} ({', '.join(counted)})"
+        mask = [self.variant.mask] if PROTOCOLS[self.protocol_key].framed else []
+        counted = ", ".join([*mask, *other, *(() if self.subset == "main" else (self.subset,))])
+        title = f"{self.title}{'' if same else f': {self.protocol_label}'}"
+        return f"{title} ({counted})" if counted else title
 
 
 def build_table(

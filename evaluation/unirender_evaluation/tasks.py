@@ -31,6 +31,8 @@ from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_reference.shapes import MeshObject
 
 Capability = Literal["decompose", "edit", "relight", "render"]
+LIGHT = ("light", "light-from-image")
+LIGHT_ANSWER = "environment"
 PROTOCOLS: tuple[tuple[str, str], ...] = (
     ("rendering", "from-image"),
     ("rendering", "given"),
@@ -38,9 +40,8 @@ PROTOCOLS: tuple[tuple[str, str], ...] = (
     ("inverse", "single-image"),
     ("relighting", "from-image-sd"),
     ("relighting", "from-image-hdri"),
-    ("light", "light-from-image"),
+    LIGHT,
 )
-LIGHT_ANSWER = "environment"
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,7 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Itera
         ("inverse", "single-image"): _inverse,
         ("relighting", "from-image-sd"): _relights,
         ("relighting", "from-image-hdri"): _relights,
-        ("light", "light-from-image"): _light,
+        LIGHT: _light,
     }
     if (table, protocol) not in makers:
         raise UnirenderError(
@@ -290,7 +291,7 @@ def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> 
 def _light(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
     sample = f"{scene.key}_{material_key(suite.spec.base)}"
     yield Task(
-        table="light",
+        table=LIGHT[0],
         protocol=protocol,
         sample=sample,
         scene=scene,

@@ -8,6 +8,7 @@ from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import paired_difference
+from unirender_evaluation.tasks import LIGHT
 
 
 @dataclass(frozen=True)
@@ -23,17 +24,23 @@ class Finding:
     def __str__(self) -> str:
         c = self.claim
         if self.comparison is None:
-            what = f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}"
+            what = f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}"
             return f"{self.why}{what}: {c.a} against {c.b}"
         d = self.comparison.difference
         sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
         return (
-            f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}: "
+            f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}: "
             f"{c.a} {self.comparison.verdict} {c.b}, "
             f"difference {d.mean:+.4g} [{d.low:+.4g}, {d.high:+.4g}] {unit} (n {d.n}, {d.clusters} objects{remark})"
         )
+
+
+def _scale(claim: Claim) -> str:
+    """How a number of the light is aligned; everything else is not."""
+    said = {"aligned": " (aligned)", "raw": " (raw)"}[claim.scale] if "scale" in claim.kind.axes else ""
+    return said if claim.table == LIGHT[0] else ""
 
 
 def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) -> list[Finding]:
@@ -101,7 +108,8 @@ def ceiling_breaches(
 
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     """The verdict section: claims, ceiling, truth check; one line each."""
-    lines = [f"Verdict on suite {run.suite} (masked, sRGB, unaligned; paired bootstrap 95 % intervals over objects)"]
+    head = "masked, sRGB and unaligned, where nothing else is said; paired bootstrap 95 % intervals over objects"
+    lines = [f"Verdict on suite {run.suite} ({head})"]
     lines += [f"  {finding}" for finding in findings(records, run_claims(records, run))]
     breaches = ceiling_breaches(records)
     lines += [f"  FAILS  {breach}" for breach in breaches] or [

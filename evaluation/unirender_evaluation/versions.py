@@ -3,7 +3,7 @@
 Every content key holds the version of the *core* (shared vocabulary and scorer) and of those other parts that its row
 uses, so that a change of the network's code leaves the composite's records valid, and one of a report nobody's.
 
-    core        shared vocabulary, tasks, methods, metrics
+    core        shared vocabulary, tasks, methods, metrics, what reads predictions
     lpips       the backbones' weights, by content: every row whose pictures are scored
     model       the network, its diffusion and pipeline, and the adapters of others' pipelines: our rows, and plug-ins,
                 which may call them
@@ -44,6 +44,8 @@ class Part:
     without: tuple[str, ...] = ()
     variables: tuple[str, ...] = ()
 
+
+LIGHT_READER = ("lights/files.py", "lights/light.py")  # of lights in folders of predictions
 
 # Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
 # the records anew at the end of every run.
@@ -149,7 +151,7 @@ NOT_IN_RECORDS = (
 NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
-        {"unirender": ("*.py",), "unirender_evaluation": ("*.py",)},
+        {"unirender": ("*.py",), "unirender_evaluation": ("*.py",), "unirender_reference": LIGHT_READER},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
             *(f"unirender/{name}.py" for name in OUTSIDE),

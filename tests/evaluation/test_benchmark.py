@@ -16,7 +16,7 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
-from unirender.exr import image_channels, intrinsics_channels, write_exr
+from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, _work
@@ -61,6 +61,7 @@ class Guess:
             roughness=half,
             specular=grey,
             diffuse=grey,
+            environment=np.full((4, 8, 3), 0.1 + image_srgb.mean(), np.float32),
             mask=mask,
             camera=camera,
         )
@@ -128,7 +129,7 @@ def test_killed_run_resumes_to_the_same_records(suite: Suite, tmp_path: Path) ->
         engine.answer = original
     strip = lambda records: [(r.table, r.protocol, r.method, r.sample, r.values, r.key) for r in records]  # noqa: E731 - one use
     assert strip(resumed) == strip(whole) == strip(again) == strip(read_records(path))
-    assert first == sum(r.method != "noise-ceiling" for r in whole) - 20
+    assert first == sum(r.method not in ("noise-ceiling", "true-light-16-x-32") for r in whole) - 20
     assert len(asked) == first, "a third run asks nothing"
 
 
@@ -219,7 +220,7 @@ def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
     path = tmp_path / "records.jsonl"
     many = evaluate(suite, trivial_rows(), path)
     few = evaluate(suite, [make_row(UneditedInput(), "trivial")], path)
-    assert {r.method for r in few} == {"unedited-input", "noise-ceiling"}
+    assert {r.method for r in few} == {"unedited-input", "noise-ceiling", "true-light-16-x-32"}
     assert len(few) < len(many)
     assert len(read_records(path)) == len(few)
 
@@ -326,7 +327,9 @@ def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
             target.mkdir(parents=True, exist_ok=True)
             for capability in task.asks:
                 result = getattr(method, capability)(**task.inputs[capability])
-                if isinstance(result, Intrinsics):
+                if task.asks_light:
+                    write_environment(target / "environment.exr", result.environment)
+                elif isinstance(result, Intrinsics):
                     write_exr(target / "intrinsics.exr", intrinsics_channels(result), half=False)
                 else:
                     write_exr(target / f"{task.answer}.exr", image_channels(result), half=False)

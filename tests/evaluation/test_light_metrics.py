@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from reference_scenes import environment
 
+from unirender.errors import UnirenderError
 from unirender.lighting import environment_directions, resample_environment, rotate_environment, texel_solid_angles
 from unirender_evaluation import metrics
 from unirender_evaluation.light_metrics import (
@@ -102,9 +103,17 @@ def test_resolutions_are_brought_together() -> None:
     assert light_values(environment(7), light)["environment.log_rmse_scaled"] > 0.1
 
 
-def test_no_factor_changes_a_black_light() -> None:
-    black, true = np.zeros((*SHAPE, 3), np.float32), lamp(7.5, 8.0)
-    values = light_values(black, true)
-    w = texel_solid_angles(*SHAPE)[..., None]
-    assert values["environment.log_rmse_scaled"] == pytest.approx(metrics.log_rmse(black, true, w), rel=1e-6)
-    assert values["environment.peak_deg"] == 90
+def test_a_black_light_is_refused() -> None:
+    black = np.zeros((*SHAPE, 3), np.float32)
+    with pytest.raises(UnirenderError, match="the found light is black"):
+        light_values(black, lamp(7.5, 8.0))
+
+
+def test_a_light_that_is_the_same_all_around_has_no_direction() -> None:
+    """And one with a broad lamp, or with two alike, has one: its own, exactly."""
+    rows = np.linspace(2, 0.1, SHAPE[0], dtype=np.float32)
+    around = np.broadcast_to(rows[:, None, None], (*SHAPE, 3)).copy()
+    assert brightest_direction(around) is None
+    assert peak_angle_deg(around, lamp(7.5, 8.0)) == 90
+    for light in (lamp(7.5, 8.0, width_deg=40), lamp(7.5, 8.0) + lamp(7.5, 24.0)):
+        assert peak_angle_deg(light, light) == 0

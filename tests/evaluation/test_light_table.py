@@ -13,6 +13,7 @@ from unirender.exr import image_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, resample_environment
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
+from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, ball_values, balls
 from unirender_evaluation.light_methods import MeanLight, UniformLight
@@ -20,12 +21,13 @@ from unirender_evaluation.light_statistics import light_means, light_statistics,
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
 from unirender_evaluation.prediction_check import PredictionError, check_predictions
-from unirender_evaluation.rows import prediction_rows, trivial_rows
+from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.rows import make_row, prediction_rows, trivial_rows
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_table
 from unirender_evaluation.tasks import Task, tasks
-from unirender_evaluation.training_statistics import training_statistics
+from unirender_evaluation.verdict import findings
 
 RAW, ALIGNED = f"{MATTE_BALL}.rmse_relative@raw", f"{MATTE_BALL}.rmse_relative@aligned"
 GLOSSY_ALIGNED = f"{GLOSSY_BALL}.rmse_relative@aligned"
@@ -65,6 +67,15 @@ def test_a_lamp_lights_its_own_side(direction: tuple[float, float, float], axis:
     for ball in balls(lamp(*direction), 32).values():
         place = (ball_normals(32)[..., axis] * ball[..., 0]).sum() / ball[..., 0].sum()
         assert place * direction[axis] > 0.3
+
+
+def test_a_lamp_at_the_viewer_lights_the_middle_and_one_behind_the_rim() -> None:
+    front, behind = (balls(lamp(0, 0, z), 32) for z in (1.0, -1.0))
+    for name in (MATTE_BALL, GLOSSY_BALL):
+        assert front[name][16, 16, 0] > 5 * behind[name][16, 16, 0]
+    aside = balls(lamp(-0.8, 0, -0.6), 32)[GLOSSY_BALL]  # behind, on the left: reflected by the left rim alone
+    assert aside[16, 1, 0] > 5 * aside[16, 16, 0]
+    assert aside[16, 1, 0] > 5 * aside[16, 30, 0]
 
 
 def test_the_balls_errors_by_hand() -> None:
@@ -111,9 +122,9 @@ def test_the_true_light_scores_nothing_and_a_wrong_one_something(suite: Suite) -
     assert turned["environment.log_rmse_scaled"] > 0.05
     assert turned[RAW] > 0.003
     assert score(task, Prediction(maps=Intrinsics(albedo=np.ones((8, 8, 3)))), ()) == {}  # no light found
-    black = score(task, Prediction(maps=Intrinsics(environment=np.zeros((16, 32, 3)))), ())
-    assert black[RAW] == black[ALIGNED] > 1  # no factor helps
-    assert black["environment.peak_deg"] == 90
+    ringing = np.where(truth > np.median(truth), truth, np.float32(-5e-4))  # counts as 0
+    cut = score(task, Prediction(maps=Intrinsics(environment=np.maximum(ringing, 0))), ())
+    assert score(task, Prediction(maps=Intrinsics(environment=ringing)), ()) == cut
 
 
 def test_rows_that_a_light_must_beat(suite: Suite) -> None:
@@ -123,13 +134,12 @@ def test_rows_that_a_light_must_beat(suite: Suite) -> None:
     assert chosen == {"uniform-light", "mean-light"}
     inverse = next(tasks(suite, "inverse", "single-image", scenes))
     assert not {row.info.key for row in trivial_rows() if row.answers(inverse, scenes)} & chosen
-    albedo = float(srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32)).mean())
     grey = np.full((8, 8, 3), 0.5, np.float32)
     mask = np.zeros((8, 8, 1), np.float32)
     mask[2:5] = 1
     found = UniformLight().decompose(grey, mask, Camera()).environment
     assert found is not None
-    np.testing.assert_allclose(found, srgb_decode(grey).mean() / albedo, rtol=1e-5)
+    np.testing.assert_allclose(found, srgb_decode(grey).mean() / 0.25, rtol=1e-5)
     mean = MeanLight().decompose(grey, mask, Camera()).environment
     assert mean is not None
     assert mean.shape == (16, 32, 3)
@@ -206,6 +216,74 @@ def test_lights_that_cannot_be_scored_are_named(
     assert str(folder / name) in str(caught.value)
 
 
+def test_an_hdr_file_is_read_too(suite: Suite, tmp_path: Path) -> None:
+    """Four bytes a pixel, by the letter of the format: mantissas and a common exponent."""
+    task = first(suite)
+    folder = tmp_path / "mine" / task.folder
+    folder.mkdir(parents=True)
+    pixels = np.array([128, 64, 32, 129], np.uint8)  # 128 / 256 x 2^(129 - 128) = 1.0, 0.5, 0.25
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\n"
+    (folder / "environment.hdr").write_bytes(header + np.tile(pixels, 32).tobytes())
+    rows = prediction_rows({"mine": tmp_path / "mine"})
+    check_predictions(rows, suite)
+    maps = answer(rows[0], task).maps
+    assert maps is not None
+    assert maps.environment is not None
+    np.testing.assert_allclose(maps.environment, np.broadcast_to([1.0, 0.5, 0.25], (4, 8, 3)), rtol=0.01)
+
+
+def test_lights_beside_pictures_that_do_not_ask_are_left_alone(suite: Suite, tmp_path: Path) -> None:
+    """`unirender decompose` leaves one beside every picture."""
+    inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    for folder in (first(suite).folder, inverse.folder):
+        (tmp_path / "mine" / folder).mkdir(parents=True, exist_ok=True)
+    write_environment(tmp_path / "mine" / first(suite).folder / "environment.exr", lamp(0, 1, 0))
+    (tmp_path / "mine" / inverse.folder / "environment.exr").write_text("not looked at")
+    (tmp_path / "mine" / inverse.folder / "environment.hdr").write_text("not looked at")
+    check_predictions(prediction_rows({"mine": tmp_path / "mine"}), suite)
+
+
+class Light:
+    """Says the same light of every picture."""
+
+    name = "same light"
+    config: dict[str, int] = {"light": 1}  # noqa: RUF012 - a constant of the test
+
+    def __init__(self, light: np.ndarray) -> None:
+        self.light = light
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        del image_srgb
+        return Intrinsics(environment=self.light, mask=mask, camera=camera)
+
+
+@pytest.mark.parametrize(
+    "light",
+    [np.ones((2, 2, 3)), np.ones((1, 2, 3)), np.ones((1, 4, 8, 3)), np.zeros((4, 8, 3)), np.full((4, 8, 3), 2e30)],
+)
+def test_a_plug_in_whose_light_cannot_be_scored_is_named(suite: Suite, light: np.ndarray) -> None:
+    row = make_row(Light(light.astype(np.float32)), "external")
+    with pytest.raises(UnirenderError, match=r"method 'same light', decompose \(light/.*twice|2 height"):
+        answer(row, first(suite))
+    inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    assert answer(row, inverse).maps is not None  # where no light is asked for, nobody looks at it
+    assert answer(make_row(Light(lamp(0, 1, 0)), "external"), first(suite)).maps is not None
+
+
+def test_the_verdict_says_which_numbers_of_a_light_are_aligned(suite: Suite) -> None:
+    records = []
+    for i, scene in enumerate(suite.scenes):
+        for key, x in (("ours-mean", 0.2), ("mean-light", 0.5)):
+            values = {RAW: x + 0.01 * i, ALIGNED: x / 2 + 0.01 * i}
+            records.append(Record("light", "light-from-image", key, scene.key, f"o{i}", values))
+    lines = [str(finding) for finding in findings(records, light_claims("ours-mean"))]
+    aligned = next(line for line in lines if "ball_matte error (aligned)" in line and "mean-light" in line)
+    raw = next(line for line in lines if "ball_matte error (raw)" in line and "mean-light" in line)
+    assert aligned.startswith("HOLDS")
+    assert raw.startswith("stated")
+    assert "-0.3 " in raw
+
+
 def test_two_lights_for_one_picture_are_refused(suite: Suite, tmp_path: Path) -> None:
     folder = tmp_path / "mine" / first(suite).folder
     folder.mkdir(parents=True)
@@ -232,9 +310,8 @@ def test_bounds_of_the_light(suite: Suite) -> None:
 
 
 def test_the_table_names_its_columns(suite: Suite) -> None:
-    from unirender_evaluation.records import Record, RunInfo
-
-    record = Record("light", "light-from-image", TRUE_LIGHT.key, "s", "o", ball_values(lamp(0, 1, 0), lamp(0, 1, 1)))
+    values = ball_values(lamp(0, 1, 0), lamp(0, 1, 1))
+    record = Record("light", "light-from-image", TRUE_LIGHT.key, "s", "o", values)
     run = RunInfo("tiny", "0" * 64, 64, (TRUE_LIGHT,))
     table = build_table(ALL_TABLES["light"], [record], run, protocol="light-from-image")
     assert [column.group for column in table.columns] == [
@@ -244,3 +321,7 @@ def test_the_table_names_its_columns(suite: Suite) -> None:
         "Glossy ball (aligned)",
     ]
     assert all(cell.measured is not None for cell in table.rows[0].cells)
+    said = dict(table.protocol)
+    assert said["variant"] == "raw"
+    assert {"mask", "colour"}.isdisjoint(said)  # of pictures in a frame
+    assert table.heading == "Light: from the image"

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from tiny_suites import make_suite
 
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import environment_directions
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.pictures import Pictures, chosen_places, question, ranking
 from unirender_evaluation.records import Record
+from unirender_evaluation.report_samples import make_sheets
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 
@@ -66,6 +69,7 @@ def test_the_question_names_edit_material_or_light(suite: Suite, table: str, pro
         ("inverse", "single-image"): [f"decompose: true {text}" for text in true],
         "rendering": [f"render: metallic {m:.1f}, roughness {r:.1f}" for m, r in suite.spec.edits],
         "relighting": [f"relit by {suite.other_light(scene).light}"],
+        "light": [f"the light, {scene.light}"],
     }
     assert found == expected.get((table, protocol), expected.get(table))
 
@@ -128,3 +132,46 @@ def test_maps_and_lights_come_with_what_was_given(suite: Suite, tmp_path: Path) 
         "given-light": ([*materials, "HDRI"], ["image"]),
         "from-image-sd": (["input", "target specular", "target diffuse"], ["image", "specular", "diffuse"]),
     }
+
+
+def test_lights_are_shown_as_balls_and_ranked_by_their_error(suite: Suite, tmp_path: Path) -> None:
+    pictures = Pictures(tmp_path, suite, list(suite.scenes))
+    asked = list(tasks(suite, "light", "light-from-image", list(suite.scenes)))
+    key = metric_key("ball_matte", "rmse_relative")
+    records = []
+    for i, task in enumerate(asked):
+        assert task.truth_maps is not None
+        pictures.keep(task, "mine", "key", Prediction(maps=task.truth_maps))
+        values = {key: 0.1 + 0.2 * i}
+        records.append(Record("light", "light-from-image", "mine", task.sample, task.scene.object, values))
+    items = pictures.items(records, "mine")
+    assert (items[0].rank, items[0].sample) == ("worst", asked[-1].sample)  # the largest error
+    assert items[0].figure == f"error {0.1 + 0.2 * (len(asked) - 1):.2f}"
+    worst = items[0]
+    assert list(worst.truth) == ["matte ball", "glossy ball", "mirror ball"]
+    for name, picture in worst.truth.items():
+        np.testing.assert_allclose(worst.predictions["mine"][name], picture, rtol=0, atol=0.5 / 255 + 1e-6)
+    assert worst.scores["mine"]["matte ball"].startswith("error ")
+    assert worst.given_mask is not None
+    assert np.array_equal(worst.given_mask, asked[-1].mask)
+    assert worst.mask.sum() == pytest.approx(np.pi / 4 * worst.mask.size, rel=0.05)  # a disc
+    sheet = make_sheets([worst])["light", "light-from-image", worst.sample]
+    assert sheet.names == ("input", *worst.truth)
+    assert sheet.width == 4 * sheet.height // 2
+
+
+def test_the_mirror_ball_shows_the_right_light_on_the_right(suite: Suite, tmp_path: Path) -> None:
+    """+x of the contract is the viewer's right, +y up; what stands behind the ball is at its rim."""
+    pictures = Pictures(tmp_path, suite, list(suite.scenes))
+    task = next(tasks(suite, "light", "light-from-image", list(suite.scenes)))
+    directions = environment_directions(16, 32)
+    for axis, sign, rows, columns in ((0, 1, ..., slice(20, None)), (1, 1, slice(None, 12), ...)):
+        light = (0.5 * (sign * directions[..., axis] > 0.8)[..., None]).repeat(3, axis=-1).astype(np.float32)
+        pictures.keep(task, "mine", "key", Prediction(maps=Intrinsics(environment=light)))
+        record = Record(
+            "light", "light-from-image", "mine", task.sample, "o", {metric_key("ball_matte", "rmse_relative"): 1.0}
+        )
+        shown = pictures.items([record], "mine")[0].predictions["mine"]["mirror ball"].sum(axis=-1)
+        part = np.zeros_like(shown)
+        part[rows, columns] = shown[rows, columns]
+        assert part.sum() > 0.9 * shown.sum() > 0

@@ -69,6 +69,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (MULTIVIEW, "unirender_evaluation", ("multiview_scoring.py", "multiview_settings.py")),
         ("core", "unirender_evaluation", ("physics.py", "physics_rows.py", "records.py", "suite_spec.py")),
         ("core", "unirender_evaluation", ("light_balls.py", "light_methods.py", "light_metrics.py")),
+        ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
     ],
 )
 def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from tiny_suites import make_suite
 
-from unirender_evaluation.bounds import ceiling_info
+from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_info
 from unirender_evaluation.methods import InputAsAlbedo
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record, RunInfo
@@ -65,7 +65,7 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> list[Table]:
         suite=suite.spec.name,
         suite_hash=suite.sha256,
         resolution=suite.spec.resolution,
-        methods=(*(row.info for row in rows), ceiling_info(suite)),
+        methods=(*(row.info for row in rows), ceiling_info(suite), TRUE_LIGHT),
         coverage=0.4,
         lpips=("alex",),
         mitsuba="none",
