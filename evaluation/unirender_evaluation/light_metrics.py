@@ -75,7 +75,7 @@ def light_values(
 
 def score_light(found: Intrinsics | None, true: Intrinsics | None) -> dict[str, float]:
     """Metric key -> value of the light among a method's maps, as it is and with its scale free; empty where one of the
-    two has none.
+    two has none. Where the true light has no brightest direction there is no angle.
 
     Args:
         found: with its `environment`, any resolution; what is below 0 (ringing) counts as 0.
@@ -87,7 +87,10 @@ def score_light(found: Intrinsics | None, true: Intrinsics | None) -> dict[str, 
     if found is None or true is None or found.environment is None or true.environment is None:
         return {}
     light = np.maximum(found.environment, 0)
-    return {**light_values(light, true.environment), **ball_values(light, true.environment)}
+    values = {**light_values(light, true.environment), **ball_values(light, true.environment)}
+    if brightest_direction(resample_environment(true.environment, SHAPE)) is None:
+        del values[metrics.metric_key("environment", PEAK_ANGLE)]
+    return values
 
 
 def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
-from unirender_evaluation.metrics import METRICS, SCALES, Metric, Variant, metric_key
+from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant, metric_key
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
@@ -27,7 +27,7 @@ _THIRDS = (("0 to 0.3", 0.0, 0.35), ("0.4 to 0.6", 0.35, 0.65), ("0.7 to 1", 0.6
 
 @dataclass(frozen=True)
 class Question:
-    """One number of row `a` against that of row `b`."""
+    """One number of row `a` against that of row `b`; `scale`: how it is aligned, where its metric has such variants."""
 
     text: str
     table: str
@@ -36,6 +36,7 @@ class Question:
     metric: str
     a: str
     b: str
+    scale: Scale = "raw"
 
     @property
     def kind(self) -> Metric:
@@ -44,7 +45,7 @@ class Question:
 
     @property
     def key(self) -> str:
-        return metric_key(self.quantity, self.kind, MASKED)
+        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
 
 
 def run_line(results: Results) -> str:

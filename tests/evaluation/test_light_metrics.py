@@ -7,6 +7,7 @@ import pytest
 from reference_scenes import environment
 
 from unirender.errors import UnirenderError
+from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, resample_environment, rotate_environment, texel_solid_angles
 from unirender_evaluation import metrics
 from unirender_evaluation.light_metrics import (
@@ -15,6 +16,7 @@ from unirender_evaluation.light_metrics import (
     light_values,
     peak_angle_deg,
     scaled_log_rmse,
+    score_light,
 )
 
 
@@ -107,6 +109,12 @@ def test_a_black_light_is_refused() -> None:
     black = np.zeros((*SHAPE, 3), np.float32)
     with pytest.raises(UnirenderError, match="the found light is black"):
         light_values(black, lamp(7.5, 8.0))
+
+
+def test_no_angle_is_taken_from_a_light_without_direction() -> None:
+    around, aside = (Intrinsics(environment=light) for light in (np.ones((*SHAPE, 3)), lamp(7.5, 8.0)))
+    assert "environment.peak_deg" not in score_light(aside, around)
+    assert score_light(around, aside)["environment.peak_deg"] == 90
 
 
 def test_a_light_that_is_the_same_all_around_has_no_direction() -> None:
