@@ -17,10 +17,11 @@ if TYPE_CHECKING:
     from unirender_evaluation.figures_panels import MitsubaTruth, Subject
     from unirender_evaluation.suites import Scene, Suite
 
-Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview"]  # of checkpoints and methods
+Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview", "light"]  # of checkpoints and methods
 Contract = Literal["maps", "camera"]  # of the documentation of the data contract; of nobody
 Kind = Asked | Contract
-KINDS: tuple[Asked, ...] = get_args(Asked)
+ASKED: tuple[Asked, ...] = get_args(Asked)
+KINDS = ASKED[:-1]  # where none is named: few methods find the light
 CONTRACT: tuple[Contract, ...] = get_args(Contract)
 SCENES = 2  # that are shown where none is named
 
@@ -49,8 +50,9 @@ class Figures:
     """Pictures of your own instead of the suite's, with an alpha channel that cuts the object out: `pictures.png`."""
     kinds: tuple[Kind, ...] = KINDS
     """metallic, roughness: the input edited over `--values`. relighting: under other lights of the suite. comparison: a
-    column for each checkpoint and method. overview: maps, edits and relighting of one picture. maps, camera: what the
-    data contract says, without a method; only where they are named. Not with --pictures."""
+    column for each checkpoint and method. overview: maps, edits and relighting of one picture. light: balls under the
+    light that is found. maps, camera: what the data contract says, without a method. These three only where they are
+    named. Not with --pictures."""
     values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of metallic and roughness in the strips, in [0, 1]."""
     lights: int = 4
@@ -81,7 +83,7 @@ class Figures:
                 f"--{beside[0]}: got it beside --pictures, expected one of the two: scenes are the suite's"
             )
         if not self.kinds:
-            raise UsageError(f"--kinds: expected at least one of {', '.join([*KINDS, *CONTRACT])}")
+            raise UsageError(f"--kinds: expected at least one of {', '.join([*ASKED, *CONTRACT])}")
 
     def run(self) -> int:
         """Draws, and prints a line for each figure; returns the exit status."""
@@ -97,7 +99,7 @@ class Figures:
         truth = MitsubaTruth(suite, self.spp)
         grids: dict[str, Callable[[list[Subject]], Grid]] = {
             kind: partial(self.draw, kind, suite=suite, scenes=scenes, truth=truth)
-            for kind in KINDS
+            for kind in ASKED
             if kind in self.kinds
         }
         if self.pictures:
@@ -182,9 +184,11 @@ class Figures:
         self, kind: Asked, subjects: "list[Subject]", suite: "Suite", scenes: "list[Scene]", truth: "MitsubaTruth"
     ) -> "Grid":
         """One figure."""
-        from unirender_evaluation import figures_overview
+        from unirender_evaluation import figures_light, figures_overview
         from unirender_evaluation import figures_panels as panels
 
+        if kind == "light":
+            return figures_light.light_figure(subjects, suite, scenes)
         if kind == "overview":
             return figures_overview.overview(subjects, suite, scenes)
         if kind == "comparison":

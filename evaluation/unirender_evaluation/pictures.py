@@ -196,14 +196,14 @@ def _given(task: Task) -> dict[str, Picture]:
 
 def _pictures(task: Task, image: Float[np.ndarray, "h w 3"] | None, maps: Intrinsics | None) -> dict[str, Picture]:
     if task.asks_light:
-        return {} if maps is None or maps.environment is None else _balls(maps.environment, task.mask.shape[1])
+        return {} if maps is None or maps.environment is None else ball_pictures(maps.environment, task.mask.shape[1])
     pictures = {} if image is None else {"image": image_picture(image, task.mask)}
     if maps is not None:
         pictures |= map_pictures(maps)
     return pictures
 
 
-def _balls(environment: Float[np.ndarray, "eh ew 3"], size: int) -> dict[str, Picture]:
+def ball_pictures(environment: Float[np.ndarray, "eh ew 3"], size: int) -> dict[str, Picture]:
     """Display pictures of balls under a light: those that are scored, and a mirror, which shows the light itself."""
     made = balls(environment, size)
     normal = ball_normals(size)

@@ -14,6 +14,7 @@ from tiny_suites import SIZE, make_suite
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.figures import GAP, WIDEST, Grid, Line, Tile, cell_side, draw, folded, save
 from unirender_evaluation.figures_command import Figures, default_scenes, labels
+from unirender_evaluation.figures_light import light_figure
 from unirender_evaluation.figures_overview import MAPS, overview
 from unirender_evaluation.figures_panels import (
     MitsubaTruth,
@@ -23,6 +24,8 @@ from unirender_evaluation.figures_panels import (
     other_lights,
     relighting_grid,
 )
+from unirender_evaluation.light_balls import ball_values
+from unirender_evaluation.light_methods import MeanLight
 from unirender_evaluation.methods import InputAsAlbedo, UneditedInput
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites import Material, Scene, Suite, load_suite
@@ -167,6 +170,30 @@ def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite
     assert [name for name in MAPS if found[name] is not None] == ["albedo"]
     assert found["metallic 1"] is None
     assert all(tile is not None for tile in grid.lines[1].tiles[1:])
+
+
+def test_the_light_figure_shows_balls_with_the_errors_of_the_tables(suite: Suite) -> None:
+    found = Subject("mean light", make_row(MeanLight(), "trivial"))
+    grid = light_figure([found, UNEDITED], suite, suite.scenes[:2])
+    assert [line.label for line in grid.lines] == ["mean light", "true light"] * 2
+    assert grid.columns == ("input", "matte ball", "glossy ball", "mirror ball")
+    light = MeanLight().decompose(np.ones((4, 4, 3), np.float32), np.ones((4, 4, 1), np.float32), suite.spec.camera)
+    assert light.environment is not None
+    errors = ball_values(light.environment, suite.environment(suite.scenes[0]))
+    corners = [tile.corner for tile in grid.lines[0].tiles if tile is not None]
+    assert corners == ["", *(f"{errors[f'ball_{name}.rmse_relative@aligned']:.2f}" for name in ("matte", "glossy")), ""]
+    assert grid.lines[1].tiles[0] is None
+    for name in (0, 2):  # each scene under its own light, and one light for all
+        assert not np.array_equal(shown(grid, name + 1), shown(grid, (name + 3) % 4))
+    assert np.array_equal(shown(grid, 0), shown(grid, 2))
+    with pytest.raises(UnirenderError, match=r"light: as albedo finds none; leave it out"):
+        light_figure([ALBEDO], suite, suite.scenes[:1])
+
+
+def shown(grid: Grid, line: int) -> np.ndarray:
+    tile = grid.lines[line].tiles[1]
+    assert tile is not None
+    return tile.picture
 
 
 def test_a_figure_that_no_method_can_fill_is_refused_by_name(suite: Suite) -> None:
