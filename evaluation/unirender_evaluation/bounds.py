@@ -114,7 +114,7 @@ TRUE_LIGHT = MethodInfo(
     "true-light-16-x-32",
     "True light, 16 x 32 texels",
     "ceiling",
-    note="what a method scores that finds the light at the resolution that ours has, without an error",
+    note="what the resolution of our light alone costs; on the balls a finer one may do better, maps are compared so",
     config={"bound": "true-light", "shape": list(LIGHT_SHAPE)},
 )
 

@@ -1,9 +1,10 @@
 """A light by what it does: how a matte and a glossy white ball look under it.
 
 Both balls are seen from afar along the camera's axis, in `SIZE` x `SIZE` pixels, the light far away. The matte one is
-white and Lambertian: its pixels are the irradiance / pi at each normal that faces the viewer. The glossy one reflects
-all light (F = 1) by a GGX lobe of roughness `GLOSSY`; mirror directions of a ball's pixels are spread evenly over the
-sphere, so that it shows light from everywhere. Closed form, without noise (`unirender.surface_light`).
+white and Lambertian: its pixels are the irradiance / pi at each normal that faces the viewer. The glossy one is
+the s of roughness `GLOSSY` (F = 1, a GGX lobe, single scattering); mirror directions of a ball's pixels are spread
+evenly over the sphere, so that it shows light from everywhere. Integrated over 32 x 64 texels, without noise
+(`unirender.surface_light`): within about a hundredth of the mean.
 
 Such balls are how estimates of light are usually compared, since what matters of a light is what it makes of things
 put into it: a lamp of one texel and one smeared over two are the same to both, and far apart texel by texel.

@@ -50,7 +50,7 @@ PEAK_ANGLE = Metric(
     False,
     0.0,
     (),
-    1,
+    0,
     f"between the brightest directions (centroid of the luminance in the cone of {CONE_DEG:g} degrees that holds the "
     "most); 90 for a uniform light",
 )

@@ -17,9 +17,9 @@ LIGHT_TABLE = TableSpec(
     (
         _column("Environment", "environment", SCALED_LOG_RMSE),
         _column("Environment", "environment", PEAK_ANGLE),
-        _column("Matte ball", MATTE_BALL, METRICS["rmse_relative"]),
+        _column("Matte ball", MATTE_BALL, METRICS["rmse_relative"], scale="raw"),
         _column("Matte ball (aligned)", MATTE_BALL, METRICS["rmse_relative"], scale="aligned"),
-        _column("Glossy ball", GLOSSY_BALL, METRICS["rmse_relative"]),
+        _column("Glossy ball", GLOSSY_BALL, METRICS["rmse_relative"], scale="raw"),
         _column("Glossy ball (aligned)", GLOSSY_BALL, METRICS["rmse_relative"], scale="aligned"),
     ),
     (LIGHT[1],),

@@ -24,7 +24,7 @@ from unirender.lighting import sample_environment
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import GalleryItem, Mask, Picture, image_picture, map_pictures
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, balls
-from unirender_evaluation.metrics import METRICS, metric_key
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.table_formats import format_number
@@ -228,6 +228,9 @@ def _scores(task: Task, record: Record, names: Iterable[str]) -> dict[str, str]:
         found = next(((value, text) for value, text in values if value is not None), None)
         if found is not None:
             texts[name] = found[1].format(found[0])
+        aligned = record.values.get(metric_key(quantity, "rmse_relative", Variant(scale="aligned")))
+        if aligned is not None:
+            texts[name] += f", aligned {aligned:.2f}"
     return texts
 
 

@@ -134,6 +134,8 @@ def _layout_problems(folder: Path, files: list[Path], question: Question) -> Ite
     for answer in sorted(question.answers):
         if {f"{answer}{suffix}" for suffix in SUFFIXES} <= names:
             yield f"{folder}: {answer} is there as EXR and as PNG, expected one of them"
+    if question.light and "environment.png" in names and not names & set(LIGHT_FILES):
+        yield f"{folder / 'environment.png'}: display values are no light, expected {' or '.join(LIGHT_FILES)}"
     if question.light and set(LIGHT_FILES) <= names:
         yield f"{folder}: {' and '.join(LIGHT_FILES)} are both there, expected one of them"
 

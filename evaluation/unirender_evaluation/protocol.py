@@ -35,22 +35,23 @@ def protocol_line(
     """(what, value) pairs in the order in which they are printed."""
     spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
-    frame = [("mask", _mask_text(variant, methods, records)), ("colour", SPACE_TEXT[variant.space])]
+    frame = [
+        ("variant", variant.label),
+        ("mask", _mask_text(variant, methods, records)),
+        ("colour", SPACE_TEXT[variant.space]),
+        ("scale alignment", SCALE_TEXT[variant.scale]),
+    ]
+    coverage = "-" if run.coverage is None or protocol.truth else f"{run.coverage:.3f}"
     items = [
         ("given", protocol.given),
-        ("variant", variant.label if protocol.framed else variant.scale),
         *(frame if protocol.framed else ()),
-        (
-            "scale alignment",
-            SCALE_TEXT[variant.scale] if protocol.framed else SCALE_TEXT[variant.scale].partition(",")[0],
-        ),
         ("exposure", run.exposure),
         ("resolution", f"{run.resolution} x {run.resolution}"),
         ("n", f"{len(samples)} samples of {len(objects)} objects"),
-        ("coverage", "-" if run.coverage is None or protocol.truth else f"{run.coverage:.3f}"),
+        *([("coverage", coverage)] if protocol.framed else []),
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
-        ("LPIPS", _lpips_text(variant, run)),
+        *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
         ("interval", f"{CONFIDENCE:.0%} bootstrap over objects, {RESAMPLES} draws, seed {SEED}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),

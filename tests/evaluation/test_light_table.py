@@ -203,6 +203,7 @@ def test_a_light_from_a_folder(suite: Suite, tmp_path: Path) -> None:
         ("environment.exr", np.zeros((16, 32, 3)), "black"),
         ("environment.exr", np.ones((16, 16, 3)), "twice as wide as high"),
         ("environment.exr", np.full((16, 32, 3), 1e31), "limit them"),
+        ("environment.png", np.ones((16, 32, 3)), "display values are no light, expected environment.exr or"),
     ],
 )
 def test_lights_that_cannot_be_scored_are_named(
@@ -322,6 +323,6 @@ def test_the_table_names_its_columns(suite: Suite) -> None:
     ]
     assert all(cell.measured is not None for cell in table.rows[0].cells)
     said = dict(table.protocol)
-    assert said["variant"] == "raw"
-    assert {"mask", "colour"}.isdisjoint(said)  # of pictures in a frame
+    assert {"variant", "mask", "colour", "coverage", "LPIPS"}.isdisjoint(said)  # of pictures in a frame
+    assert said["given"] == "one image and its mask"
     assert table.heading == "Light: from the image"

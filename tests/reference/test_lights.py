@@ -175,9 +175,17 @@ def test_grey_exr_is_white_light_but_luminance_chroma_is_not(tmp_path):
     np.testing.assert_array_equal(e, e[..., :1].repeat(3, -1))
     write_exr(tmp_path / "chroma.exr", {"Y": grey, "RY": grey, "BY": grey})
     write_exr(tmp_path / "depth.exr", {"Z": grey})
-    for name in ("chroma", "depth"):
+    write_exr(tmp_path / "xyz.exr", {"X": grey, "Y": grey, "Z": grey})
+    for name in ("chroma", "depth", "xyz"):
         with pytest.raises(UnirenderError, match=f"{name}.exr: got EXR channels .*expected R, G, B, or Y alone"):
             lights.load_light(tmp_path / f"{name}.exr")
+
+
+def test_a_picture_under_the_name_of_a_map_is_refused(tmp_path):
+    Image.fromarray(np.full((16, 32, 3), 128, np.uint8)).save(tmp_path / "map.png")
+    (tmp_path / "map.png").rename(tmp_path / "map.hdr")
+    with pytest.raises(UnirenderError, match=r"map.hdr: is a PNG under another name, expected radiance"):
+        lights.load_light(tmp_path / "map.hdr")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -30,6 +30,7 @@ from unirender.pictures import check_finite, display_values, negative_share, ope
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
 WINDOW_DEG, FADE_DEG = 45.0, 30.0
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
@@ -137,7 +138,7 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     """Radiance, and the attributes of an EXR's header."""
     if path.suffix.lower() == ".exr":
         channels, attributes = read_exr(path)
-        if "R" not in channels and "Y" in channels and not {"RY", "BY"} & channels.keys():
+        if "R" not in channels and "Y" in channels and not {"RY", "BY", "X"} & channels.keys():
             channels = dict.fromkeys("RGB", channels["Y"])
         if not channels.keys() >= set("RGB"):
             raise UnirenderError(
@@ -146,6 +147,8 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
             )
         return channels_rgb(channels), attributes
     mi = mitsuba()
+    if path.read_bytes()[:8] == PNG_SIGNATURE:
+        raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
     try:
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except RuntimeError as error:
