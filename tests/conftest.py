@@ -5,9 +5,11 @@ annotation in a signature is checked by beartype at each call. A wrong shape in 
 """
 
 import os
+import signal
 import sys
 import tempfile
 import types
+from collections.abc import Iterator
 
 from beartype import BeartypeConf, beartype
 from jaxtyping import install_import_hook
@@ -29,6 +31,14 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # one core per worker, or the workers f
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest  # noqa: E402 - after the environment is set
+
+
+@pytest.fixture
+def a_hangup_counts() -> Iterator[None]:
+    """Under `nohup` it is ignored, also by what is tested, as it should be."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

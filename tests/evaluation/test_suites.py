@@ -100,6 +100,7 @@ def test_methods_see_eight_bits_and_nothing_else(tmp_path: Path) -> None:
             "decompose": {"image_srgb", "mask", "camera"},
             "relight": {"image_srgb", "mask", "camera", "environment"},
         },
+        "light-from-image": {"decompose": {"image_srgb", "mask", "camera"}},
         "given": {"render": {"intrinsics"}},
         "given-light": {"render": {"intrinsics"}},
     }

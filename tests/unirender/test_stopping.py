@@ -19,6 +19,7 @@ from unirender.training.stopping import SIGNALS, stopping_gently
 from unirender.training.trainer import RunConfig, Trainer
 
 STEPS = 4
+pytestmark = pytest.mark.usefixtures("a_hangup_counts")
 
 
 class Source:

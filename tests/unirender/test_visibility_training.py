@@ -181,6 +181,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
 
+@pytest.mark.usefixtures("a_hangup_counts")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
     number: int, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
