@@ -6,8 +6,8 @@ from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics_tests import PHYSICS_TABLE
 from unirender_evaluation.specs import TABLES, TableSpec
 
-OURS = (LIGHT_TABLE, MULTIVIEW_TABLE, PHYSICS_TABLE)
-ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in OURS}}
+BESIDE_THE_PAPERS = (LIGHT_TABLE, MULTIVIEW_TABLE, PHYSICS_TABLE)
+ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in BESIDE_THE_PAPERS}}
 ALL_METRICS: dict[str, Metric] = {
     **{column.metric.name: column.metric for spec in ALL_TABLES.values() for column in spec.columns},
     **METRICS,

@@ -147,11 +147,12 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
             )
         return channels_rgb(channels), attributes
     mi = mitsuba()
-    if path.read_bytes()[:8] == PNG_SIGNATURE:
-        raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
     try:
+        with path.open("rb") as file:
+            if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
+                raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    except RuntimeError as error:
+    except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
     return np.array(bitmap), {}
