@@ -1,7 +1,7 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
-# make test-long   what make test leaves out because it takes long: notebooks, and some 50 tests; CI runs it too
+# make test-long   what make test leaves out because it takes long: notebooks, and some 100 tests; CI runs it too
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
 # make test-demo   likewise: the page of `unirender demo` in Chromium
@@ -16,7 +16,8 @@
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 PIP_ARGS ?=
 BENCH_ARGS ?=
-PYTEST_ARGS ?= -n auto
+# Neighbouring tests go to one process while there are enough of them: they share what they set up.
+PYTEST_ARGS ?= -n auto --dist worksteal
 SUITE ?= tiny
 OUT ?= results
 # Of the multi-view table, which is not the paper's: 3 minutes each. `unirender bench run` takes 4.
@@ -61,7 +62,9 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-test: lint docs-check
+# Type checks and documentation use one core each.
+test: $(VENV)/.dev
+	$(MAKE) --jobs=2 --no-print-directory lint docs-check
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The notebooks run in `docs`.

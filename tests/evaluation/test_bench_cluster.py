@@ -157,6 +157,7 @@ def test_a_finished_run_asks_for_no_cluster(tmp_path: Path, monkeypatch: pytest.
     assert store.used.keys() == {job.key for job in jobs}
 
 
+@pytest.mark.long
 def test_a_worker_that_is_not_like_this_machine_is_refused(tmp_path: Path) -> None:
     """Other code, another truth, other rows: what a worker would say, said here."""
     config, run = trivial(tmp_path)

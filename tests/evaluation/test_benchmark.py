@@ -105,6 +105,7 @@ def evaluate(suite: Suite, rows: list[Row], path: Path, stop_after: int | None =
     return store.close()
 
 
+@pytest.mark.long
 def test_killed_run_resumes_to_the_same_records(suite: Suite, tmp_path: Path) -> None:
     rows = trivial_rows()
     whole = evaluate(suite, rows, tmp_path / "whole.jsonl")
@@ -216,6 +217,7 @@ def test_keys_change_with_what_results_depend_on(suite: Suite) -> None:
     assert base == content_key(suite, scene, "inverse/x", {"a": 1}, "code")
 
 
+@pytest.mark.long
 def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
     path = tmp_path / "records.jsonl"
     many = evaluate(suite, trivial_rows(), path)
@@ -275,6 +277,7 @@ def test_ceiling_of_ssim_is_scored_where_the_suite_has_a_twin(suite: Suite, tmp_
     assert ceiling_breaches([*records, *above]) == []
 
 
+@pytest.mark.long
 def test_a_partial_run_keeps_the_records_of_the_whole_one(suite: Suite, tmp_path: Path) -> None:
     path = tmp_path / "records.jsonl"
     whole = evaluate(suite, trivial_rows(), path)

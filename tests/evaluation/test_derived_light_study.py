@@ -51,6 +51,7 @@ def values(records: list[Record], question: str, method: str) -> dict[str, float
     return dict(found)
 
 
+@pytest.mark.long
 def test_a_sphere_is_lit_as_mitsuba_lights_it(records: list[Record]) -> None:
     for question in ("s-0.3", DIFFUSE):
         floor = values(records, question, TRUTH)

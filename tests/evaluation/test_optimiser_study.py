@@ -143,6 +143,7 @@ def differences(records: Sequence[Record], row: Ingredient) -> dict[str, float]:
     }
 
 
+@pytest.mark.long
 def test_a_row_like_the_full_method_differs_from_it_by_nothing(measured: tuple[Path, list[Record]]) -> None:
     found = differences(measured[1], twin())
     assert len(found) == len(columns())
@@ -152,6 +153,7 @@ def test_a_row_like_the_full_method_differs_from_it_by_nothing(measured: tuple[P
     assert other[SECONDS] < 0
 
 
+@pytest.mark.long
 def test_what_is_measured_is_the_method_itself() -> None:
     """The shared start, then refinement: the same as all stages in one run."""
     scene = ball_scene(16, FEW)

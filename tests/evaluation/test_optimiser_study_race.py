@@ -104,6 +104,7 @@ def test_the_albedo_is_that_of_the_multi_view_table() -> None:
     assert albedo_psnr(scene, truth) > albedo_psnr(scene, wrong) + 3
 
 
+@pytest.mark.long
 def test_watching_changes_nothing() -> None:
     """What is watched finds what the method finds by itself."""
     scene = ball_scene(16, FEW)
@@ -125,6 +126,7 @@ def raced(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[ObjectRa
         return folder, race_all(small_study(folder, "optimiser_study_race"), SETTINGS, folder, Console(quiet=True))
 
 
+@pytest.mark.long
 def test_the_plain_loops_are_those_of_the_tutorials(raced: tuple[Path, list[ObjectRace]]) -> None:
     folder, (race,) = raced
     study = small_study(folder, "optimiser_study_race")

@@ -74,6 +74,7 @@ def test_rows_of_a_test(tmp_path: Path) -> None:
     assert set(sampled) == {MITSUBA, OURS, TWIN}
 
 
+@pytest.mark.long
 def test_our_samples_are_drawn_once_for_a_picture(tmp_path: Path) -> None:
     """Nineteen materials in the cube that differ; the second test that asks has the same, another picture its own."""
     suite = make_suite(tmp_path, objects=1)

@@ -47,7 +47,7 @@ class Folder:
         return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_check_is_reused_only_for_the_same_truth_code_and_seed(suite: Suite, tmp_path: Path) -> None:
     folder = Folder(suite, tmp_path)
     first = folder.check(seed=3)

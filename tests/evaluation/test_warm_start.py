@@ -64,6 +64,7 @@ def named(records: list[Record], method: str) -> list[Record]:
     return [record for record in records if record.method == method]
 
 
+@pytest.mark.long
 def test_a_perfect_prediction_is_a_better_start_than_none(records: list[Record]) -> None:
     """It scores the ceiling itself; what starts from it is nearer to the truth than what starts from grey."""
     assert len(records) == 6

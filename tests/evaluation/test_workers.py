@@ -64,7 +64,7 @@ def locked(path: Path) -> bool:
         return False
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("script", [BENCH, TRUTH], ids=["bench", "truth"])
 def test_a_worker_ends_with_a_killed_parent(script: str, tmp_path: Path) -> None:
     held = tmp_path / "held"

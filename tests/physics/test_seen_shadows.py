@@ -64,6 +64,7 @@ def test_s_and_d_are_nearer_to_what_mitsuba_renders(scenes: list[Intrinsics]) ->
     assert (found - wrong).mean(axis=0).min() > LEAST_GAIN, (found, wrong)
 
 
+@pytest.mark.long
 def test_pictures_are_nearer_with_what_the_object_reflects(
     samples: list[Sample], monkeypatch: pytest.MonkeyPatch
 ) -> None:

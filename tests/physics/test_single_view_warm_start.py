@@ -24,7 +24,7 @@ def decibels(found: Intrinsics, truth: Intrinsics) -> float:
     return float(-10 * np.log10(squared.sum() / true["mask"].sum() / 3))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_learned_start_beats_a_grey_one_at_the_same_steps() -> None:
     obj = make_object(SEED, "train")
     renderer = Renderer(obj, resolution=64)

@@ -110,6 +110,7 @@ def test_it_doubles_with_the_light() -> None:
         np.testing.assert_allclose(twice[name], 2 * once[name], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.long
 def test_a_larger_picture_has_the_same() -> None:
     small, large = (bounced_light(lit(painted(*gutter(size)[:2])), LIGHT) for size in (SIZE, 4 * SIZE))
     for name in LIGHT:

@@ -123,7 +123,7 @@ def heed_hang_up() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
     solution = truth()
     write_views(rendered_views(solution, 2, 0, 16), tmp_path / "views")

@@ -64,6 +64,7 @@ def bowls(folder: Path) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hollow", [False, True])
 def test_the_light_of_each_group_is_stored_with_and_without_shadows(folder: Path, tmp_path: Path, hollow: bool) -> None:
     folder = bowls(tmp_path) if hollow else folder

@@ -36,7 +36,7 @@ def run_python(code: str, *arguments: str) -> tuple[str, set[str]]:
     return done.stdout, set(json.loads(done.stderr.strip().splitlines()[-1]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_decompose_does_without_what_it_does_not_use(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     Image.fromarray(picture).save(tmp_path / "picture.png")

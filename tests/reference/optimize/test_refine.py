@@ -161,7 +161,7 @@ def test_every_prior_reaches_its_map(views: Views, truth: Solution, field: str) 
     assert not fit.priors(state)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demodulated_loss_is_of_light_alone(views: Views, truth: Solution) -> None:
     plain, with_light = (Fit(views, truth, dataclasses.replace(FAST, demodulated=w)) for w in (0.0, 1.0))
     state = RefineState.begin(truth, FAST)

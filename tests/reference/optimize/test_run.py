@@ -61,7 +61,7 @@ def killed(out: Path, at: int) -> None:
     assert process.wait() == -signal.SIGKILL
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_run_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path):
     out = tmp_path / "run"
     killed(out, 3)
