@@ -16,7 +16,8 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType, ModuleType, NoneType, UnionType
@@ -34,10 +35,17 @@ BOOLEANS = {"true": True, "false": False}
 
 @dataclass(frozen=True)
 class Plugin:
-    """A stranger's method. `source` is the sha256 of the file that defines it: part of the cache key."""
+    """A stranger's method, and what its records depend on besides its own `config`.
+
+    Attributes:
+        method: answers.
+        source: sha256 of the file that defines its class, and of the callable's that made it where that is another.
+        made_by: its class, by which name it was asked for, and the arguments: a file may have several of one `config`.
+    """
 
     method: Any
     source: str
+    made_by: Mapping[str, Any] = field(default_factory=dict)
 
 
 def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
@@ -56,7 +64,7 @@ def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
                 f"--predictions {name}=FOLDER"
             )
         what = f"plug-in {name!r} ({found[name].value})"
-        plugins.append(_plugin(_attempt(what, "load it", found[name].load), what))
+        plugins.append(_plugin(_attempt(what, "load it", found[name].load), what, name))
     return plugins
 
 
@@ -82,7 +90,7 @@ def named_plugin(spec: str) -> Plugin:
         )
     found = getattr(module, name)
     arguments = _arguments(found, query, what) if has_arguments else {}
-    return _plugin(found, what, arguments)
+    return _plugin(found, what, name, arguments)
 
 
 def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
@@ -177,20 +185,28 @@ def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
         raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
 
 
-def _plugin(found: Any, what: str, arguments: Mapping[str, Any] = MappingProxyType({})) -> Plugin:
+def _plugin(found: Any, what: str, name: str, arguments: Mapping[str, Any] = MappingProxyType({})) -> Plugin:
     """The method that `found` is, or that it returns when it is called."""
-    is_method = not inspect.isclass(found) and any(callable(getattr(found, name, None)) for name in CAPABILITIES)
+    is_method = not inspect.isclass(found) and any(callable(getattr(found, can, None)) for can in CAPABILITIES)
     as_it_is = not arguments and (is_method or not callable(found))
     method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
     try:
         capabilities(method)
     except UnirenderError as error:
         raise UnirenderError(f"{what}: {error}") from None
-    return Plugin(method, _source(type(method)))
+    said = {argument: str(value) for argument, value in arguments.items()}
+    made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
+    return Plugin(method, _source(type(method), found), made_by)
 
 
-def _source(defined: type) -> str:
-    try:
-        return hashlib.sha256(Path(inspect.getfile(defined)).read_bytes()).hexdigest()
-    except (OSError, TypeError):
-        return "unknown"  # compiled, or made in an interactive session: its config has to tell versions apart
+def _source(*defined: Any) -> str:
+    """The sha256 of the files that define these; what is compiled, or made in a session, has none: its config has to
+    tell versions apart."""
+    files: dict[str, bytes] = {}
+    for what in defined:
+        with suppress(OSError, TypeError):
+            file = inspect.getfile(what)
+            files[file] = Path(file).read_bytes()
+    return (
+        hashlib.sha256(b"".join(files.values())).hexdigest() if files else "unknown"
+    )  # its config tells versions apart

@@ -218,6 +218,7 @@ def prediction_rows(folders: Mapping[str, Path]) -> list[Row]:
 def plugin_rows(plugins: Sequence[Plugin]) -> list[Row]:
     """Rows of other people's methods; what they import of unirender is not known, so that all of it counts.
 
+    Their name, class and arguments count beside their `config`: two methods of one file may leave that empty.
     Whole numbers of the names `steps`, `samples` and `seed` in a method's configuration stand in the protocol line.
     """
     rows = []
@@ -225,7 +226,8 @@ def plugin_rows(plugins: Sequence[Plugin]) -> list[Row]:
         row = make_row(plugin.method, "external", uses=frozenset({MODEL}))
         config = row.info.config
         stated = {name: config[name] for name in ("steps", "samples", "seed") if type(config.get(name)) is int}
-        rows.append(replace(row, info=replace(row.info, config={**config, "source": plugin.source}, **stated)))
+        told_apart = {"name": row.info.label, "source": plugin.source, "made_by": dict(plugin.made_by)}
+        rows.append(replace(row, info=replace(row.info, config={**config, "plugin": told_apart}, **stated)))
     return rows
 
 

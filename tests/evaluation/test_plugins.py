@@ -40,11 +40,27 @@ class Unwritable(Grey):
     config = {"weights": object()}
 
 
+class White(Grey):
+    pass
+
+
 def make():
     return Grey()
 
 
+class Level:
+    name = "level"
+    config = {}
+
+    def __init__(self, level: float = 0.5):
+        self.level = level
+
+    def render(self, intrinsics):
+        return self.level * intrinsics.albedo * intrinsics.mask
+
+
 instance = Grey()
+bright, dark = Level(0.9), Level(0.1)
 """
 
 
@@ -83,6 +99,36 @@ def test_an_edited_file_is_another_configuration(folder: Path) -> None:
     rows = plugin_rows([named_plugin(f"{folder / name}:Grey") for name in ("my_method.py", "copy.py")])
     assert rows[0].info.config != rows[1].info.config
     assert rows[0].info.config["shade"] == rows[1].info.config["shade"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("Grey", "White"), ("bright", "dark"), ("Level?level=0.2", "Level?level=0.3"), ("Grey", "make")],
+)
+def test_methods_of_one_file_share_no_record(folder: Path, one: str, other: str) -> None:
+    """Whatever their `config` says: else the numbers of the one are printed as the other's."""
+    rows = plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{name}") for name in (one, other)])
+    assert rows[0].config != rows[1].config
+    (again,) = plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{one}")])
+    assert again.config == rows[0].config
+
+
+def test_a_row_of_another_name_shares_no_record(folder: Path) -> None:
+    """A name that is an argument, or read from elsewhere when the method is made."""
+    first, second = (named_plugin(f"{folder / 'my_method.py'}:Grey") for _ in range(2))
+    second.method.name = "grey, renamed"
+    rows = plugin_rows([first, second])
+    assert rows[0].config != rows[1].config
+
+
+def test_an_edited_factory_is_another_configuration(folder: Path) -> None:
+    """Its class may stand in another file, which is the same."""
+    sources = []
+    for level in (0.1, 0.9):
+        file = folder / f"factory_{level}.py"
+        file.write_text(f"from my_method import Level\n\n\ndef make():\n    return Level({level})\n")
+        sources.append(named_plugin(f"{file}:make").source)
+    assert sources[0] != sources[1]
 
 
 def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
