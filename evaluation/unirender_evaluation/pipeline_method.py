@@ -1,14 +1,13 @@
 """Our model as a benchmark method, and what identifies its checkpoint."""
 
-import hashlib
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.methods import Image, Mask
-
-KEPT = 16  # decompositions: more than are asked for of one scene
 
 
 class PipelineMethod:
@@ -38,14 +37,14 @@ class PipelineMethod:
         samples: int,
         seed: int,
         weights: str,
-        decompositions: dict[str, Any] | None = None,
+        decompositions: Decompositions[Any] | None = None,
         closed: bool = True,
         device: str = "cpu",
     ) -> None:
         self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
         self.closed, self.device = closed, device
         self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
-        self._decompositions: dict[str, Any] = {} if decompositions is None else decompositions
+        self._decompositions = Decompositions[Any]() if decompositions is None else decompositions
 
     @property
     def config(self) -> dict[str, Any]:
@@ -75,18 +74,10 @@ class PipelineMethod:
         }
 
     def _decomposition(self, image_srgb: Image, mask: Mask, camera: Camera) -> Any:
-        """Of a picture, computed once: the rows that share it differ in what they do with it.
-
-        Only the last few are kept; those of thousands of photographs would not fit into memory.
-        """
-        key = hashlib.sha256(image_srgb.tobytes() + mask.tobytes() + repr(camera).encode()).hexdigest()
-        if key not in self._decompositions:
-            options = {**self._options(), "closed": self.closed}
-            made = self.pipeline.decompose(image_srgb, mask=mask, camera=camera, **options)
-            while len(self._decompositions) >= KEPT:
-                del self._decompositions[next(iter(self._decompositions))]
-            self._decompositions[key] = made
-        return self._decompositions[key]
+        """Of a picture, computed once: the rows that share it differ in what they do with it."""
+        options = {**self._options(), "closed": self.closed}
+        make = partial(self.pipeline.decompose, image_srgb, mask=mask, camera=camera, **options)
+        return self._decompositions.of(image_srgb, mask, camera, make)[0]
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
         return self._decomposition(image_srgb, mask, camera).intrinsics

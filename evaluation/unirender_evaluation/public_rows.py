@@ -8,6 +8,7 @@ from unirender.errors import UsageError
 from unirender.files import checkpoint_sha256
 from unirender.options import Device, ModelOptions
 from unirender.shipped import checkpoint_folder
+from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.pipeline_method import LazyPipeline, PipelineMethod
 from unirender_evaluation.plugins import installed_plugins, named_plugin
@@ -59,7 +60,7 @@ def our_rows(public: PublicSet, checkpoint: Path | None, device: Device) -> list
 
     pipeline = LazyPipeline(ModelOptions(checkpoint, device, "float32", progress=False).load)
     weights, place = checkpoint_sha256(checkpoint_folder(checkpoint)), str(resolve_device(device))
-    shared: dict[str, Any] = {}
+    shared = Decompositions[Any]()
     rows = []
     for name, anchored in (("Ours (mean)", False), ("Ours (mean, anchored)", True)):
         method = PipelineMethod(pipeline, name, "mean", anchored, 1, 1, 0, weights, decompositions=shared, device=place)

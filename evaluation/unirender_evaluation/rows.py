@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.light_methods import MeanLight, UniformLight
 from unirender_evaluation.methods import (
     Composite,
@@ -52,6 +53,7 @@ class Row:
         uses: the parts (`versions.PARTS`) that its answers depend on besides the core.
         told: what it is handed beyond the inputs that all rows have, by the name of the task's field: "geometry", the
             object's true mesh. Its label and note say so.
+        found: what a stranger's method has found so far.
     """
 
     info: MethodInfo
@@ -62,6 +64,7 @@ class Row:
     pictures: int | None = None
     uses: frozenset[str] = frozenset()
     told: frozenset[str] = frozenset()
+    found: Decompositions[Intrinsics] = field(default_factory=Decompositions, compare=False, repr=False)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -170,7 +173,7 @@ def our_rows(
     from_image = frozenset(
         {("rendering", "from-image"), ("relighting", "from-image-sd"), ("relighting", "from-image-hdri")}
     )
-    shared: dict[str, Any] = {}
+    shared = Decompositions[Any]()
     edited: dict[str, Intrinsics] = {}
 
     def ours(name: str, anchored: bool = False, mode: str = "mean", steps: int = 1, samples: int = 1, **options: Any):

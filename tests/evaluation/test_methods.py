@@ -1,5 +1,6 @@
 """The rows that need no network: known values, capabilities, anchoring, plug-ins."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from unirender_evaluation.claims import SHADOWED
 from unirender_evaluation.engine import Prediction, answer, score
 from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import tasks
+from unirender_evaluation.tasks import PROTOCOLS, tasks
 from unirender_evaluation.training_statistics import training_statistics
 
 
@@ -184,3 +185,32 @@ def test_predictions_folder_is_needed(tmp_path: Path) -> None:
         PredictionFolder(tmp_path)
     with pytest.raises(UnirenderError, match="nowhere: no such folder"):
         PredictionFolder(tmp_path / "nowhere")
+
+
+class Patient:
+    """Takes its time to decompose, and counts how often it has to."""
+
+    name = "patient"
+    config: dict[str, Any] = {}  # noqa: RUF012 - as strangers write it
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        self.asked += 1
+        time.sleep(0.05)
+        return Intrinsics(albedo=srgb_decode(image_srgb), mask=mask, camera=camera)
+
+
+def test_a_strangers_method_decomposes_a_picture_once(suite: Suite) -> None:
+    """Relighting and light ask for the picture of the base material; each answer's seconds hold the decomposition's."""
+    method, scene = Patient(), suite.scenes[0]
+    row = make_row(method, "external")
+    asking = [task for what in PROTOCOLS for task in tasks(suite, *what, [scene]) if "decompose" in task.asks]
+    answers = [answer(row, task) for task in asking]
+    pictures = {(task.inputs["decompose"]["image_srgb"].tobytes()) for task in asking}
+    assert method.asked == len(pictures) == len(asking) - 1
+    assert all(found.seconds >= 0.05 for found in answers)
+    for task, found in zip(asking, answers, strict=True):
+        assert found.maps is not None
+        np.testing.assert_array_equal(found.maps.albedo, srgb_decode(task.inputs["decompose"]["image_srgb"]))

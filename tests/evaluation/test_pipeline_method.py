@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from unirender.camera import Camera
-from unirender_evaluation.pipeline_method import KEPT, PipelineMethod
+from unirender_evaluation.decompositions import KEPT, Decompositions
+from unirender_evaluation.pipeline_method import PipelineMethod
 
 
 class Counting:
@@ -21,15 +22,14 @@ class Counting:
 
 
 def test_rows_share_decompositions_but_thousands_of_them_are_not_kept() -> None:
-    pipeline, shared, mask = Counting(), {}, np.ones((2, 2, 1), np.float32)
+    pipeline, shared, mask = Counting(), Decompositions[Any](), np.ones((2, 2, 1), np.float32)
     rows = [PipelineMethod(pipeline, name, "mean", False, 1, 1, 0, "w", decompositions=shared) for name in "ab"]
     pictures = [np.full((2, 2, 3), value, np.float32) for value in np.linspace(0, 1, 2 * KEPT)]
     for picture in pictures:
         for row in rows:
             row._decomposition(picture, mask, Camera())
     assert len(pipeline.asked) == len(pictures)
-    assert len(shared) == KEPT
-    rows[0]._decomposition(pictures[-1], mask, Camera())
+    rows[0]._decomposition(pictures[-KEPT], mask, Camera())
     assert len(pipeline.asked) == len(pictures)
-    rows[0]._decomposition(pictures[0], mask, Camera())
+    rows[0]._decomposition(pictures[-KEPT - 1], mask, Camera())
     assert len(pipeline.asked) == len(pictures) + 1
