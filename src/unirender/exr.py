@@ -20,6 +20,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.primaries import in_rec709
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
@@ -28,6 +29,7 @@ ATTRIBUTE_PREFIX = "unirender:"
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
 GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
+COLORS = ("", *(name for name, components in _COMPONENTS.items() if components == "RGB"))  # "": the image
 MAP_CHANNELS: Mapping[str, tuple[str, ...]] = {
     name: tuple(f"{name}.{component}" for component in _COMPONENTS.get(name, "Y")) for name in IMAGE_MAPS
 }
@@ -99,7 +101,7 @@ def exr_bytes(
         if half and np.abs(value).max(initial=0.0) > HALF_MAX:
             raise UnirenderError(
                 f"EXR channel {name}: got {np.abs(value).max():.4g}, half precision ends at {HALF_MAX:g}; "
-                "lower the exposure of the light, or pass half=False"
+                "lower the exposure of the light (in Python: or pass half=False)"
             )
         stored[name] = np.ascontiguousarray(value, dtype=np.float16 if half else np.float32)
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -112,6 +114,8 @@ def exr_bytes(
 
 def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
+
+    Colours of a file that states other primaries come in Rec.709 (`unirender.primaries`).
 
     Raises:
         UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels of another part
@@ -146,6 +150,8 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
             f"{name}: the pixels cover {stored} (dataWindow) and the picture {shown} (displayWindow), from the first "
             "pixel to the last, expected the same; save the whole picture"
         )
+    if "chromaticities" in header:
+        channels = in_rec709(channels, header["chromaticities"], COLORS, name)
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
     return channels, attributes
 

@@ -11,6 +11,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
+from unirender.icc import in_srgb
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 MAX_PIXELS = 100_000_000
@@ -45,27 +46,44 @@ class Picture:
 def read_picture(path: str | Path) -> Picture:
     """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied).
 
+    Colours come in sRGB's primaries, whatever the file's ICC profile or chromaticities say.
+
     Raises:
         UnirenderError: the file is missing, no picture, broken, too large, or an EXR with NaN or infinite values or
             with more negative radiance than `NEGATIVE_MOST`.
+    """
+    path = checked_file(path)
+    return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path)
+
+
+def checked_file(path: str | Path) -> Path:
+    """The path.
+
+    Raises:
+        UnirenderError: there is no such file.
     """
     path = Path(path)
     if not path.exists():
         raise UnirenderError(f"{path}: no such file, expected a picture: {FORMATS}")
     if path.is_dir():
         raise UnirenderError(f"{path}: is a folder, expected a picture: {FORMATS}")
-    return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path)
+    return path
 
 
 def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
-    """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours.
+    """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours, as they are stored.
+
+    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone.
 
     Raises:
         UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty.
     """
-    picture = read_picture(path)
-    channels = [picture.image_srgb] if picture.mask is None else [picture.image_srgb, picture.mask]
-    mask = coverage(np.concatenate(channels, axis=-1))
+    path = checked_file(path)
+    mask = (
+        _read_exr_mask(path)
+        if path.suffix.lower() == ".exr"
+        else coverage(display_values(open_picture(path), str(path)))
+    )
     if mask.shape[:2] != size:
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
@@ -120,7 +138,7 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
         name: what to call it in messages.
 
     Raises:
-        UnirenderError: a floating-point or 32-bit picture, whose values have no display white.
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white, or one of L*a*b*.
     """
     if image.mode.startswith("I;16") or image.mode in ("I", "F"):
         values = np.asarray(image, dtype=np.float32)
@@ -130,9 +148,11 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
                 "grey; save linear radiance as EXR"
             )
         return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+    if image.mode in ("LAB", "HSV", "YCbCr"):
+        raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
-    has_alpha = "A" in image.getbands() or "transparency" in image.info
+    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
 
 
@@ -175,9 +195,25 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
 
 
 def _read_display_picture(path: Path) -> Picture:
-    pixels = display_values(open_picture(path), str(path))
+    pixels = display_values(in_srgb(open_picture(path), str(path)), str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
     return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name)
+
+
+def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:
+    """Coverage is no radiance: the numbers as they are, however the colours beside them are."""
+    channels, _ = read_exr(path)
+    alpha, grey = channels.get("A"), channels.get("mask.Y", channels.get("Y"))
+    if grey is None and set("RGB") <= set(channels):
+        grey = channels_rgb(channels).mean(axis=-1)
+    if alpha is not None and (grey is None or alpha.min() < 1):
+        grey = alpha
+    if grey is None:
+        raise UnirenderError(
+            f"{path}: has the channels {', '.join(sorted(channels))}, expected a mask: A, mask.Y, Y, or R, G and B"
+        )
+    check_finite(grey[..., None], str(path))
+    return grey[..., None]
 
 
 def _read_exr_picture(path: Path) -> Picture:

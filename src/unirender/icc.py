@@ -1,0 +1,60 @@
+"""Pictures whose file states another colour space by an ICC profile: brought to sRGB."""
+
+import io
+
+import numpy as np
+from PIL import Image, ImageCms
+
+from unirender.errors import UnirenderError
+
+SAME_PROFILE = 2  # of 255: profiles of sRGB differ by this much among one another
+PROBE = 9  # steps along each axis of the cube that two profiles are compared on
+
+
+def in_srgb(image: Image.Image, name: str) -> Image.Image:
+    """A picture whose ICC profile is not sRGB's, converted: relative colorimetric, 8 bits a channel, RGB or RGBA.
+
+    Others come back as they are: those without a profile, those of sRGB, to the bit, and 16-bit grey, whose profile is
+    not looked at.
+
+    Args:
+        image: the picture; colours, not data.
+        name: what to call it in messages.
+
+    Raises:
+        UnirenderError: the profile is damaged, or of another kind of picture.
+    """
+    data = image.info.get("icc_profile")
+    if not data or image.mode.startswith(("I", "F")):
+        return image
+    has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+    alpha = image.convert("RGBA").getchannel("A") if has_alpha else None
+    colors = image if image.mode in ("RGB", "L", "CMYK") else image.convert(_opaque_mode(image))
+    try:
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
+        if colors.mode == "RGB" and _is_srgb(profile):
+            return image
+        srgb, intent = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
+        converted = ImageCms.profileToProfile(colors, profile, srgb, renderingIntent=intent, outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        raise UnirenderError(
+            f"{name}: its ICC profile cannot be used ({error}); convert the picture to sRGB, or save it without profile"
+        ) from error
+    assert converted is not None, "it was not converted in place"
+    if alpha is not None:
+        converted.putalpha(alpha)
+    return converted
+
+
+def _opaque_mode(image: Image.Image) -> str:
+    """Grey stays grey: its profile has one channel."""
+    return "L" if image.mode in ("LA", "La", "1") else "RGB"
+
+
+def _is_srgb(profile: ImageCms.ImageCmsProfile) -> bool:
+    steps = np.linspace(0, 255, PROBE).round().astype(np.uint8)
+    cube = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(PROBE, PROBE * PROBE, 3)
+    probe, srgb = Image.fromarray(cube), ImageCms.createProfile("sRGB")
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    seen = ImageCms.profileToProfile(probe, profile, srgb, renderingIntent=intent, outputMode="RGB")
+    return bool(np.abs(np.asarray(seen, np.int16) - cube).max() <= SAME_PROFILE)

@@ -1,0 +1,158 @@
+"""Files that state another colour space than ours: pictures by an ICC profile, EXRs by chromaticities."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from icc_profiles import P3_D50, SRGB_D50, matrix_profile
+from PIL import Image, ImageCms
+
+from unirender.color import srgb_decode, srgb_encode
+from unirender.errors import UnirenderError
+from unirender.exr import read_exr
+from unirender.icc import in_srgb
+from unirender.pictures import read_mask, read_picture
+from unirender.pipelines.inputs import as_picture
+from unirender.primaries import REC709
+
+RNG = np.random.default_rng(3)
+PIXELS = RNG.integers(30, 200, (6, 9, 3), dtype=np.uint8)
+ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+TO_REC709 = np.array(  # published, of AP0 with Bradford: the ACES project's AP0 to Rec.709 D65
+    [[2.52169, -1.13413, -0.38756], [-0.27648, 1.37272, -0.09624], [-0.01538, -0.15298, 1.16835]]
+)
+
+
+def linear(primaries: np.ndarray, gamma: float) -> np.ndarray:
+    """What `PIXELS` mean under a profile, in linear sRGB, by the definition of a matrix profile."""
+    return (PIXELS / 255.0) ** gamma @ (np.linalg.inv(SRGB_D50) @ primaries).T
+
+
+@pytest.mark.parametrize(("primaries", "gamma"), [(SRGB_D50, 1.0), (P3_D50, 2.2), (SRGB_D50, 1.8)])
+def test_a_picture_of_another_profile_is_converted(tmp_path: Path, primaries: np.ndarray, gamma: float) -> None:
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", icc_profile=matrix_profile(primaries, gamma))
+    expected = srgb_encode(np.clip(linear(primaries, gamma), 0, 1).astype(np.float32))
+    seen = read_picture(tmp_path / "a.png").image_srgb
+    np.testing.assert_allclose(seen, expected, rtol=0, atol=2 / 255)
+    assert np.abs(seen - PIXELS / 255).max() > 0.02
+    picture, _ = as_picture(Image.open(tmp_path / "a.png").resize((9, 8), Image.Resampling.NEAREST))
+    np.testing.assert_array_equal(picture[0], seen[0])
+
+
+@pytest.mark.parametrize("profile", [None, ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
+def test_a_picture_in_srgb_keeps_its_values(tmp_path: Path, profile: bytes | None) -> None:
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", icc_profile=profile)
+    np.testing.assert_array_equal(np.round(read_picture(tmp_path / "a.png").image_srgb * 255), PIXELS)
+
+
+def test_alpha_and_palettes_go_through_a_profile(tmp_path: Path) -> None:
+    alpha = RNG.integers(0, 256, PIXELS.shape[:2], dtype=np.uint8)
+    alpha[0, 0] = 255
+    profile = matrix_profile(SRGB_D50, 1.0)
+    Image.fromarray(PIXELS).save(tmp_path / "rgb.png", icc_profile=profile)
+    Image.fromarray(np.dstack([PIXELS, alpha])).save(tmp_path / "rgba.png", icc_profile=profile)
+    few = Image.fromarray(PIXELS).convert("P")
+    few.save(tmp_path / "palette.png", icc_profile=profile)
+    few.convert("RGB").save(tmp_path / "same.png", icc_profile=profile)
+    opaque, seen = (read_picture(tmp_path / f"{name}.png") for name in ("rgb", "rgba"))
+    assert seen.mask is not None
+    np.testing.assert_array_equal(np.round(seen.mask[..., 0] * 255), alpha)
+    np.testing.assert_array_equal(seen.image_srgb, opaque.image_srgb)
+    palette, same = (read_picture(tmp_path / f"{name}.png") for name in ("palette", "same"))
+    np.testing.assert_array_equal(palette.image_srgb, same.image_srgb)
+
+
+def test_a_mask_has_no_colour_space(tmp_path: Path) -> None:
+    """Coverage 0.5 is 0.5 in a file with whatever profile."""
+    grey = np.full((4, 4, 3), 128, np.uint8)
+    grey[0] = 255
+    Image.fromarray(grey).save(tmp_path / "a.png", icc_profile=matrix_profile(SRGB_D50, 1.0))
+    assert read_mask(tmp_path / "a.png", (4, 4))[1, 1, 0] == pytest.approx(128 / 255)
+
+
+@pytest.mark.parametrize("profile", [b"no profile", matrix_profile(SRGB_D50, 1.0)[:200]])
+def test_a_damaged_profile_is_refused(profile: bytes, tmp_path: Path) -> None:
+    image = Image.fromarray(PIXELS)
+    image.info["icc_profile"] = profile
+    with pytest.raises(UnirenderError, match=r"a picture: its ICC profile cannot be used .* convert the picture"):
+        in_srgb(image, "a picture")
+    grey = Image.fromarray(PIXELS)
+    grey.info["icc_profile"] = matrix_profile(SRGB_D50, 1.0)
+    with pytest.raises(UnirenderError, match="its ICC profile cannot be used"):
+        in_srgb(_with_profile(grey.convert("L"), grey.info["icc_profile"]), "a grey picture")
+
+
+def _with_profile(image: Image.Image, profile: bytes) -> Image.Image:
+    image.info["icc_profile"] = profile
+    return image
+
+
+def test_a_lab_picture_is_refused(tmp_path: Path) -> None:
+    """Its second band is named A, and is no alpha."""
+    Image.merge("LAB", Image.fromarray(PIXELS).split()).save(tmp_path / "lab.tif")
+    with pytest.raises(UnirenderError, match="a picture of mode LAB, expected RGB, grey or CMYK"):
+        read_picture(tmp_path / "lab.tif")
+
+
+def write(path: Path, channels: dict[str, np.ndarray], chromaticities: tuple[float, ...] | None) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    stated = {} if chromaticities is None else {"chromaticities": chromaticities}
+    OpenEXR.File(
+        header | stated, {name: np.ascontiguousarray(value, np.float32) for name, value in channels.items()}
+    ).write(str(path))
+
+
+def test_an_exr_of_other_primaries_is_converted(tmp_path: Path) -> None:
+    rgb = RNG.uniform(0.2, 0.8, (5, 4, 3)).astype(np.float32)
+    image = dict(zip("RGB", np.moveaxis(rgb, -1, 0), strict=True))
+    maps = {f"albedo.{name}": value for name, value in image.items()}
+    data = {f"normal.{axis}": value for axis, value in zip("XYZ", image.values(), strict=True)} | {"A": np.ones((5, 4))}
+    write(tmp_path / "a.exr", image | maps | data, ACES_AP0)
+    seen, _ = read_exr(tmp_path / "a.exr")
+    expected = rgb @ TO_REC709.T
+    for prefix in ("", "albedo."):
+        found = np.stack([seen[f"{prefix}{name}"] for name in "RGB"], axis=-1)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3)
+    for name, value in data.items():
+        np.testing.assert_array_equal(seen[name], np.float32(value))
+    grey = {name: np.full((4, 4), 0.5) for name in "RGB"}
+    write(tmp_path / "white.exr", grey, ACES_AP0)
+    np.testing.assert_allclose(srgb_decode(read_picture(tmp_path / "white.exr").image_srgb), 0.5, atol=1e-4)
+
+
+@pytest.mark.parametrize("chromaticities", [None, REC709, (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.31271, 0.32902)])
+def test_an_exr_in_rec709_keeps_its_values(tmp_path: Path, chromaticities: tuple[float, ...] | None) -> None:
+    image = {name: RNG.uniform(0, 1, (3, 3)).astype(np.float32) for name in "RGB"}
+    write(tmp_path / "a.exr", image, chromaticities)
+    seen, _ = read_exr(tmp_path / "a.exr")
+    for name, value in image.items():
+        np.testing.assert_array_equal(seen[name], value)
+
+
+def test_chromaticities_of_no_space_are_refused(tmp_path: Path) -> None:
+    write(tmp_path / "a.exr", {name: np.ones((3, 3)) for name in "RGB"}, (0.3, 0.3) * 4)
+    with pytest.raises(UnirenderError, match="are those of no colour space, expected x, y of red, green, blue"):
+        read_exr(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("names", [("R", "G", "B"), ("R", "G", "B", "A"), ("mask.Y",), ("Y",), ("A",)])
+def test_a_mask_in_an_exr_is_coverage_as_it_is(tmp_path: Path, names: tuple[str, ...]) -> None:
+    """No transfer curve: half covered is 0.5. An alpha of 1 everywhere says nothing where there are colours."""
+    mask = np.ones((4, 4), np.float32)
+    mask[:, 0], mask[:, 1] = 0.5, 0.25
+    only_alpha = names == ("A",)
+    channels = {name: np.ones((4, 4)) if name == "A" and not only_alpha else mask for name in names}
+    write(tmp_path / "m.exr", channels, None)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.exr", (4, 4))[..., 0], mask)
+    buffer = io.BytesIO()
+    Image.fromarray((mask * 255).astype(np.uint8)).save(buffer, "PNG")
+    (tmp_path / "m.png").write_bytes(buffer.getvalue())
+    np.testing.assert_allclose(read_mask(tmp_path / "m.png", (4, 4))[..., 0], mask, atol=1 / 255)
+
+
+def test_an_exr_without_a_mask_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "m.exr", {"depth.Z": np.ones((4, 4))}, None)
+    with pytest.raises(UnirenderError, match=r"has the channels depth.Z, expected a mask: A, mask.Y, Y, or R, G and B"):
+        read_mask(tmp_path / "m.exr", (4, 4))
