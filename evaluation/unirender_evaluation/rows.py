@@ -94,9 +94,9 @@ class Row:
         """How a run of that many scenes names it: where the row had fewer, its note says how many."""
         fewer = [self.info.note] if self.info.note else []
         if self.scenes is not None and self.scenes < scenes:
-            fewer.append(f"{self.scenes} scenes only")
+            fewer.append(f"{self.scenes} scene{'s' * (self.scenes != 1)} only")
         if self.pictures is not None:
-            fewer.append(f"inverse: {self.pictures} pictures of each scene only")
+            fewer.append(f"inverse: {self.pictures} picture{'s' * (self.pictures != 1)} of each scene only")
         return replace(self.info, note="; ".join(fewer))
 
 

@@ -30,10 +30,12 @@ class Finding:
         sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
+        interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""  # one object has none
+        objects = f"{d.clusters} object{'s' * (d.clusters != 1)}"
         return (
             f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}: "
             f"{c.a} {self.comparison.verdict} {c.b}, "
-            f"difference {d.mean:+.4g} [{d.low:+.4g}, {d.high:+.4g}] {unit} (n {d.n}, {d.clusters} objects{remark})"
+            f"difference {d.mean:+.4g} {interval}{unit} (n {d.n}, {objects}{remark})"
         )
 
 

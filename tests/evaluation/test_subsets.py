@@ -70,7 +70,7 @@ def test_optimisation_rows_take_some_pictures_of_some_scenes(suite: Suite) -> No
         assert {scenes.index(task.scene) for task in asked} == {0, 2, 5, 7}
         assert Counter(task.table for task in asked) == {"rendering": 12, "inverse": 4, "relighting": 8, "light": 4}
         assert not any(task.protocol in ("given", "given-light") for task in asked)
-        assert row.described(8).note.endswith("; 4 scenes only; inverse: 1 pictures of each scene only")
+        assert row.described(8).note.endswith("; 4 scenes only; inverse: 1 picture of each scene only")
     whole = optimized_rows(None)[0]
     assert all(whole.answers(task, scenes) for task in tasks(suite, "inverse", "single-image", scenes))
 

@@ -164,4 +164,7 @@ def test_one_object_decides_nothing() -> None:
     records = [*rows("a", ALBEDO, np.array([20, 21])), *rows("b", ALBEDO, np.array([10, 11]))]
     found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
     assert found[0].holds is None
-    assert "stated inverse/single-image albedo PSNR: a is not comparable on one object with b" in str(found[0])
+    text = str(found[0])
+    assert "stated inverse/single-image albedo PSNR: a is not comparable on one object with b, difference" in text
+    assert text.endswith("1 object)")
+    assert "nan" not in text
