@@ -1,14 +1,15 @@
 """The report: one self-contained HTML file that works from file:// without a network.
 
 Tables with the published value beside the measured one and the protocol below, the standing of our rows between the
-trivial ones and the noise ceiling, one tick per sample, paired verdicts, a gallery that begins with the failures, and a
-table of all samples that opens to every row's numbers.
+trivial ones and the noise ceiling, one tick per sample, the run's verdict and paired ones, a gallery that begins with
+the failures, and a table of all samples that opens to every row's numbers.
 This module turns results into view models; `templates/` lays them out. `unirender bench report RUN` writes the page
 of a finished run again.
 """
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,9 +21,9 @@ from unirender.errors import UnirenderError
 from unirender.files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.gallery import GalleryItem, hero, shelves, shown_width
-from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
+from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_records, read_run
-from unirender_evaluation.report_plots import heading, strip_plots, tiles
+from unirender_evaluation.report_plots import LEADING, heading, is_headline, strip_plots, tiles
 from unirender_evaluation.report_samples import Place, Sheet, make_sheets, sample_sections
 from unirender_evaluation.specs import TABLES, TableSpec
 from unirender_evaluation.table_counts import cell_counts
@@ -42,7 +43,8 @@ if TYPE_CHECKING:
     from unirender_evaluation.suites import Suite
 
 TEMPLATES = Path(__file__).parent / "templates"
-HEADLINE = ("psnr", "mse", "cosine")  # metrics of the verdicts, the tiles and the distributions
+VERDICT = "verdict.txt"  # in a run's folder
+STATES = ("HOLDS", "FAILS", "stated")  # how a line of it may begin
 DENSE = 8  # columns: from here on the interval stands below its mean
 KIND_NAMES = {
     "ours": "ours",
@@ -65,6 +67,7 @@ def write_report(
     *,
     specs: Mapping[str, TableSpec] | None = None,
     sheets: Mapping[Place, Sheet] | None = None,
+    verdict: str = "",
     title: str = "Rendering and inverse rendering, scored against path tracing",
 ) -> Path:
     """Writes the report, atomically.
@@ -77,6 +80,7 @@ def write_report(
         records: per-sample values for distributions, verdicts and the table of samples; none = without these sections.
         specs: columns, for tables beyond `TABLES`.
         sheets: pictures of samples for the table of samples.
+        verdict: what `verdict.verdict_text` says of the run; empty = the report has no such list.
         title: heading of the page.
 
     Returns:
@@ -98,10 +102,11 @@ def write_report(
         watermark=next((table.watermark for table in tables if table.watermark), None),
         resolution=run.resolution,
         hero=hero(gallery, run),
-        tiles=tiles(tables, HEADLINE),
+        tiles=tiles(tables),
         kinds=_kinds(tables),
         blocks=[_block(list(group)) for _, group in groupby(tables, key=_identity)],
-        strips=strip_plots(specs, records, run, HEADLINE),
+        strips=strip_plots(specs, records, run),
+        claims=_claims(verdict),
         verdicts=_verdicts(specs, records, run),
         gallery=shelves(gallery, run, {name: spec.title for name, spec in specs.items()}, most),
         footer=f"{run.suite} {run.suite_hash[:12]} · code {run.code or '-'} · {run.date or 'no date'}.",
@@ -135,10 +140,10 @@ def _identity(table: Table) -> tuple[str, str, str]:
 def _block(variants: Sequence[Table]) -> dict[str, Any]:
     first = variants[0]
     suffix = "" if first.subset == "main" else f" ({first.subset})"
-    return {
-        "title": heading(first.title, first.protocol_key) + suffix,
-        "panels": [_panel(table) for table in variants],
-    }
+    title, panels = heading(first.title, first.protocol_key) + suffix, [_panel(table) for table in variants]
+    for panel in panels:
+        panel["name"] = f"{title}, {panel['tab']}" if len(panels) > 1 else title
+    return {"title": title, "panels": panels}
 
 
 def _panel(table: Table) -> dict[str, Any]:
@@ -212,15 +217,26 @@ def _cell(cell: Cell, decimals: int, few: int | None) -> dict[str, Any]:
     return view
 
 
+def _claims(verdict: str) -> dict[str, Any] | None:
+    """The lines of `verdict.txt` below its heading, each with the word that it begins with; None without a verdict."""
+    head, *lines = verdict.splitlines() or [""]
+    return {"head": head, "lines": [_claim(line.strip()) for line in lines]} if lines else None
+
+
+def _claim(line: str) -> dict[str, str]:
+    word, _, rest = line.partition(" ")
+    return {"state": word, "text": rest.strip()} if word in STATES else {"state": "", "text": line}
+
+
 def _verdicts(specs: Mapping[str, TableSpec], records: Sequence[Record], run: RunInfo) -> list[dict[str, Any]]:
     groups = []
     for spec in specs.values():
         for protocol in spec.protocols:
             chosen = Selection(spec.name, protocol).of(records)
+            headlines = tuple(column for column in spec.columns if is_headline(spec.name, column))
+            shown = replace(spec, columns=headlines)
             rows = []
-            for column, found in verdicts(spec, chosen, run, variant=DEFAULT_VARIANT) if chosen else ():
-                if column.metric.name not in HEADLINE:
-                    continue
+            for column, found in (pair for kind in LEADING for pair in verdicts(shown, chosen, run, kind=kind)):
                 digits, difference = column.metric.decimals, found.difference
                 unit = f" {column.metric.unit}" if column.metric.unit else ""
                 interval = f"[{difference.low:+.{digits}f}, {difference.high:+.{digits}f}]"
@@ -294,7 +310,10 @@ def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Rec
     items = pictures.items(records, leading_row(run))
     items += MultiviewPictures(folder / "pictures").items(records, suite)
     sheets = make_sheets(pictures.leading(records, leading_row(run)))
-    return write_report(folder / "report.html", tables, items, run, records, specs=ALL_TABLES, sheets=sheets)
+    verdict = (folder / VERDICT).read_text(encoding="utf-8") if (folder / VERDICT).is_file() else ""
+    return write_report(
+        folder / "report.html", tables, items, run, records, specs=ALL_TABLES, sheets=sheets, verdict=verdict
+    )
 
 
 def leading_row(run: RunInfo) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender_evaluation.comparisons import Selection, values_of
+from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import PROTOCOLS, Column, TableSpec
@@ -13,16 +14,23 @@ from unirender_evaluation.statistics import Estimate, bootstrap_mean
 from unirender_evaluation.table_formats import format_estimate, format_number
 from unirender_evaluation.tables import Row, Table
 
+HEADLINE = ("psnr", "mse", "cosine")  # metrics of the verdicts, the tiles and the distributions
+LIGHT_HEADLINE = ("log_rmse_scaled", "peak_deg", "rmse_relative")  # and of the light's, where its level is left free
 WIDTH = 1000  # of a strip's own coordinates; strokes do not scale with it
 FEW = " (n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}{})"  # behind the label of a row that has fewer samples than the others
 LEADING = ("ours", "external")  # kinds whose rows the report is about; the first that is there
 MARKED = ("trivial", "baseline", "optimisation", "external", "ours")  # kinds whose best row is marked on a tile's scale
 
 
-def strip_plots(
-    specs: Mapping[str, TableSpec], records: Sequence[Record], run: RunInfo, metrics: Sequence[str]
-) -> list[dict[str, Any]]:
-    """One plot per table, protocol and column whose metric is among `metrics`, inside the mask."""
+def is_headline(table: str, column: Column) -> bool:
+    """Whether verdicts, tiles and distributions show a column; of a light's balls the aligned ones alone."""
+    if table == LIGHT_TABLE.name:
+        return column.metric.name in LIGHT_HEADLINE and column.overrides.get("scale") != "raw"
+    return column.metric.name in HEADLINE
+
+
+def strip_plots(specs: Mapping[str, TableSpec], records: Sequence[Record], run: RunInfo) -> list[dict[str, Any]]:
+    """One plot per table, protocol and headline, inside the mask where there is one."""
     plots = []
     for spec in specs.values():
         for protocol in spec.protocols:
@@ -30,7 +38,7 @@ def strip_plots(
             objects = {record.sample: record.object for record in chosen}
             keys = list(dict.fromkeys(record.method for record in chosen))
             for column in spec.columns:
-                if column.metric.name not in metrics:
+                if not is_headline(spec.name, column):
                     continue
                 values = {key: values_of(chosen, key, column.key(DEFAULT_VARIANT)) for key in keys}
                 values = {key: found for key, found in values.items() if found}
@@ -81,16 +89,17 @@ def heading(title: str, protocol: str) -> str:
     return title if label.casefold() == title.casefold() else f"{title}: {label}"
 
 
-def tiles(tables: Sequence[Table], metrics: Sequence[str]) -> list[dict[str, Any]]:
-    """The best row of the leading kind between the trivial rows and what nobody can pass, from the masked tables."""
+def tiles(tables: Sequence[Table]) -> list[dict[str, Any]]:
+    """The best row of the leading kind between the trivial rows and what nobody can pass, from the masked tables: the
+    paper's under its own protocols, and the light's."""
     found = []
     for table in tables:
         if table.variant != DEFAULT_VARIANT or table.subset != "main":
             continue
-        if not PROTOCOLS[table.protocol_key].published:
+        if not (PROTOCOLS[table.protocol_key].published or table.name == LIGHT_TABLE.name):
             continue
         for i, column in enumerate(table.columns):
-            tile = _tile(table, column, i) if column.metric.name in metrics else None
+            tile = _tile(table, column, i) if is_headline(table.name, column) else None
             if tile is not None:
                 found.append(tile)
     return found

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from report_pieces import RUN, SIZE, item, mask, records
+from report_pieces import LIGHTS, RUN, SIZE, VERDICT, item, light_records, mask, records
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
@@ -33,7 +33,7 @@ from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
 from unirender_evaluation.report import leading_row, rebuild, report_run, write_report
-from unirender_evaluation.report_plots import Scale, heading, tiles
+from unirender_evaluation.report_plots import Scale, heading, strip_plots, tiles
 from unirender_evaluation.report_samples import make_sheets
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_tables
@@ -118,6 +118,95 @@ def test_verdicts_and_distributions_are_there(page: str) -> None:
     assert page.count('class="rug"') == 3
 
 
+def test_a_light_alone_has_its_standing_distributions_and_verdicts(tmp_path: Path) -> None:
+    """By what does not depend on the light's level: the raw balls, by which it loses, are in the table alone."""
+    made, named = light_records(), ["Environment log-RMSE", "Environment angle"]
+    named += ["Matte ball (aligned) error", "Glossy ball (aligned) error"]
+    tables = build_tables(made, LIGHTS, ALL_TABLES)
+    assert [tile["what"] for tile in tiles(tables)] == [f"{name} ↓" for name in named]
+    assert {(tile["by"], tile["start_kind"], tile["end"]) for tile in tiles(tables)} == {
+        ("Lamp finder", "trivial", "perfect: 0")
+    }
+    assert [strip["title"] for strip in strip_plots(ALL_TABLES, made, LIGHTS)] == named
+    path = write_report(tmp_path / "r.html", tables, [], LIGHTS, made, specs=ALL_TABLES)
+    page = path.read_text(encoding="utf-8")
+    for name in named:
+        assert f'<span class="best">beats</span> Uniform light</td><td>{name} ↓</td>' in page
+    assert "is beaten by" not in page
+
+
+def test_the_runs_own_verdict_is_in_its_report_where_the_folder_has_one(page: str, tmp_path: Path) -> None:
+    suite = make_suite(tmp_path / "suite")
+    run = replace(RUN, suite=suite.spec.name, suite_hash=suite.sha256)
+    write_run(tmp_path / "run.json", run)
+    write_records(tmp_path / "records.jsonl", records())
+    (tmp_path / "verdict.txt").write_text(VERDICT, encoding="utf-8")
+    found = rebuild(tmp_path, str(suite.spec.path)).read_text(encoding="utf-8")
+    claims = re.findall(r'<li><b class="(\w*)">(\w*)</b> <span>(.*?)</span></li>', found)
+    assert [claim[:2] for claim in claims] == [
+        ("holds", "HOLDS"), ("fails", "FAILS"), ("stated", "stated"), ("", ""), ("", ""),
+    ]  # fmt: skip
+    assert claims[1][2] == "ours exceeds the noise ceiling on &lt;this&gt; by at least 0.10 dB"
+    assert claims[3][2] == "not run inverse/single-image normal cos: ours against mean-normal"
+    assert VERDICT.splitlines()[0] in found
+    assert 'class="claims"' not in page
+
+
+def test_a_verdict_without_anything_to_compare_has_a_section(tmp_path: Path) -> None:
+    tables = build_tables(records(), RUN)
+    page = write_report(tmp_path / "r.html", tables, [], RUN, verdict=VERDICT).read_text(encoding="utf-8")
+    assert page.count('href="#verdicts"') == page.count('<section id="verdicts">') == 1
+    assert "Row against row" not in page
+
+
+class Cells(HTMLParser):
+    """(tag, attributes) of what is in data tables and around them."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+    def all(self, tag: str, **wanted: str) -> list[dict[str, str | None]]:
+        """Attributes of these elements; `class_` names one of the classes."""
+        kind = wanted.pop("class_", None)
+        found = [attrs for name, attrs in self.found if name == tag and wanted.items() <= attrs.items()]
+        return [attrs for attrs in found if kind is None or kind in (attrs.get("class") or "").split()]
+
+
+def test_tables_say_what_they_and_their_headings_are(page: str) -> None:
+    cells = Cells(page)
+    assert {attrs.get("scope") for attrs in cells.all("th")} == {"col", "colgroup", "row", "rowgroup"}
+    labels = [attrs.get("aria-label") for attrs in cells.all("table")]
+    assert labels[:2] == [f"Inverse rendering: from the image, {tab}" for tab in
+                          ("whole frame, beside the paper", "inside the mask")]  # fmt: skip
+    assert all(labels)
+    scrolling = cells.all("div", class_="scroll")
+    assert len(scrolling) == len(labels)
+    assert all(attrs["tabindex"] == "0" and attrs["role"] == "region" and attrs["aria-label"] for attrs in scrolling)
+    assert re.search(r'<th scope="row"[^>]*><span class="dot k-ours"></span>Ours &lt;mean&gt;', page)
+
+
+def test_tabs_and_panels_name_each_other_and_panels_have_headings(page: str) -> None:
+    cells = Cells(page)
+    tabs, panels = cells.all("button", role="tab"), cells.all("div", role="tabpanel")
+    assert [tab["aria-controls"] for tab in tabs] == [panel["id"] for panel in panels] == ["panel-1-1", "panel-1-2"]
+    assert [tab["id"] for tab in tabs] == [panel["aria-labelledby"] for panel in panels]
+    headings = re.findall(r'<h4 class="variant">(.*?)</h4>', page)
+    assert headings == ["whole frame, beside the paper", "inside the mask"]
+    assert "@media screen { .tabbed .variant { display: none; } }" in page, "hidden by scripts alone, and not in print"
+
+
+def test_on_paper_nothing_is_cut_off(page: str) -> None:
+    assert "@page { size: landscape;" in page
+    paper = page.split("@media print {")[1].split("\n}")[0]
+    assert ".scroll, .scroll.tall, .opened { overflow: visible; max-height: none; }" in paper
+    assert re.search(r"table\.data td \{[^}]*white-space: normal", paper)
+
+
 def test_without_records_and_gallery_it_still_stands(tmp_path: Path) -> None:
     path = write_report(tmp_path / "r.html", build_tables(records(), RUN), [], RUN)
     text = path.read_text(encoding="utf-8")
@@ -168,7 +257,7 @@ def tile_of(column: str, values: dict[str, list[float]], quantity: str, metric: 
         for i, value in enumerate(found)
     ]
     run = replace(RUN, limit=None)
-    (tile,) = [tile for tile in tiles(build_tables(made, run), ("psnr", "mse", "cosine")) if column in tile["what"]]
+    (tile,) = [tile for tile in tiles(build_tables(made, run)) if column in tile["what"]]
     return tile
 
 

@@ -151,7 +151,7 @@ class Browser:
         entries = _call(f"{self.address}/se/log", {"type": "performance"})
         events = [json.loads(entry["message"])["message"] for entry in entries]
         asked = [e["params"]["request"]["url"] for e in events if e["method"] == "Network.requestWillBeSent"]
-        return [address for address in asked if not address.startswith(("data:", "chrome:"))]
+        return [address for address in asked if not address.startswith(("data:", "chrome:", "chrome-untrusted:"))]
 
 
 def _call(address: str, body: Any = None, method: str | None = None) -> Any:

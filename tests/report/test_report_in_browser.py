@@ -3,17 +3,24 @@
 The file is opened from file:// as a reader opens it, clicked and typed at. Each check has a twin that it must refuse.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import browser
 import pytest
 from browser import Browser
-from report_pieces import write_page
+from report_pieces import LONG, write_page
 
 pytestmark = [pytest.mark.report, pytest.mark.slow]
 
 PHONE = 390
+PAPER = 960  # CSS pixels between the margins of a landscape page: Letter, the narrower one
+ON_PAPER = """for (const sheet of document.styleSheets) for (const rule of sheet.cssRules)
+    if (rule.media) {
+        const text = rule.media.mediaText;
+        rule.media.mediaText = {print: "all", screen: "not all"}[text] ?? text;
+    }"""  # the page's rules for print, on the screen
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +71,67 @@ def test_a_phone_does_not_scroll_sideways(page: Path, tmp_path: Path) -> None:
         assert phone.ask("return document.querySelector('#viewer').getBoundingClientRect().width") <= PHONE
         phone.open(twin(page, tmp_path, '<p style="width:500px">wide</p>'))
         assert phone.ask(width) > PHONE
+
+
+def test_a_long_name_breaks_and_covers_no_number(tmp_path: Path) -> None:
+    """Of our row: in its cell, below the big number, in legends, plots and cards."""
+    covered = """return [...document.querySelectorAll('table.data tbody > tr > :first-child')].filter(cell => {
+        const text = document.createRange(); text.selectNodeContents(cell);
+        return text.getBoundingClientRect().right > cell.getBoundingClientRect().right + 1; }).length"""
+    page = write_page(tmp_path, LONG)
+    for width in (PHONE, 1280):
+        with Browser.start(tmp_path / str(width), width, 844) as opened:
+            opened.open(page)
+            assert opened.ask("return document.documentElement.scrollWidth") == width
+            assert opened.ask(covered) == 0
+            opened.ask("document.querySelectorAll('th, td').forEach(cell => { cell.style.overflowWrap = 'normal'; })")
+            assert opened.ask(covered) > 0, "the twin"
+
+
+def test_on_paper_every_column_is_within_the_page(tmp_path: Path) -> None:
+    wide = """return [...document.querySelectorAll('table')].filter(table =>
+        table.getBoundingClientRect().right > document.documentElement.clientWidth + 1).length"""
+    shown = """return [...document.querySelectorAll('.variant, .panel, .tabs')].map(e =>
+        [e.className, e.offsetHeight > 0])"""
+    page = write_page(tmp_path, LONG)
+    with Browser.start(tmp_path, PAPER, 800) as opened:
+        opened.open(page)
+        before = opened.ask(shown)
+        assert before == [["tabs", True], ["panel", True], ["variant", False], ["panel", False], ["variant", False]]
+        opened.ask(ON_PAPER)
+        assert opened.ask(wide) == 0
+        assert opened.ask("return document.documentElement.scrollWidth") == PAPER
+        assert opened.ask(shown) == [[name, name != "tabs"] for name, _ in before]
+        cut = "return [...document.querySelectorAll('.scroll')].map(e => getComputedStyle(e).overflowX)"
+        assert set(opened.ask(cut)) == {"visible"}
+        opened.ask("document.querySelectorAll('th, td').forEach(cell => { cell.style.minWidth = '200px'; })")
+        assert opened.ask(wide) > 0, "the twin"
+
+
+def test_without_scripts_each_panel_has_its_heading_and_there_are_no_tabs(page: Path, tmp_path: Path) -> None:
+    text = re.sub(r"<script.*?</script>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (tmp_path / "plain.html").write_text(text, encoding="utf-8")
+    with Browser.start(tmp_path) as opened:
+        opened.open(tmp_path / "plain.html")
+        headings = (
+            "return [...document.querySelectorAll('.variant')].filter(e => e.offsetHeight > 0).map(e => e.textContent)"
+        )
+        assert opened.ask(headings) == ["whole frame, beside the paper", "inside the mask"]
+        assert opened.ask("return document.querySelector('.tabs').offsetHeight") == 0
+
+
+def test_arrow_keys_move_between_tabs(desk: Browser) -> None:
+    state = """const all = (selector, view) => [...document.querySelectorAll(selector)].map(view);
+        return [document.activeElement.textContent,
+            all('#tables [role=tab]', tab => [tab.getAttribute('aria-selected'), tab.tabIndex]),
+            all('#tables .panel', panel => panel.hidden)]"""
+    first = ["whole frame, beside the paper", [["true", 0], ["false", -1]], [False, True]]
+    second = ["inside the mask", [["false", -1], ["true", 0]], [True, False]]
+    desk.click("#tables [role=tab]")
+    assert desk.ask(state) == first
+    for key, expected in (("right", second), ("right", first), ("left", second), ("home", first), ("end", second)):
+        desk.press("#tables [aria-selected=true]", key)
+        assert desk.ask(state) == expected, key
 
 
 def test_a_heading_sorts_a_table_and_the_samples(desk: Browser) -> None:

@@ -6,11 +6,25 @@ for (const block of all(".block")) { // variants of one table as tabs
   const panels = all(".panel", block), tabs = all(".tabs button", block);
   const show = (i) => {
     panels.forEach((panel, k) => { panel.hidden = k !== i; });
-    tabs.forEach((tab, k) => tab.setAttribute("aria-selected", String(k === i)));
+    tabs.forEach((tab, k) => {
+      tab.setAttribute("aria-selected", String(k === i));
+      tab.tabIndex = k === i ? 0 : -1;
+    });
   };
-  tabs.forEach((tab, i) => tab.addEventListener("click", () => show(i)));
+  tabs.forEach((tab, i) => {
+    tab.addEventListener("click", () => show(i));
+    tab.addEventListener("keydown", (event) => { // the Tab key stops at one of them, arrows go on to the others
+      const last = tabs.length - 1;
+      const to = { ArrowRight: i < last ? i + 1 : 0, ArrowLeft: i > 0 ? i - 1 : last, Home: 0, End: last }[event.key];
+      if (to === undefined) return;
+      event.preventDefault();
+      show(to);
+      tabs[to].focus();
+    });
+  });
   if (tabs.length) show(0);
 }
+document.documentElement.classList.add("tabbed"); // tabs work: the panels need no headings of their own on a screen
 
 for (const table of all("table.data:not(#sample-rows)")) { // sort inside sections, so that bounds stay bounds
   const heads = all("thead tr:last-child th", table);
