@@ -5,6 +5,7 @@ enlarged by a whole factor without interpolation, so that every pixel of the sui
 columns is folded: a page would shrink it until nobody can read its labels.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -20,6 +21,7 @@ from unirender.files import replace_file
 SIDE = 128  # of a cell, pixels, about: the nearest whole multiple of the pictures' own size, and never less than it
 WIDEST = 6  # columns beside one another; the others follow below, all rows again
 GAP, GROUP_GAP, HEADER, MARGIN = 6, 16, 24, 12
+HEADING_LINES = 3  # of a column's name; what is longer loses its middle
 INK, SOFT = "#222222", "#666666"
 FONT, SMALL = 13, 12
 
@@ -93,11 +95,12 @@ def draw(grid: Grid) -> Image.Image:
     parts = folded(len(grid.columns))
     width = left + len(parts[0]) * (side + GAP) + MARGIN - GAP
     caption = _wrapped(grid.caption, small, width - 2 * MARGIN)
+    names = _headings(grid.columns, font, side)
     headings, places, y = [], [], MARGIN
     for part in parts:
         y += GROUP_GAP if headings else 0
+        y += HEADER + (max(len(names[column]) for column in part) - 1) * (FONT + 3)
         headings.append(y)
-        y += HEADER
         for number, line in enumerate(grid.lines):
             y += GROUP_GAP if line.starts and number else 0
             high = _height([line.tiles[column] for column in part], side)
@@ -105,10 +108,11 @@ def draw(grid: Grid) -> Image.Image:
             y += high + GAP
     sheet = Image.new("RGB", (width, y + len(caption) * (SMALL + 6) + MARGIN), "white")
     pen = ImageDraw.Draw(sheet)
-    for part, top in zip(parts, headings, strict=True):
+    for part, bottom in zip(parts, headings, strict=True):
         for place, column in enumerate(part):
-            x, text = left + place * (side + GAP) + side // 2, _fitting(grid.columns[column], font, side + GAP)
-            pen.text((x, top + HEADER // 2), text, fill=INK, font=font, anchor="mm")
+            for above, text in enumerate(reversed(names[column])):
+                at = (left + place * (side + GAP) + side // 2, bottom - HEADER // 2 - above * (FONT + 3))
+                pen.text(at, text, fill=INK, font=font, anchor="mm")
     for part, line, top, high in places:
         pen.text((left - MARGIN, top + high // 2), line.label, fill=INK, font=font, anchor="rm")
         for place, column in enumerate(part):
@@ -158,21 +162,37 @@ def _width(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont") -> i
     return int(np.ceil(font.getlength(text)))
 
 
-def _fitting(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int) -> str:
-    """The text, cut where it is too wide."""
-    if _width(text, font) <= width:
-        return text
-    while text and _width(text + "...", font) > width:
-        text = text[:-1]
-    return text + "..."
+def _headings(
+    texts: Sequence[str], font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int
+) -> list[list[str]]:
+    """The lines of each column's name: `HEADING_LINES`, or as many more as tell different names apart."""
+    whole = [_wrapped(text, font, width) for text in texts]
+    for most in range(HEADING_LINES, max(map(len, whole))):
+        found = [_shortened(text, font, width, most) for text in texts]
+        if len(set(map(tuple, found))) == len(set(map(tuple, whole))):
+            return found
+    return whole
+
+
+def _shortened(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int, most: int) -> list[str]:
+    """The text in at most so many lines, without its middle where it needs more."""
+    kept, lines = len(text), _wrapped(text, font, width)
+    while len(lines) > most and kept > 0:
+        kept -= 1
+        lines = _wrapped(f"{text[: kept - kept // 2]}...{text[len(text) - kept // 2 :]}", font, width)
+    return lines
 
 
 def _wrapped(text: str, font: "ImageFont.FreeTypeFont | ImageFont.ImageFont", width: int) -> list[str]:
-    """The text in lines that fit."""
+    """The text in lines that fit, broken behind a space, _ or -, else where the line is full."""
     lines: list[str] = []
-    for word in text.split():
-        if lines and _width(f"{lines[-1]} {word}", font) <= width:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines
+    for word in re.split(r"(?<=[\s_-])", " ".join(text.split())):
+        if lines and _width((lines[-1] + word).rstrip(), font) <= width:
+            lines[-1] += word
+            continue
+        lines.append("")
+        for letter in word:
+            if lines[-1] and _width((lines[-1] + letter).rstrip(), font) > width:
+                lines.append("")
+            lines[-1] += letter
+    return [line.rstrip() for line in lines if line.strip()]

@@ -6,6 +6,7 @@ that it is stored, with its file, date and code: none of them was measured now.
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,8 @@ from unirender_evaluation.results_data import Results
 from unirender_evaluation.rows import slug
 
 Sample = tuple[str, str, str, str]  # table, protocol, subset, sample
+SCENES_ONLY = re.compile(r"\d+ scenes? only")  # what a row's note says of one run (`rows.Row.described`)
+PICTURES_ONLY = re.compile(r"inverse: \d+ pictures? of each scene only")
 
 
 def obstacles(a: Results, b: Results) -> list[str]:
@@ -64,11 +67,12 @@ def check_comparable(files: Sequence[Results]) -> None:
 
 @dataclass
 class _Row:
-    """A row in the making: its description in the first file that has it, and its records."""
+    """A row in the making: its description in the first file that has it, its records, and each file's note on them."""
 
     info: MethodInfo
     origin: str
     records: dict[Sample, Record] = field(default_factory=dict)
+    notes: list[tuple[str, set[Sample]]] = field(default_factory=list)
 
     def is_also(self, info: MethodInfo, records: Mapping[Sample, Record]) -> bool:
         """Whether another file's row is this one: the same method with the same configuration and values."""
@@ -76,11 +80,29 @@ class _Row:
         same = (self.info.key, self.info.kind, self.info.config) == (info.key, info.kind, info.config)
         return same and all(agree(self.records[sample].values, records[sample].values) for sample in shared)
 
-    def take(self, records: Mapping[Sample, Record]) -> None:
-        """Adds what another file has of this row; the first file's record and values stay, where both have one."""
+    def take(self, note: str, records: Mapping[Sample, Record]) -> None:
+        """Adds what a file has of this row; the first file's record and values stay, where both have one."""
+        self.notes.append((note, set(records)))
         for sample, record in records.items():
             own = self.records.get(sample)
             self.records[sample] = record if own is None else replace(own, values={**record.values, **own.values})
+
+    def note(self) -> str:
+        """The note of a file that has all of the row; else the first one's, without counts that the others do not say.
+
+        How many scenes is true of one file, and not of several together.
+        """
+        whole = next((note for note, samples in self.notes if samples >= self.records.keys()), None)
+        if whole is not None:
+            return whole
+        first, *others = [note.split("; ") for note, samples in self.notes if samples]
+        kept = [
+            part
+            for part in first
+            if not SCENES_ONLY.fullmatch(part)
+            and (not PICTURES_ONLY.fullmatch(part) or all(part in other for other in others))
+        ]
+        return "; ".join(kept)
 
 
 def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
@@ -104,7 +126,7 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
             if row is None:
                 row = _Row(replace(info, stored=info.stored or _stored(file, name)), name)
                 rows.append(row)
-            row.take(records)
+            row.take(info.note, records)
     rows = _told_apart(rows)
     methods = tuple(row.info for row in rows)
     merged = [replace(r, method=row.info.key) for row in rows for r in row.records.values()]
@@ -136,7 +158,7 @@ def _told_apart(rows: Sequence[_Row]) -> list[_Row]:
             key += "-again"
         keys.add(key)
         label = f"{label} ({row.origin})" if labels.count(label) > 1 else label
-        told.append(_Row(replace(row.info, key=key, label=label), row.origin, row.records))
+        told.append(replace(row, info=replace(row.info, key=key, label=label, note=row.note())))
     return told
 
 

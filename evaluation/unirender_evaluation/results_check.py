@@ -6,16 +6,19 @@ A *problem* makes a file invalid. A *remark* is what a reader must know of a val
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import MASKS, SCALES, SPACES
 from unirender_evaluation.published import check_name
-from unirender_evaluation.records import Record
+from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.results_data import Results, metric_definition, metric_name, protocol_definition
 from unirender_evaluation.schema_check import Problem, did_you_mean
 from unirender_evaluation.specs import PROTOCOLS
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
+
+if TYPE_CHECKING:
+    from unirender_evaluation.suites import Suite
 
 WORDS = {"mask": MASKS, "space": SPACES, "scale": SCALES}
 TOLERANCE = 1e-6  # by which rounding may carry a value beyond a perfect one
@@ -41,6 +44,8 @@ def remarks(results: Results) -> list[str]:
     run, found = results.run, []
     if run.limit is not None:
         found.append(f"a partial run (--limit {run.limit}): its tables carry a watermark")
+    else:
+        found += _untold_part(results)
     used = {record.method for record in results.records}
     idle = [info.key for info in run.methods if info.key not in used]
     if idle:
@@ -181,26 +186,59 @@ def _twice(records: Iterable[Record]) -> Iterator[Problem]:
             yield Problem(f"records[{i}].object", what)
 
 
-def _strangers_to_the_suite(results: Results) -> list[Problem]:
-    """Samples that the suite does not have, where this installation has that very suite with its truth."""
+def _suite_of(run: RunInfo) -> "Suite | None":
+    """The very suite of a run with its truth; None where this installation does not have it."""
     from unirender_evaluation.suites import load_suite
 
-    if installed_suite_hash(results.run.suite) != results.run.suite_hash:
-        return []
+    if installed_suite_hash(run.suite) != run.suite_hash:
+        return None
     try:
-        suite = load_suite(results.run.suite)
+        return load_suite(run.suite)
     except UnirenderError:  # the truth is not made here: nothing to compare with
+        return None
+
+
+def _beginnings(sample: str) -> set[str]:
+    """What a sample's name begins with, word by word: one is the key of its scene, or its object's name."""
+    words = sample.split("_")
+    return {"_".join(words[:n]) for n in range(1, len(words) + 1)}
+
+
+def _untold_part(results: Results) -> Iterator[str]:
+    """That no row has all scenes of the suite, which only a partial run leaves out.
+
+    A method answers as much as it can, but the trivial rows and the bounds answer for all scenes of a run. Without a
+    record of any scene, as of the multi-view table alone, nothing is known.
+    """
+    suite = _suite_of(results.run)
+    if suite is None:
+        return
+    keys = {scene.key for scene in suite.scenes}
+    of_rows: dict[str, set[str]] = {}
+    for method, sample in {(record.method, record.sample) for record in results.records}:
+        of_rows.setdefault(method, set()).update(_beginnings(sample) & keys)
+    most = max(map(len, of_rows.values()), default=0)
+    if 0 < most < len(keys):
+        yield f"records of {most} of {len(keys)} scenes, though the run says that it is whole"
+
+
+def _strangers_to_the_suite(results: Results) -> list[Problem]:
+    """Pictures of another size and samples that the suite does not have, where it is the one installed here."""
+    suite, run = _suite_of(results.run), results.run
+    if suite is None:
         return []
     scenes = {scene.key: scene.object for scene in suite.scenes}
     names = {*scenes, *scenes.values()}
+    wrong = []
+    if run.resolution != suite.spec.resolution:
+        what = f"got {run.resolution}, expected {suite.spec.resolution}: suite {run.suite!r} has pictures of that size"
+        wrong.append(Problem("run.resolution", what))
 
     def check(record: Record) -> Iterator[tuple[str, str]]:
-        words = record.sample.split("_")
-        beginnings = {"_".join(words[:n]) for n in range(1, len(words) + 1)}
-        found = beginnings & names
+        found = _beginnings(record.sample) & names
         if not found:
             yield ".sample", f"suite {results.run.suite!r} has no scene of the sample {record.sample!r}"
         elif record.object not in {scenes.get(name, name) for name in found}:
             yield ".object", f"the sample {record.sample!r} is of another object than {record.object!r}"
 
-    return _gathered(results.records, check)
+    return [*wrong, *_gathered(results.records, check)]

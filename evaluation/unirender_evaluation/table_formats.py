@@ -9,6 +9,7 @@ import dataclasses
 import json
 import math
 import textwrap
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -22,10 +23,21 @@ from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate
 from unirender_evaluation.table_counts import cell_counts, label_n
+from unirender_evaluation.table_text import markdown_row, plain_markdown, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table
 
 MISSING, NOT_AVAILABLE = "-", "n/a"
 NO_CELL = Cell()
+GREEK = (  # TeX's names from U+03B1 on
+    "alpha beta gamma delta varepsilon zeta eta theta iota kappa lambda mu nu xi o pi rho varsigma sigma tau "
+    "upsilon varphi chi psi omega"
+)
+GREEK_CAPITALS = (  # from U+0391 on; U+03A2 is no letter
+    r"A B \Gamma \Delta E Z H \Theta I K \Lambda M N \Xi O \Pi P - \Sigma T \Upsilon \Phi X \Psi \Omega"
+)
+# Of the letters up to `LATIN` those that pdflatex stops at, and of those beyond it some that it has.
+LATIN, TEX_LACKS = 0x17F, frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲųſ")
+TEX_HAS = frozenset("ȘșȚț\u2010\u2011\u2013\u2014\u2018\u2019\u201c\u201d\u2022\u2026\u20ac\u2122")
 TEX_COLUMN = 13  # letters of a column's heading in LaTeX: longer ones are broken, so that the column stays narrow
 
 
@@ -72,9 +84,9 @@ def to_markdown(table: Table) -> str:
         marks += ["--:", "--:"] if doubled else ["--:"]
     lines = [f"### {table.heading}", ""]
     lines += [f"> **{table.watermark}**", ""] if table.watermark else []
-    lines += [_pipe(titles), _pipe(marks)]
+    lines += [markdown_row(titles), markdown_row(marks)]
     for row in table.rows:
-        texts, counts = [row_label(row, table)], cell_counts(table.rows, row)
+        texts, counts = [plain_markdown(row_label(row, table))], cell_counts(table.rows, row)
         for i, (column, cell, doubled) in enumerate(_cells(row, table)):
             digits = column.metric.decimals
             if doubled:
@@ -85,9 +97,9 @@ def to_markdown(table: Table) -> str:
             else:
                 mean, spread = format_estimate(cell.measured, digits)
                 texts.append(f"{_markdown_rank(mean, cell.measured_rank)} {spread}".strip() + _few(counts, i))
-        lines.append(_pipe(texts))
-    lines += ["", f"Protocol: {protocol_text(table.protocol)}."]
-    lines += [line for note in table.notes for line in ("", note)]
+        lines.append(markdown_row(texts))
+    lines += ["", plain_paragraph(f"Protocol: {protocol_text(table.protocol)}.")]
+    lines += [line for note in table.notes for line in ("", plain_paragraph(note))]
     return "\n".join(lines) + "\n"
 
 
@@ -95,7 +107,7 @@ def to_latex(table: Table) -> str:
     """A booktabs `table*` in the paper's layout; needs packages booktabs and graphicx, and nothing else.
 
     The title is the caption, protocol and notes stand below; a table that is wider than the page is scaled to it. A
-    name in letters that LaTeX's own fonts do not have needs another engine than pdflatex.
+    name in letters that LaTeX's own fonts do not have needs another engine than pdflatex. A comment above says both.
     """
     groups = [(name, list(columns)) for name, columns in groupby(table.columns, key=lambda column: column.group)]
     doubled = dict(zip(map(id, table.columns), table.published_columns, strict=True))
@@ -127,7 +139,8 @@ def to_latex(table: Table) -> str:
         lines += [r"\midrule", *(_tex_row(_latex_cells(row, table)) for row in rows)]
     lines += [r"\bottomrule", r"\end{tabular}}"]
     lines += [r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {_tex_below(table)}}}"]
-    return "\n".join([*lines, r"\end{table*}"]) + "\n"
+    text = "\n".join([*lines, r"\end{table*}"]) + "\n"
+    return _tex_needs(text) + text
 
 
 def to_json(tables: Iterable[Table]) -> str:
@@ -212,10 +225,6 @@ def _markdown_rank(text: str, rank: int | None) -> str:
     return {1: f"**{text}**", 2: f"<u>{text}</u>"}.get(rank or 0, text)
 
 
-def _pipe(texts: Iterable[str]) -> str:
-    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
-
-
 def _cells(row: Row, table: Table) -> Iterator[tuple[Column, Cell, bool]]:
     """Each column with the row's cell, and whether it is doubled."""
     return zip(table.columns, row.cells, table.published_columns, strict=True)
@@ -282,11 +291,27 @@ _TEX = str.maketrans(
         "\N{MINUS SIGN}": r"$-$",
         "∞": r"$\infty$",
     }
+    | {chr(0x3B1 + i): rf"$\{name}$" if len(name) > 1 else f"${name}$" for i, name in enumerate(GREEK.split())}
+    | {chr(0x391 + i): rf"$\mathrm{{{name}}}$" for i, name in enumerate(GREEK_CAPITALS.split())}
 )
 
 
 def _tex(text: str) -> str:
-    return text.translate(_TEX).replace("--", "-{}-")
+    return unicodedata.normalize("NFC", text).translate(_TEX).replace("--", "-{}-")
+
+
+def _tex_needs(text: str) -> str:
+    """The comment above a table: what compiles it."""
+    lines = [r"% Needs \usepackage{booktabs,graphicx}."]
+    strange = sorted({character for character in text if _is_strange(character)})
+    if strange:
+        lines.append(f"% Needs lualatex or xelatex, and a font that has {' '.join(strange)}: pdflatex has not.")
+    return "\n".join(lines) + "\n"
+
+
+def _is_strange(character: str) -> bool:
+    """Whether pdflatex stops at a character, with the fonts that it takes where none is named."""
+    return character in TEX_LACKS or (ord(character) > LATIN and character not in TEX_HAS)
 
 
 def _tex_row(texts: Iterable[str]) -> str:

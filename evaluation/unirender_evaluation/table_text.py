@@ -1,11 +1,52 @@
-"""Tables of texts, for measurements whose rows are no systems of the benchmark: to a terminal and as Markdown."""
+"""Tables of texts, for measurements whose rows are no systems of the benchmark: to a terminal and as Markdown.
 
+And what all tables in Markdown need: a text that shows as it is (`plain_markdown`), and a row of a table.
+"""
+
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
+
+# What our own texts mark: code, and bold numbers with their intervals.
+OWN_MARKUP = re.compile(r"(?<!`)`[^`<>\\]+`(?!`)|\*\*[-+\d.,±∞% ]+\*\*")
+# What begins or ends markup where it stands: HTML, entities, emphasis, code, mathematics, links.
+MARKUP = re.compile(r"[`\\]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|[*~$](?=\S)|(?<![^\W_])_(?=\S)|\](?=[(\[])")
+BLOCK = re.compile(r"^(\d*)([-+*#>.)\[])")  # what makes a line a list, a heading, a quotation, a link's definition
+
+
+def plain_markdown(text: str, own: bool = False) -> str:
+    """Markdown that shows a text from outside as it is, on one line.
+
+    Characters that mark nothing where they stand are left: one * at the end of a name, the _ inside it.
+
+    Args:
+        text: a name, or a sentence.
+        own: code and bold numbers in it are ours and stay (`OWN_MARKUP`).
+    """
+    text = " ".join(text.split())
+    kept = [found.span() for found in OWN_MARKUP.finditer(text)] if own else []
+
+    def shown(found: re.Match[str]) -> str:
+        if any(first <= found.start() < last for first, last in kept):
+            return found[0]
+        return "&lt;" if found[0] == "<" else f"\\{found[0]}"
+
+    return MARKUP.sub(shown, text)
+
+
+def plain_paragraph(text: str) -> str:
+    """The same of a sentence of ours with names from outside, which begins a line: its code is kept."""
+    return BLOCK.sub(r"\1\\\2", plain_markdown(text, own=True))
+
+
+def markdown_row(texts: Iterable[str]) -> str:
+    """A row of a table; `texts` are Markdown."""
+    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
 
 
 @dataclass(frozen=True)
@@ -15,7 +56,7 @@ class TextTable:
     Attributes:
         title: what it shows.
         columns: headers; the first names the rows.
-        sections: groups of rows, each row one text for each column.
+        sections: groups of rows, each row one text for each column; code and bold numbers in them are marked up.
         notes: sentences below it.
     """
 
@@ -31,8 +72,10 @@ class TextTable:
 
     def markdown(self) -> str:
         """GitHub-flavoured; the first column to the left, numbers to the right."""
-        lines = [f"### {self.title}", "", _pipe(self.columns), _pipe((":--", *["--:"] * (len(self.columns) - 1)))]
-        lines += [_pipe(row) for section in self.sections for row in section]
+        lines = [f"### {self.title}", "", markdown_row(self.columns)]
+        lines += [markdown_row((":--", *["--:"] * (len(self.columns) - 1)))]
+        rows = [row for section in self.sections for row in section]
+        lines += [markdown_row(plain_markdown(text, own=True) for text in row) for row in rows]
         lines += [line for note in self.notes for line in ("", note)]
         return "\n".join(lines) + "\n"
 
@@ -48,7 +91,3 @@ class TextTable:
         console.print(table)
         for note in self.notes:
             console.print(note, style="dim", highlight=False, markup=False)
-
-
-def _pipe(texts: tuple[str, ...]) -> str:
-    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"

@@ -8,11 +8,25 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFont
 from tiny_suites import SIZE, make_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.figures import GAP, WIDEST, Grid, Line, Tile, cell_side, draw, folded, save
+from unirender_evaluation.figures import (
+    FONT,
+    GAP,
+    HEADING_LINES,
+    MARGIN,
+    WIDEST,
+    Grid,
+    Line,
+    Tile,
+    _headings,
+    cell_side,
+    draw,
+    folded,
+    save,
+)
 from unirender_evaluation.figures_command import Figures, default_scenes, labels
 from unirender_evaluation.figures_light import light_figure
 from unirender_evaluation.figures_overview import MAPS, overview
@@ -111,6 +125,43 @@ def test_a_folded_grid_shows_every_tile_below_the_first_ones_in_the_same_columns
     assert tops[1, 0] >= tops[0, 0] + 128
     assert lefts[0].tolist() == lefts[1].tolist()
     assert (np.diff(lefts[0]) == 128 + GAP).all()
+
+
+LONG = ("my_inverse_renderer_without_light", "my_inverse_renderer_with_light")
+
+
+def headings(*columns: str) -> np.ndarray:
+    """What is drawn above the pictures of these columns, in darkness; 0 is white."""
+    black = tuple(Tile(colour(0)) for _ in columns)
+    sheet = np.asarray(draw(Grid(columns, (Line("", black),))).convert("L"))
+    top = int(np.argmax((sheet == 0).sum(axis=1) >= 128 * len(columns)))
+    return 255 - sheet[:top].astype(int)
+
+
+def test_long_names_of_columns_are_whole_differ_and_keep_apart() -> None:
+    font = ImageFont.load_default(FONT)
+    found = _headings(("input", *LONG), font, 128)
+    assert [" ".join(lines).replace("_ ", "_") for lines in found] == ["input", *LONG]
+    assert all(font.getlength(line) <= 128 for lines in found for line in lines)
+    assert max(map(len, found)) <= HEADING_LINES
+    drawn, short = headings(*LONG), headings("one", "two")
+    assert drawn.shape[0] > short.shape[0], "the pictures stand below all lines"
+    left = 2 * MARGIN
+    assert drawn[:, left - 1 : left + 128 + GAP + 128 + 1].any()
+    assert not drawn[:, left + 129 : left + 128 + GAP - 1].any(), "a margin between two names"
+
+
+def test_a_name_that_is_too_long_loses_its_middle_but_not_what_tells_it_apart() -> None:
+    font = ImageFont.load_default(FONT)
+    (first, last) = _headings([f"{'long_' * 30}{end}" for end in ("first", "last")], font, 128)
+    assert len(first) == len(last) == HEADING_LINES
+    assert "..." in "".join(first)
+    assert "".join(first).endswith("_first")
+    assert "".join(last).endswith("_last")
+    middle = [f"{'x' * 60}{letter}{'x' * 60}" for letter in "ab"]
+    assert len(set(map(tuple, _headings(middle, font, 128)))) == 2
+    same = _headings([middle[0], f" {middle[0]}"], font, 128)
+    assert same[0] == same[1], "names that look alike whole are no reason to go on"
 
 
 def test_a_grid_with_a_row_of_another_length_or_nothing_in_it_is_refused() -> None:

@@ -80,6 +80,43 @@ def test_rivals_of_one_name_stand_side_by_side(by: float) -> None:
     assert [row.cells[0].measured_rank for row in rows] == [2, 1]
 
 
+def noted(note: str, objects: tuple[str, ...], source: str) -> Results:
+    """A file whose first row has this note, and records of these objects alone."""
+    full = small_results(source)
+    infos = (replace(METHODS[0], note=note), *METHODS[1:])
+    records = tuple(r for r in full.records if r.method != "ours-mean" or r.object in objects)
+    return replace(full, run=replace(full.run, methods=infos), records=records)
+
+
+EVERY = ("ball-0", "ball-1")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "note"),
+    [
+        (("fast; 1 scenes only", EVERY[:1]), ("fast; 4 scenes only", EVERY), "fast; 4 scenes only"),
+        (("fast; 4 scenes only", EVERY), ("fast; 1 scene only", EVERY[:1]), "fast; 4 scenes only"),
+        (("fast; 1 scene only", EVERY[:1]), ("fast", EVERY), "fast"),
+        (("fast; 2 scenes only", EVERY[:1]), ("fast; 3 scenes only", EVERY[1:]), "fast"),
+        (("1 scene only", EVERY[:1]), ("1 scene only", EVERY[1:]), ""),
+        (("fast; 1 scene only", EVERY[:1]), ("", ()), "fast; 1 scene only"),
+    ],
+)
+def test_a_row_from_two_files_says_no_count_of_one_of_them(
+    first: tuple[str, tuple[str, ...]], second: tuple[str, tuple[str, ...]], note: str
+) -> None:
+    run, _ = merge([noted(*first, "a.json"), noted(*second, "b.json")])
+    assert run.method("ours-mean").note == note
+
+
+def test_what_both_files_say_of_each_scenes_pictures_stays() -> None:
+    said = "inverse: 2 pictures of each scene only"
+    halves = [noted(f"3 scenes only; {said}", (name,), f"{name}.json") for name in EVERY]
+    assert merge(halves)[0].method("ours-mean").note == said
+    other = noted(f"3 scenes only; {said.replace('2', '1')}", EVERY[1:], "b.json")
+    assert merge([halves[0], other])[0].method("ours-mean").note == ""
+
+
 def test_a_value_that_only_one_file_has_is_kept() -> None:
     """One run had the weights of LPIPS, the other had not: merged either way, the number is there."""
     lpips = metric_key("albedo", "lpips_alex")

@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from small_results import RUN, small_document, small_records, small_results, wri
 from unirender.errors import UnirenderError
 from unirender_evaluation.records import write_records, write_run
 from unirender_evaluation.results_check import content_problems, remarks
-from unirender_evaluation.results_data import definitions
+from unirender_evaluation.results_data import Results, definitions
 from unirender_evaluation.results_file import from_document, read_results, write_results
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites import Scene, load_suite
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 
 PSNR = "albedo.psnr@masked-srgb-raw"
@@ -191,7 +191,7 @@ def test_a_metrics_name_means_one_thing_in_all_tables() -> None:
 def test_samples_are_looked_up_in_the_suite_that_is_installed() -> None:
     suite = load_suite("tiny")
     scene, other = suite.scenes[0], suite.scenes[-1]
-    base = small_results(suite="tiny", suite_hash=suite.sha256)
+    base = small_results(suite="tiny", suite_hash=suite.sha256, resolution=suite.spec.resolution)
 
     def at(sample: str, owner: str) -> list[str]:
         records = (replace(base.records[0], sample=sample, object=owner),)
@@ -203,6 +203,39 @@ def test_samples_are_looked_up_in_the_suite_that_is_installed() -> None:
     assert "is of another object than" in at(f"{scene.key}_m010_r030", other.object)[0]
     elsewhere = remarks(small_results(suite="tiny"))
     assert "is not the one installed here" in elsewhere[0]
+
+
+def of_tiny(scenes: Mapping[str, Sequence[Scene]], **changes: Any) -> Results:
+    """Results of suite tiny: for each row the scenes that it has a record of; `changes` are fields of the run."""
+    suite = load_suite("tiny")
+    facts = {"suite": "tiny", "suite_hash": suite.sha256, "resolution": suite.spec.resolution} | changes
+    base = small_results(methods=tuple(scenes), **facts)
+    records = tuple(
+        replace(base.records[0], method=method, sample=f"{scene.key}_m010_r030", object=scene.object)
+        for method, shown in scenes.items()
+        for scene in shown
+    )
+    return replace(base, records=records, definitions=definitions(records))
+
+
+def test_pictures_of_another_size_than_the_suites_are_refused() -> None:
+    scenes = {"ours-mean": load_suite("tiny").scenes}
+    assert content_problems(of_tiny(scenes)) == []
+    problems = [str(problem) for problem in content_problems(of_tiny(scenes, resolution=128))]
+    assert problems == ["run.resolution: got 128, expected 64: suite 'tiny' has pictures of that size"]
+    assert content_problems(of_tiny(scenes, resolution=128, suite_hash="f" * 64)) == [], "somebody's own suite"
+
+
+def test_a_reader_hears_of_a_partial_run_that_does_not_say_so() -> None:
+    scenes = load_suite("tiny").scenes
+    two = {"ours-mean": scenes[:2], "input-as-albedo": scenes[1:2]}
+    assert remarks(of_tiny(two)) == ["records of 2 of 48 scenes, though the run says that it is whole"]
+    assert remarks(of_tiny(two, limit=2)) == ["a partial run (--limit 2): its tables carry a watermark"]
+    assert not any("though" in line for line in remarks(of_tiny(two, suite_hash="f" * 64)))
+    assert remarks(of_tiny({**two, "input-as-albedo": scenes})) == [], "a folder may have predictions of a part"
+    objects = of_tiny({"ours-mean": scenes[:1]})
+    objects = replace(objects, records=tuple(replace(r, sample=r.object) for r in objects.records))
+    assert remarks(objects) == [], "records of objects say nothing of scenes"
 
 
 def test_the_file_is_named_as_it_was_given(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from functools import partial
 from io import StringIO
 
 import pytest
+from markdown_it import MarkdownIt
 from rich.console import Console
 
 from unirender.errors import UnirenderError
@@ -19,6 +20,7 @@ from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
 from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+from unirender_evaluation.table_text import TextTable, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
 
 METHODS = (
@@ -308,6 +310,97 @@ def test_latex_is_balanced_booktabs() -> None:
     assert text.count("{") == text.count("}")
     assert r"\textbf{26.15} {\scriptsize $\pm$" in text
     assert not re.search(r"[±†·∞↑↓]", text)
+
+
+def named(label: str, note: str = "") -> Table:
+    """The masked inverse table of one stranger's row."""
+    records = [replace(record, method="theirs") for record in inverse("ours")]
+    run = replace(RUN, methods=(MethodInfo("theirs", label, "external", note=note),))
+    return build_table(TABLES["inverse"], records, run, protocol="single-image")
+
+
+HARD = [
+    "<b>bold</b>", "*a*", "**a**", "_x_", "a_b_c", "`code`", "a ` b", "[text](http://a.b)", "![i](x)", "[a][b]",
+    "[Uni]", "a*", "2 * 3 * 4", "<script>alert(1)</script>", "<!-- a -->", "a < b > c", "&lt;", "AT&T", "&amp;amp;",
+    "a|b", r"a\|b", r"a\*b*", "C:\\", "~~gone~~", "$x$ and $y$", "<http://a.b>", "__a__", "*`a`*", "``a``",
+]  # fmt: skip
+BEGINNINGS = ["# a", "- a", "+ a", "* a", "1. a", "2) a", "> a", "[a]", "~~~", "---", "***", "```"]
+
+
+def rendered(text: str, **enabled: bool) -> list[tuple[str, list[str]]]:
+    """(Type, types of its parts with their text) of each inline block, read by another implementation of Markdown."""
+    tokens = MarkdownIt("commonmark", {"html": True}).enable(["table", "strikethrough"]).parse(text)
+    return [
+        (tokens[i - 1].type, [f"{part.type}: {part.content}" for part in token.children or ()])
+        for i, token in enumerate(tokens)
+        if token.type == "inline"
+    ]
+
+
+@pytest.mark.parametrize("name", HARD + BEGINNINGS)
+def test_a_strangers_name_and_note_are_text_in_markdown(name: str) -> None:
+    """As they were given, in the row's cell and in the note below, with nothing marked up in either."""
+    blocks = rendered(to_markdown(named(name, note=f"of {name}")))
+    cells = [parts for kind, parts in blocks if kind == "td_open"]
+    assert "".join(part.removeprefix("text: ") for part in cells[0]) == name
+    if "`" not in name:  # code in a sentence is kept, since our own sentences have it
+        (note,) = [parts for kind, parts in blocks if kind == "paragraph_open" and f"of {name}" in flat(parts)]
+        assert flat(note) == f"{name}: of {name}"
+    assert not {kind for kind, _ in blocks} - {"td_open", "th_open", "paragraph_open", "heading_open"}
+    assert sum(kind == "heading_open" for kind, _ in blocks) == 1
+
+
+def flat(parts: list[str]) -> str:
+    """The text; empty where something is marked up."""
+    return "".join(p.removeprefix("text: ") for p in parts) if all(p.startswith("text: ") for p in parts) else ""
+
+
+@pytest.mark.parametrize("name", ["<b>bold</b>", "*a*", "_x_", "`code`", "[text](http://a.b)", "&lt;", "~~gone~~"])
+def test_what_is_not_escaped_is_marked_up(name: str) -> None:
+    """The twin: the other implementation does notice."""
+    ((_, parts),) = rendered(name)
+    assert flat(parts) != name
+
+
+def test_our_own_names_and_sentences_are_left_as_they_are() -> None:
+    text = to_markdown(table())
+    assert "| InPix2Pix* |" in to_markdown(
+        build_table(
+            TABLES["rendering"],
+            [replace(r, table="rendering", protocol="from-image") for r in RECORDS],
+            RUN,
+            protocol="from-image",
+            variant=Variant("whole"),
+        )
+    )
+    assert "| Ours (mean) [Uni-Renderer] |" in text
+    ours = "see `unirender bench physics`, my_method (roughness >= 0.3)"
+    assert plain_paragraph(ours) == ours
+    line = TextTable("t", ("a", "b"), (((r"<b>|`transport.rounds = 0`", "27.50 (**-2.12 ± 1.83**)"),),)).markdown()
+    assert line.splitlines()[4] == r"| &lt;b>\|`transport.rounds = 0` | 27.50 (**-2.12 ± 1.83**) |"
+
+
+def test_a_name_on_two_lines_is_one_row() -> None:
+    lines = [line for line in to_markdown(named("two\nlines")).splitlines() if line.startswith("|")]
+    assert len(lines) == 3
+    assert lines[2].startswith("| two lines |")
+
+
+def test_latex_says_what_it_needs() -> None:
+    text = to_latex(table())
+    assert text.splitlines()[0] == r"% Needs \usepackage{booktabs,graphicx}."
+    assert text.splitlines()[1].startswith(r"\begin{table*}")
+    for label in ("λ-Net", "Αθηνα", "Müller", "e\u0301cole", "\u201cx\u201d"):
+        assert "lualatex" not in to_latex(named(label)), label
+    greek = to_latex(named("λ-Net, Ω"))
+    assert r"$\lambda$-Net, $\mathrm{\Omega}$" in greek
+    assert greek.isascii() or set(re.sub(r"[\x00-\x7f]", "", greek)) <= {"é"}
+
+
+@pytest.mark.parametrize("letters", ["東京", "Ж", "Đ", "ή"])
+def test_latex_says_which_letters_pdflatex_has_not(letters: str) -> None:
+    line = to_latex(named(f"a {letters} b")).splitlines()[1]
+    assert line == f"% Needs lualatex or xelatex, and a font that has {' '.join(sorted(letters))}: pdflatex has not."
 
 
 def test_json_is_strict_and_whole() -> None:
