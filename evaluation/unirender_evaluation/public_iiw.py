@@ -85,14 +85,16 @@ def read_judgements(path: Path) -> list[Judgement]:
     """The judgements of a file that count.
 
     Raises:
-        UnirenderError: no readable file, or another layout.
+        UnirenderError: no readable file, another layout, or a value out of its range (`judgements`).
     """
     expected = "expected IIW's intrinsic_points and intrinsic_comparisons"
     try:
         return judgements(json.loads(path.read_text(encoding="utf-8")))
+    except UnirenderError as error:
+        raise UnirenderError(f"{path}: {error}") from None
     except OSError as error:
         raise UnirenderError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
     except KeyError as error:
         raise UnirenderError(f"{path}: {error} is missing, {expected}") from None
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise UnirenderError(f"{path}: not readable ({error}), {expected}") from None

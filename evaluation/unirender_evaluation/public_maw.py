@@ -32,6 +32,7 @@ from unirender_evaluation.specs import Column, TableSpec
 NAME = "maw"
 LAYOUT = "MAW's folders labels (with meta.csv) and images_png"
 COLUMNS = 6
+RANGE_TOLERANCE = 1e-3  # of measured colours
 SIZE = (320, 240)  # width and height at which albedo and mask are compared
 
 
@@ -62,7 +63,7 @@ class Maw(Scenes):
         need_folder(self.folder, self.name, LAYOUT)
         meta = self.folder / "labels" / "meta.csv"
         try:
-            rows = list(csv.reader(meta.read_text(encoding="utf-8").splitlines(), delimiter="\t"))
+            rows = list(csv.reader(meta.read_text(encoding="utf-8-sig").splitlines(), delimiter="\t"))
         except (OSError, UnicodeDecodeError) as error:
             raise PublicSetError(self.name, [f"{meta}: cannot be read ({error}), expected {LAYOUT}"]) from error
         found, problems = [], []
@@ -135,15 +136,23 @@ def adobe_to_rec709() -> Float[np.ndarray, "3 3"]:
 def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integer[np.ndarray, "h w"]]:
     """The measured colours, linear Rec.709 in [0, 1], and the labels of the pixels that have them.
 
+    Adobe RGB has colours outside Rec.709: what leaves [0, 1] on the way is clipped.
+
     Raises:
-        UnirenderError: a file is broken, or they do not fit together.
+        UnirenderError: a file is broken, a stored colour lies outside [0, 1], or the files do not fit together.
     """
     try:
         adobe = np.load(colours, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise UnirenderError(f"{colours}: not a readable NumPy array ({error})") from error
+    if not isinstance(adobe, np.ndarray):
+        raise UnirenderError(f"{colours}: is an archive of arrays, expected one array of (k, 3)")
     if adobe.ndim != 2 or adobe.shape[1] != 3 or adobe.dtype.kind not in "fiu" or not np.isfinite(adobe).all():
         raise UnirenderError(f"{colours}: got {adobe.dtype} of {adobe.shape}, expected finite numbers of (k, 3)")
+    if adobe.size and (adobe.min() < -RANGE_TOLERANCE or adobe.max() > 1 + RANGE_TOLERANCE):
+        raise UnirenderError(
+            f"{colours}: has values from {adobe.min():g} to {adobe.max():g}, expected linear colours from 0 to 1"
+        )
     try:
         with Image.open(mask) as picture:
             labels = np.asarray(picture)
@@ -156,7 +165,7 @@ def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integ
         raise UnirenderError(
             f"{mask}: has {count} labels beside 0, expected {len(adobe)} as {colours.name} has colours"
         )
-    return np.clip(adobe.astype(np.float64) @ adobe_to_rec709().T, 0, 1), labels
+    return np.clip(np.clip(adobe.astype(np.float64), 0, 1) @ adobe_to_rec709().T, 0, 1), labels
 
 
 def kinds(labels: Integer[np.ndarray, "h w"]) -> list[int]:

@@ -12,6 +12,7 @@ They differ from `metrics` on purpose: PSNR-H and PSNR-L divide by the whole fra
 """
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from jaxtyping import Float, Integer
 from scipy.ndimage import binary_erosion, correlate1d
 
 from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000
 
 ERODED = 5  # pixels, side of the square by which Stanford-ORB shrinks its masks
@@ -168,16 +170,43 @@ def judgements(content: Mapping[str, Any]) -> list[Judgement]:
 
     Raises:
         KeyError, TypeError, ValueError: the content has another layout.
+        UnirenderError: a point lies outside the photograph, `opaque` is neither true nor false nor null (not known), or
+            the weight of a judgement that would count is negative or not finite.
     """
-    points = {point["id"]: point for point in content["intrinsic_points"]}
+    points = {point["id"]: _point(point) for point in content["intrinsic_points"]}
     found = []
-    for entry in content["intrinsic_comparisons"]:
-        pair = points[entry["point1"]], points[entry["point2"]]
+    for number, entry in enumerate(content["intrinsic_comparisons"]):
+        (first, first_opaque), (second, second_opaque) = points[entry["point1"]], points[entry["point2"]]
         weight = entry["darker_score"]
-        if entry["darker"] in ("1", "2", "E") and weight is not None and weight > 0 and all(p["opaque"] for p in pair):
-            first, second = ((float(p["x"]), float(p["y"])) for p in pair)
+        if entry["darker"] not in ("1", "2", "E") or weight is None or not (first_opaque and second_opaque):
+            continue
+        if not _in_range(weight, sys.float_info.max):
+            raise UnirenderError(
+                f"intrinsic_comparisons[{number}]: darker_score is {weight!r}, expected a finite number >= 0"
+            )
+        if weight > 0:
             found.append(Judgement(first, second, entry["darker"], float(weight)))
     return found
+
+
+def _point(entry: Mapping[str, Any]) -> tuple[tuple[float, float], bool]:
+    """Where a point of an IIW file is, and whether it is known to be opaque."""
+    for axis, side in (("x", "width"), ("y", "height")):
+        if not _in_range(entry[axis], 1):
+            raise UnirenderError(
+                f"intrinsic_points, id {entry['id']}: {axis} is {entry[axis]!r}, expected a fraction of the {side}, 0 "
+                "to 1"
+            )
+    if entry["opaque"] is not None and not isinstance(entry["opaque"], bool):
+        raise UnirenderError(
+            f"intrinsic_points, id {entry['id']}: opaque is {entry['opaque']!r}, expected true, false or null"
+        )
+    return (float(entry["x"]), float(entry["y"])), entry["opaque"] is True
+
+
+def _in_range(value: Any, most: float) -> bool:
+    """Whether a value of a JSON file is a number from 0 to `most`; NaN is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= most
 
 
 def whdr(albedo_linear: Rgb, judged: Sequence[Judgement], delta: float = DELTA) -> dict[str, float]:

@@ -159,7 +159,7 @@ class StanfordOrb:
         full = read_display(frame.mask(self.folder), 1)
         if full.shape[:2] != linear.shape[:2]:
             raise UnirenderError(
-                f"{frame.mask(self.folder)}: is of {full.shape[:2]} pixels, expected {linear.shape[:2]}"
+                f"{frame.mask(self.folder)}: is {_size(full)} pixels, expected {_size(linear)} as its photograph {path}"
             )
         picture = quantise(block_mean(linear * full, self.resolution, str(path)), mask)
         found: dict[str, Any] = {"image_srgb": picture, "mask": mask, "camera": frame.camera(*mask.shape[:2])}
@@ -179,24 +179,52 @@ class StanfordOrb:
             frame = self._relit[sample.key][1]
             if answer.image is None:
                 return {}
-            path = frame.photo(self.folder, HDR)
-            truth = block_mean(read_radiance(path), self.resolution, str(path))
-            return scoring.score_relit(answer.image, truth, self._mask(frame), lpips)
+            mask, path = self._mask(frame), frame.photo(self.folder, HDR)
+            truth = self._reduced(read_radiance(path), path, frame)
+            return scoring.score_relit(answer.image, truth, mask, lpips)
         frame = self._tests[sample.key]
-        truths = {name: self._truth(name, path) for name, path in frame_truths(self.folder, frame).items()}
-        return scoring.score_maps(answer, truths, self._mask(frame), lpips)
+        mask = self._mask(frame)
+        found = frame_truths(self.folder, frame)
+        truths = {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
+        return scoring.score_maps(answer, truths, mask, lpips)
 
     def _mask(self, frame: Frame) -> Float[np.ndarray, "h w 1"]:
         path = frame.mask(self.folder)
-        mask = block_mean(read_display(path, 1), self.resolution, str(path))
+        full = read_display(path, 1)
+        if full.shape[0] != full.shape[1]:
+            raise UnirenderError(f"{path}: is {_size(full)} pixels, expected a square, as all pictures of the set are")
+        mask = block_mean(full, self.resolution, str(path))
         if not eroded(mask).any():
             raise UnirenderError(f"{path}: shows no object that is larger than the edge which is left out")
         return mask
 
-    def _truth(self, name: str, path: Path) -> Float[np.ndarray, "h w c"]:
+    def _reduced(self, value: Float[np.ndarray, "h w c"], path: Path, frame: Frame) -> Float[np.ndarray, "h2 w2 c"]:
+        """A map at the run's resolution, which has to be a square like the mask of its frame."""
+        if value.shape[0] != value.shape[1]:
+            raise UnirenderError(
+                f"{path}: is {_size(value)} pixels, expected a square like its mask {frame.mask(self.folder)}"
+            )
+        return block_mean(value, self.resolution, str(path))
+
+    def _truth(
+        self, name: str, path: Path, frame: Frame, counted: Float[np.ndarray, "h w 1"]
+    ) -> Float[np.ndarray, "h w c"]:
+        """A map of the truth, with a look at the values that count: those of the eroded mask."""
         if path.suffix == ".png":
-            return srgb_decode(block_mean(read_display(path, 3), self.resolution, str(path)))
-        return block_mean(read_array(path, 1 if name == "depth" else 3), self.resolution, str(path))
+            return srgb_decode(self._reduced(read_display(path, 3), path, frame))
+        found = self._reduced(read_array(path, 1 if name == "depth" else 3), path, frame)
+        scoring.check_truth(name, found[counted[..., 0] > 0], str(path))
+        return found
+
+    def why_absent(self, table: str) -> str | None:
+        """How many photographs could be relit by a method, where it is none."""
+        relit = [sample for sample in self.samples() if sample.asks == "relight"]
+        if table != scoring.RELIT_TABLE.name or not relit or any(sample.one_picture for sample in relit):
+            return None
+        return (
+            f"relighting: 0 of {len(relit)} photographs were taken from within {self.tolerance_deg:g} degrees of a "
+            "photograph of the capture that is relit; see --tolerance-deg"
+        )
 
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs: what exactly the table of that name measures."""
@@ -219,6 +247,10 @@ class StanfordOrb:
             *shared,
             *scoring.ABOUT_RELIT,
         )
+
+
+def _size(value: Float[np.ndarray, "h w c"]) -> str:
+    return f"{value.shape[1]} x {value.shape[0]}"
 
 
 def _relight_name(frame: Frame) -> str:

@@ -16,6 +16,7 @@ from unirender.errors import UnirenderError
 
 LDR, HDR, TRUTH = "blender_LDR", "blender_HDR", "ground_truth"
 # `teapot_scene001`, and as the evaluation code names them `scene001_obj018_teapot`
+ROTATION_TOLERANCE = 1e-3
 NAMES = (re.compile(r"(?P<object>.+)_scene\d+"), re.compile(r"scene\d+_(?P<object>.+)"))
 
 
@@ -125,17 +126,19 @@ def read_frames(path: Path, capture: str) -> tuple[Frame, ...]:
     """The frames of a transforms_*.json.
 
     Raises:
-        UnirenderError: no readable file, or another layout.
+        UnirenderError: no readable file, another layout, or a pose that is no rotation and position.
     """
     expected = "expected frames with file_path and a 4 x 4 transform_matrix, and camera_angle_x in radians"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         return tuple(_frame(entry, content, capture) for entry in content["frames"])
+    except UnirenderError as error:
+        raise UnirenderError(f"{path}: {error}") from None
     except OSError as error:
         raise UnirenderError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
     except KeyError as error:
         raise UnirenderError(f"{path}: {error} is missing, {expected}") from None
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:
         raise UnirenderError(f"{path}: not readable ({error}), {expected}") from None
 
 
@@ -147,6 +150,12 @@ def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Fram
     if not 0 < angle < math.pi:
         raise ValueError(f"camera_angle_x {angle:g}")
     file = PurePosixPath(entry["file_path"])
+    turn = pose[:3, :3]
+    if not (np.abs(turn.T @ turn - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(turn) > 0):
+        raise UnirenderError(
+            f"frame {file}: the transform_matrix is no rotation and position, expected camera to world without scale "
+            "(else divide the first three columns by their lengths) or mirroring"
+        )
     rows = tuple(tuple(float(x) for x in row) for row in pose)
     return Frame(str(entry.get("scene_name", capture)), file.parent.name, file.stem, angle, rows)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Metric, Scale, Variant, metric_key
 from unirender_evaluation.public_metrics import (
@@ -35,6 +36,9 @@ from unirender_evaluation.specs import Column, TableSpec
 
 SCALES: Mapping[Scale, str] = {"aligned_rgb": "scaled", "raw": "raw"}
 FLOORED = "_floored"  # behind a PSNR's name: 1 where its value is the benchmark's floor
+RANGE_TOLERANCE = 1e-3  # of a stored albedo
+LENGTH_TOLERANCE = 0.1  # of stored normals: means over blocks are a little shorter
+MOST_OFF = 0.1  # share of the object whose normals may have another length: a scan has holes
 Rgb = Float[np.ndarray, "h w 3"]
 OneMask = Float[np.ndarray, "h w 1"]
 
@@ -82,6 +86,31 @@ ABOUT_RELIT = (
     ("PSNR-L", "clipped at 1, sRGB; mean over the frame, peak 1"),
     ("LPIPS", "v0.1, whole frame, of pictures encoded to sRGB twice, as the benchmark's code does"),
 )
+
+
+def check_truth(name: str, inside: Float[np.ndarray, "n c"], source: str) -> None:
+    """Looks whether a stored map is in its unit where it counts.
+
+    Args:
+        name: "normal", "albedo" or "depth", which has none.
+        inside: its values in the eroded mask.
+        source: the file, for the message.
+
+    Raises:
+        UnirenderError: an albedo leaves [0, 1], or more than a tenth of the normals are no unit vectors.
+    """
+    if name == "albedo" and (inside.min() < -RANGE_TOLERANCE or inside.max() > 1 + RANGE_TOLERANCE):
+        raise UnirenderError(
+            f"{source}: the albedo reaches from {inside.min():g} to {inside.max():g} on the object, expected linear "
+            "values from 0 to 1"
+        )
+    if name == "normal":
+        off = float((np.abs(np.linalg.norm(inside, axis=-1) - 1) > LENGTH_TOLERANCE).mean())
+        if off > MOST_OFF:
+            raise UnirenderError(
+                f"{source}: {off:.0%} of the object's normals have another length than 1, expected unit vectors in "
+                "camera axes (not (n + 1) / 2)"
+            )
 
 
 def score_relit(p: Rgb, t: Rgb, mask: OneMask, lpips: Sequence[Lpips]) -> dict[str, float]:

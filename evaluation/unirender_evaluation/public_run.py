@@ -133,6 +133,9 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     replace_file(what.out / "tables.json", to_json(tables))
     for table in tables:
         print_table(console, table)
+    absent = [spec.name for spec in what.public.tables if spec.name not in {record.table for record in records}]
+    for line in filter(None, map(what.public.why_absent, absent)):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print(f"{computed} new records of {len(records)}; {what.out / 'tables.md'}, .tex, .json", highlight=False)
     return PublicResult(tuple(records), tuple(tables), missing, computed)
 

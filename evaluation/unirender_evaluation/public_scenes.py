@@ -41,6 +41,10 @@ class Scenes:
         """Every photograph counts."""
         return sample
 
+    def why_absent(self, table: str) -> str | None:
+        """There is always something to ask."""
+        return None
+
     def about_scenes(self) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs for the protocol line."""
         return (

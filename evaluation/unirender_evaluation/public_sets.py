@@ -126,6 +126,10 @@ class PublicSet(Protocol):
         """What of `averaged_first` the sample of that key belongs to; the key itself where there is nothing."""
         ...
 
+    def why_absent(self, table: str) -> str | None:
+        """One line for the user where nothing could be asked for the table of that name; None where something could."""
+        ...
+
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs: what exactly the table of that name measures."""
         ...
@@ -169,10 +173,10 @@ def read_display(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
 
 
 def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
-    """A map of a NumPy file, `[h w]` or `[h w c]`.
+    """A map of a NumPy file, `[h w]` or `[h w c]`, of floating-point values.
 
     Raises:
-        UnirenderError: no such array, another number of channels, or values that are not finite.
+        UnirenderError: no such array, another number of channels, integers, or values that are not finite.
     """
     try:
         found = np.load(path, allow_pickle=False)
@@ -182,6 +186,11 @@ def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
     if getattr(value, "ndim", 0) != 3 or value.shape[-1] != channels or value.dtype.kind not in "fiu":
         shape = getattr(found, "shape", type(found).__name__)
         raise UnirenderError(f"{path}: got an array of {shape}, expected numbers of (h, w, {channels})")
+    if value.dtype.kind != "f":
+        raise UnirenderError(
+            f"{path}: got integers ({value.dtype}) of {found.shape}, expected floating-point values in the map's own "
+            "unit"
+        )
     if not np.isfinite(value).all():
         raise UnirenderError(f"{path}: has NaN or infinite values, expected finite ones")
     return value.astype(np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from unirender.color import srgb_encode
+from unirender.errors import UnirenderError
 from unirender_evaluation.public_metrics import (
     Judgement,
     channel_factors,
@@ -162,6 +163,38 @@ def test_only_decided_opaque_judgements_with_a_weight_count() -> None:
         ],
     }
     assert judgements(content) == [Judgement((0.5, 0.5), (0.5, 0.5), "1", 0.5)]
+
+
+def changed_judgements(point: dict, weight: object = 1.0, opaque_points: bool = True) -> dict:
+    """A file of one judgement, its first point changed."""
+    points = [{"id": i, "x": 0.5, "y": 0.5, "opaque": opaque_points} for i in range(2)]
+    points[0] |= point
+    pairs = [{"point1": 0, "point2": 1, "darker": "1", "darker_score": weight}]
+    return {"intrinsic_points": points, "intrinsic_comparisons": pairs}
+
+
+@pytest.mark.parametrize(
+    "value", [-0.01, 1.01, 40.0, math.nan, math.inf, "0.5", None, True, pytest.param(10**400, id="huge")]
+)
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_point_outside_its_photograph_is_refused(axis: str, value: object) -> None:
+    with pytest.raises(UnirenderError, match=rf"^intrinsic_points, id 0: {axis} is .*, expected a fraction"):
+        judgements(changed_judgements({axis: value}))
+    assert len(judgements(changed_judgements({axis: 1}))) == len(judgements(changed_judgements({axis: 0}))) == 1
+
+
+@pytest.mark.parametrize("weight", [math.inf, math.nan, -1.0, "2.0", True, pytest.param(10**400, id="huge")])
+def test_a_weight_that_cannot_be_summed_is_refused(weight: object) -> None:
+    with pytest.raises(UnirenderError, match=r"^intrinsic_comparisons\[0\]: darker_score is .* finite number >= 0$"):
+        judgements(changed_judgements({}, weight))
+    assert judgements(changed_judgements({}, weight, opaque_points=False)) == []  # it would not count
+
+
+@pytest.mark.parametrize("opaque", ["false", "true", 0, 1, []])
+def test_opaque_is_true_or_false(opaque: object) -> None:
+    with pytest.raises(UnirenderError, match=r"^intrinsic_points, id 0: opaque is .*, expected true, false or null$"):
+        judgements(changed_judgements({"opaque": opaque}))
+    assert judgements(changed_judgements({"opaque": None})) == judgements(changed_judgements({"opaque": False})) == []
 
 
 def test_intensity_by_hand() -> None:

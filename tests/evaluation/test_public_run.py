@@ -113,6 +113,31 @@ def test_every_module_that_measures_is_in_the_keys(public: type) -> None:
     assert set(re.findall(r"unirender_evaluation(?:\.| import )(public_\w+)", text)) <= named
 
 
+def test_a_table_that_nothing_can_be_asked_for_is_explained(tmp_path: Path) -> None:
+    """The relighting of Stanford-ORB, where no photograph is from nearly the other's camera."""
+    folder = make_orb(tmp_path / "orb")
+    path = folder / "blender_LDR/cup_scene001/transforms_test.json"
+    path.write_text(path.read_text().replace("0.6", "0.8"))  # another field of view
+    said = {}
+    for degrees in (2.0, 60.0):
+        orb, console = StanfordOrb(folder, 32, degrees), Console(file=io.StringIO(), width=200)
+        rows = tuple(plugin_rows([Plugin(Ramp(), "test")]))
+        what = PublicRun(
+            orb, rows, tmp_path / f"out-{degrees}", None, (), Versions("test", {"model": "1", "lpips": "1"})
+        )
+        result = run(what, console)
+        assert isinstance(console.file, io.StringIO)
+        said[degrees] = (len(result.tables), console.file.getvalue())
+    line = (
+        "relighting: 0 of 2 photographs were taken from within 2 degrees of a photograph of the capture that is relit; "
+        "see --tolerance-deg\n"
+    )
+    assert (said[2.0][0], line in said[2.0][1]) == (1, True)
+    assert (said[60.0][0], "relighting: 0 of" in said[60.0][1]) == (2, False)
+    (folder / "blender_LDR/cup_scene001/transforms_novel.json").unlink()
+    assert StanfordOrb(folder, 32).why_absent("stanford-orb-relighting") is None  # nothing is asked of anybody
+
+
 def test_a_limit_is_a_watermark(tmp_path: Path) -> None:
     iiw = Iiw(make_iiw(tmp_path / "iiw"))
     result = done(iiw, trivial_rows(iiw), tmp_path / "out", limit=1)

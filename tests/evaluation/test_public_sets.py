@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, sample_environment
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public_iiw import Iiw
-from unirender_evaluation.public_maw import Maw, adobe_to_rec709
+from unirender_evaluation.public_maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public_metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
 from unirender_evaluation.public_orb import StanfordOrb, contract_environment
 from unirender_evaluation.public_orb_frames import Frame, difference_deg, object_of
@@ -162,6 +163,114 @@ def test_orb_refuses_broken_files_and_sizes(orb: StanfordOrb) -> None:
         orb.score(sample, Answer(), ())
 
 
+@pytest.mark.parametrize("width", [32, 64])
+@pytest.mark.parametrize(
+    ("kind", "stored", "message"),
+    [
+        ("pseudo_gt_albedo", lambda n: np.full(n.shape, 200, np.uint8), r"got integers \(uint8\) of \(64, 64, 3\)"),
+        ("pseudo_gt_albedo", lambda n: np.full(n.shape, 200.0), "the albedo reaches from 200 to 200 on the object"),
+        ("pseudo_gt_albedo", lambda n: np.full(n.shape, -0.1), "the albedo reaches from -0.1 to -0.1"),
+        ("surface_normal", lambda n: (n + 1) / 2, r"% of the object's normals have another length than 1"),
+        ("surface_normal", lambda n: 0 * n, "100% of the object's normals"),
+        ("surface_normal", lambda n: np.round(127 * n).astype(np.int8), r"got integers \(int8\)"),
+        ("z_depth", lambda n: np.full(n.shape[:2], 3000, np.uint16), r"got integers \(uint16\)"),
+    ],
+)
+def test_orb_refuses_a_truth_in_another_unit(
+    orb: StanfordOrb, width: int, kind: str, stored: Callable[[np.ndarray], np.ndarray], message: str
+) -> None:
+    truth = orb.folder / "ground_truth/cup_scene001"
+    normal = np.load(truth / "surface_normal/0000.npy")
+    (truth / "pseudo_gt_albedo/0000.png").unlink()
+    np.save(truth / "pseudo_gt_albedo/0000.npy", np.full((64, 64, 3), 0.5))
+    reader = StanfordOrb(orb.folder, width)
+    reader.score(sample_of(reader, "cup_scene001_0000"), Answer(), ())  # the twin
+    np.save(truth / kind / "0000.npy", stored(normal))
+    with pytest.raises(UnirenderError, match=rf"{kind}/0000\.npy: .*{message}"):
+        reader.score(sample_of(reader, "cup_scene001_0000"), Answer(), ())
+
+
+def test_orb_looks_at_a_truth_where_it_counts(orb: StanfordOrb) -> None:
+    """Whatever lies outside the mask, and a few holes of the scan."""
+    truth = orb.folder / "ground_truth/cup_scene001"
+    albedo, normal = np.full((64, 64, 3), 0.5), np.load(truth / "surface_normal/0000.npy")
+    albedo[0], normal[0], normal[30:34, 30:34] = 7, 5, 0
+    (truth / "pseudo_gt_albedo/0000.png").unlink()
+    np.save(truth / "pseudo_gt_albedo/0000.npy", albedo)
+    np.save(truth / "surface_normal/0000.npy", normal)
+    orb.score(sample_of(orb, "cup_scene001_0000"), Answer(), ())
+
+
+def test_orb_refuses_maps_of_another_shape_than_the_mask(orb: StanfordOrb) -> None:
+    truth, linear = (
+        orb.folder / "ground_truth/cup_scene001/surface_normal/0000.npy",
+        orb.folder / "blender_HDR/cup_scene002/test/0000.exr",
+    )
+    np.save(truth, np.load(truth)[:32])
+    relit = sample_of(orb, "cup_scene001/relight_cup_scene002_0000")
+    write_exr(linear, image_channels(np.ones((32, 64, 3), np.float32)))
+    image = np.zeros((32, 32, 3), np.float32)
+    for sample, path, capture in (
+        (sample_of(orb, "cup_scene001_0000"), truth, "cup_scene001"),
+        (relit, linear, "cup_scene002"),
+    ):
+        with pytest.raises(UnirenderError) as caught:
+            orb.score(sample, Answer(image=image), ())
+        mask = orb.folder / f"blender_LDR/{capture}/test_mask/0000.png"
+        assert str(caught.value) == f"{path}: is 64 x 32 pixels, expected a square like its mask {mask}"
+
+
+def test_orb_refuses_rectangles(orb: StanfordOrb) -> None:
+    photo, mask = (orb.folder / f"blender_LDR/cup_scene001/{name}/0000.png" for name in ("test", "test_mask"))
+    Image.open(photo).crop((0, 16, 64, 48)).save(photo)
+    sample = sample_of(orb, "cup_scene001_0000")
+    with pytest.raises(UnirenderError) as caught:
+        orb.inputs(sample)
+    assert str(caught.value) == f"{mask}: is 64 x 64 pixels, expected 64 x 32 as its photograph {photo}"
+    Image.open(mask).crop((0, 16, 64, 48)).save(mask)
+    for ask in (lambda: orb.inputs(sample), lambda: orb.score(sample, Answer(), ())):
+        with pytest.raises(UnirenderError, match=r"test_mask/0000\.png: is 64 x 32 pixels, expected a square, as all"):
+            ask()
+
+
+@pytest.mark.parametrize("factors", [(2, 2, 2), (1, 1, 1.01), (-1, 1, 1)])
+def test_orb_refuses_a_pose_with_scale(tmp_path: Path, factors: tuple[float, float, float]) -> None:
+    folder = make_orb(tmp_path)
+    path = folder / "blender_LDR/cup_scene001/transforms_novel.json"
+    content = json.loads(path.read_text())
+    content["frames"][1]["transform_matrix"] = (turned(40) @ np.diag([*factors, 1])).tolist()
+    path.write_text(json.dumps(content))
+    said = problems(StanfordOrb(folder, 32))
+    assert f"{path}: frame test/0001: the transform_matrix is no rotation and position" in said
+
+
+def test_files_nested_too_deep_are_named(tmp_path: Path) -> None:
+    orb, iiw = make_orb(tmp_path / "orb"), make_iiw(tmp_path / "iiw")
+    for path, public in (
+        (orb / "blender_LDR/cup_scene001/transforms_test.json", StanfordOrb(orb, 32)),
+        (iiw / "data/100.json", Iiw(iiw)),
+    ):
+        path.write_text("[" * 100_000)
+        assert f"{path}: not readable" in problems(public)
+
+
+def test_iiw_refuses_values_out_of_range_before_a_run(tmp_path: Path) -> None:
+    folder = make_iiw(tmp_path)
+    for name, old, new in (
+        ("100", '"x": 0.25', '"x": 12.5'),
+        ("101", '"darker_score": 2.0', '"darker_score": Infinity'),
+        ("102", '"opaque": true', '"opaque": "false"'),
+    ):
+        path = folder / "data" / f"{name}.json"
+        text = path.read_text()
+        assert old in text or name == "102"
+        path.write_text(text.replace(old, new, 1))
+    said = problems(Iiw(folder))
+    assert "100.json: intrinsic_points, id 1: x is 12.5, expected a fraction of the width, 0 to 1" in said
+    assert "101.json: intrinsic_comparisons[0]: darker_score is inf, expected a finite number >= 0" in said
+    assert "102.json: intrinsic_points, id 1: opaque is 'false', expected true, false or null" in said
+
+
 def test_iiw_judges_an_albedo_of_any_size(tmp_path: Path) -> None:
     iiw = Iiw(make_iiw(tmp_path))
     assert [sample.key for sample in iiw.samples()] == ["100", "101"]
@@ -219,6 +328,25 @@ def test_maw_compares_measured_surfaces(tmp_path: Path) -> None:
 def test_maw_colours_are_adobe_rgb() -> None:
     assert adobe_to_rec709() @ np.ones(3) == pytest.approx(np.ones(3), abs=2e-4)  # both whites are D65
     assert adobe_to_rec709()[0] == pytest.approx([1.398, -0.398, 0], abs=1e-3)
+
+
+@pytest.mark.parametrize("value", [-0.01, 1.01, 200.0])
+def test_maw_refuses_colours_out_of_range(tmp_path: Path, value: float) -> None:
+    folder = make_maw(tmp_path)
+    path = folder / "labels/colors/DSC1.npy"
+    np.save(path, np.array([[0.2] * 3, [0.6, 0.6, value]]))
+    assert f"{path}: has values from" in problems(Maw(folder))
+    np.save(path, np.array([[-1e-4, 0.2, 0.2], [0.6, 0.6, 1.0001]]))  # rounding
+    assert len(Maw(folder).samples()) == 1
+    np.save(path, np.array([[0, 1, 0], [0.6, 0.6, 1]]))  # outside Rec.709, and clipped
+    assert measured(path, path.with_name("DSC1_mask.png"))[0][0] == pytest.approx([0, 1, 0], abs=2e-4)
+
+
+def test_maw_reads_a_list_with_a_byte_order_mark(tmp_path: Path) -> None:
+    folder = make_maw(tmp_path)
+    meta = folder / "labels/meta.csv"
+    meta.write_text(meta.read_text(), encoding="utf-8-sig")
+    assert [sample.key for sample in Maw(folder).samples()] == ["scene_0_DSC1"]
 
 
 def test_maw_names_what_is_wrong(tmp_path: Path) -> None:

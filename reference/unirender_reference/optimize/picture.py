@@ -16,7 +16,11 @@ from unirender.files import read_result
 from unirender.pictures import display_values, open_picture, read_mask
 from unirender_reference.optimize.folder import read_picture_file, reduced
 from unirender_reference.optimize.state import rounded
-from unirender_reference.optimize.views import Step, View
+from unirender_reference.optimize.views import Step, View, Views
+
+MOST_SATURATED = 0.99  # share of the object's display values
+LEAST_LENGTH = 0.5  # of a stored normal
+SHORTEST = 1e-6  # length of a mean that still has a direction
 
 _log = logging.getLogger("unirender.optimize")
 
@@ -53,11 +57,13 @@ def read_picture_input(
         path: PNG, JPG, ... (display values) or EXR (linear, premultiplied).
         mask: picture of the coverage; None: the alpha channel, else the whole frame.
         fov_deg: vertical; None: the contract's.
-        normal: see `read_normals`.
-        longest_side: a larger picture is reduced to this many pixels, before normals are looked at.
+        normal: a file for `read_normals`.
+        longest_side: a larger picture is reduced to this many pixels, and normals of its size along with it; they may
+            also have the reduced size.
 
     Raises:
-        UnirenderError: a file is unreadable or does not fit.
+        UnirenderError: a file is unreadable or does not fit, or the picture is black or saturated where the mask covers
+            it.
     """
     image, alpha, hdr = read_picture_file(path)
     if mask is not None:
@@ -67,30 +73,75 @@ def read_picture_input(
         alpha = np.ones((*image.shape[:2], 1), np.float32)
     if fov_deg is None:
         _log.warning("field of view not given: %g degrees assumed (--fov)", DEFAULT_FOV_DEG)
-    view = View(image, alpha, Camera(DEFAULT_FOV_DEG if fov_deg is None else fov_deg), np.eye(4), path.name)
+    full = View(image, alpha, Camera(DEFAULT_FOV_DEG if fov_deg is None else fov_deg), np.eye(4), path.name)
+    _require_light(full, hdr, path)
+    view = full
     if longest_side is not None:
-        view = reduced(view, longest_side, hdr)
+        view = reduced(full, longest_side, hdr)
         view = dataclasses.replace(view, camera=dataclasses.replace(view.camera, principal=(0.5, 0.5)))
-    normals = None if normal is None else read_normals(normal, view.mask)
+    normals = None if normal is None else _fitting_normals(normal, full, view, longest_side)
     return PictureInput(view.image, view.mask, view.camera, normals, hdr)
 
 
-def read_normals(path: Path, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
-    """Unit normals in camera axes, 0 where the mask is.
+def _require_light(view: View, hdr: bool, path: Path) -> None:
+    """Looks whether the picture shows anything where its mask covers it."""
+    views = Views((view,), hdr=hdr)
+    if views.black(view):
+        raise UnirenderError(
+            f"{path}: the picture is black wherever its mask covers it, expected an object under light; does the mask "
+            "belong to the picture?"
+        )
+    saturated = float(views.saturated(view)[view.mask[..., 0] > 0].mean())
+    if saturated >= MOST_SATURATED:
+        raise UnirenderError(
+            f"{path}: {saturated:.0%} of the object's values are saturated (white), expected a picture that shows its "
+            "shading; take a darker exposure, or a linear EXR"
+        )
+
+
+def _fitting_normals(path: Path, full: View, view: View, longest_side: int | None) -> Float[np.ndarray, "h w 3"]:
+    """Normals of the picture as it is optimised: those of its own size are averaged as it was."""
+    stored = read_normals(path)
+    if longest_side is None or stored.shape[:2] == view.mask.shape[:2]:
+        return unit_normals(stored, view.mask, path)
+    unit = unit_normals(stored, full.mask, path)
+    above, below = (  # a picture has no negative values
+        reduced(dataclasses.replace(full, image=np.maximum(part, 0)), longest_side, linear=True).image
+        for part in (unit, -unit)
+    )
+    return _unit(above - below, view.mask, SHORTEST)
+
+
+def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """Normals in camera axes as they are stored.
 
     Args:
         path: a result folder or an EXR with normal.X/Y/Z, or a picture of (n + 1) / 2.
-        mask: coverage of the picture that they belong to.
 
     Raises:
-        UnirenderError: the file has no normals, or they are of another size, or some inside the mask have no length.
+        UnirenderError: the file is unreadable or has no normals.
     """
     if path.is_dir() or path.suffix.lower() == ".exr":
         normal = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False).normal
         if normal is None:
             raise UnirenderError(f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z")
-    else:
-        normal = 2 * display_values(open_picture(path), str(path))[..., :3] - 1
+        return normal
+    return 2 * display_values(open_picture(path), str(path))[..., :3] - 1
+
+
+def unit_normals(
+    normal: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h2 w2 1"], path: Path
+) -> Float[np.ndarray, "h2 w2 3"]:
+    """Vectors of length 1, 0 where the mask is.
+
+    Args:
+        normal: of any length; less than half is none, and becomes the direction towards the viewer.
+        mask: coverage of the picture that they belong to.
+        path: the file, for messages.
+
+    Raises:
+        UnirenderError: they are of another size, or some inside the mask have no length.
+    """
     if normal.shape[:2] != mask.shape[:2]:
         height, width = mask.shape[:2]
         raise UnirenderError(
@@ -98,14 +149,21 @@ def read_normals(path: Path, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarr
             "the picture"
         )
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    missing = float(((length < 0.5) & (mask > 0.5)).sum() / max(int((mask > 0.5).sum()), 1))
+    missing = float(((length < LEAST_LENGTH) & (mask > 0.5)).sum() / max(int((mask > 0.5).sum()), 1))
     if missing > 0.01:
         raise UnirenderError(
             f"{path}: {missing:.0%} of the object's pixels have no normal, expected unit vectors (as a picture: "
             "(n + 1) / 2); does the mask fit?"
         )
-    fallback = np.array([0, 0, 1], np.float32)
-    unit = np.where(length < 0.5, fallback, normal / np.maximum(length, 1e-6))
+    return _unit(normal, mask, LEAST_LENGTH)
+
+
+def _unit(
+    vectors: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], least: float
+) -> Float[np.ndarray, "h w 3"]:
+    """Vectors of length 1, towards the viewer where they are shorter than `least`, 0 where the mask is."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    unit = np.where(length < least, np.array([0, 0, 1], np.float32), vectors / np.maximum(length, SHORTEST))
     return np.where(mask > 0, unit, 0).astype(np.float32)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from unirender.files import file_sha256
 from unirender_reference.optimize.coverage import coverage_of, mask_iou
 from unirender_reference.optimize.export import SOLUTION_FILE, write_record, write_solution
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
@@ -30,7 +31,7 @@ def write_result(
     *,
     pictures: bool = True,
     clock: Callable[[], float] | None = None,
-) -> list[str]:
+) -> dict[str, str]:
     """Writes all files of a result; each appears whole, and `solution.json` after all others.
 
     Figures and pictures of linear views are at their exposure, the light is in their unit.
@@ -45,7 +46,7 @@ def write_result(
         clock: gives the seconds of the whole run, for the record.
 
     Returns:
-        The names of the files.
+        The names of the files, with the sha256 of each.
     """
     temporary = folder.out / PART
     shutil.rmtree(temporary, ignore_errors=True)
@@ -77,9 +78,10 @@ def write_result(
         **header,
     }
     write_record(temporary, record)
-    names = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file())
+    files = sorted(path for path in temporary.rglob("*") if path.is_file())
+    found = {path.relative_to(temporary).as_posix(): file_sha256(path) for path in files}
     _move_in(temporary, folder.out)
-    return names
+    return found
 
 
 def stage_records(history: Sequence[Mapping[str, Any]], patience: int) -> list[dict[str, Any]]:

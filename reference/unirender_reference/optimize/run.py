@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.files import file_sha256
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
@@ -99,10 +100,16 @@ def _described(place: Sphere | None) -> str:
 
 
 def _written(folder: RunFolder, pictures: bool) -> bool:
-    """Whether the result is there with all its files, and with pictures where they are wanted."""
+    """Whether the result is there with all its files as they were written, and with pictures where they are wanted."""
     live = folder.progress.live
     drawn = live.get("pictures", False) or not pictures
-    return bool(live.get("written")) and drawn and all((folder.out / name).is_file() for name in live["written"])
+    files = live.get("written")  # name -> hash
+    return isinstance(files, dict) and drawn and all(_is(folder.out / name, hashed) for name, hashed in files.items())
+
+
+def _is(path: Path, sha256: str) -> bool:
+    """Whether a file is there with the content of that hash."""
+    return path.is_file() and file_sha256(path) == sha256
 
 
 @contextlib.contextmanager
@@ -243,7 +250,7 @@ class _Run:
             if self.folder is not None:
                 self.folder.record(step)
             index = step.iteration - first
-            done = index / (total - first) if shares is None else shares[min(index, len(shares)) - 1]
+            done = index / max(total - first, 1) if shares is None else shares[min(index, len(shares)) - 1]
             remaining = (time.perf_counter() - began) * (1 - done) / done if done else None
             self._show(Report(step, self.plan.index(name) + 1, len(self.plan), total, remaining))
             return True

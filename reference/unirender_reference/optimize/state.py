@@ -179,7 +179,7 @@ def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) 
 def _read(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UnirenderError(f"{path}: not readable ({error}); delete the folder to begin anew") from error
     if not isinstance(content, dict):
         raise UnirenderError(f"{path}: no record of a run; delete the folder to begin anew")

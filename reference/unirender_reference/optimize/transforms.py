@@ -107,6 +107,11 @@ class Frame:
         model = self.values.get("camera_model", "PINHOLE")
         if model not in PINHOLE:
             raise UnirenderError(f"{self.name}: camera_model {model!r}, expected a pinhole; undistort the pictures")
+        fisheye = self.values.get("is_fisheye", False)
+        if not isinstance(fisheye, bool):
+            raise UnirenderError(f"{self.name}: is_fisheye is {fisheye!r}, expected true or false")
+        if fisheye:
+            raise UnirenderError(f"{self.name}: is_fisheye is true, expected a pinhole; undistort the pictures")
         bent = [key for key in DISTORTION if self._number(key, 0.0) != 0]
         if bent:
             raise UnirenderError(
@@ -131,7 +136,7 @@ def read_transforms(path: Path) -> list[Frame]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected a transforms.json") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise UnirenderError(f"{path}: not valid JSON ({error}), expected a transforms.json") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:

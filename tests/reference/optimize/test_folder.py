@@ -258,6 +258,7 @@ BAD = {
     "no file": (lambda folder: (folder / "transforms.json").unlink(), "has no transforms.json"),
     "no JSON": (lambda folder: (folder / "transforms.json").write_text("{"), "not valid JSON"),
     "not UTF-8": (lambda folder: (folder / "transforms.json").write_bytes(b"\xff\xfe{"), "not valid JSON"),
+    "deep": (lambda folder: (folder / "transforms.json").write_text("[" * 100_000), "transforms.json: not valid JSON"),
     "a list": (lambda folder: (folder / "transforms.json").write_text("[]"), "has no frames"),
     "no frames": (broken(lambda content: content.update(frames=[])), "has no frames"),
     "no path": (without("file_path"), r"frames\[0\] has no file_path"),
@@ -284,6 +285,8 @@ BAD = {
     "slightly oblong pixels": (first(fl_x=40.0, fl_y=39.8), "square pixels"),
     "distortion": (first(k1=0.1), r"distorted \(k1 not 0\)"),
     "fisheye": (first(camera_model="OPENCV_FISHEYE"), "expected a pinhole"),
+    "fisheye of instant-ngp": (broken(lambda content: content.update(is_fisheye=True)), "is_fisheye is true, expected"),
+    "fisheye as text": (first(is_fisheye="false"), "is_fisheye is 'false', expected true or false"),
     "proportions": (broken(lambda content: content.update(w=100, h=100)), "expected the same proportions"),
     "held_out text": (first(held_out="yes"), "held_out is 'yes', expected true or false"),
     "all held out": (
@@ -314,6 +317,11 @@ def test_bad_folders_are_one_sentence(folder: Path, name: str):
     with pytest.raises(UnirenderError, match=message) as caught:
         read_views(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_no_fisheye_is_a_pinhole(folder: Path):
+    """As instant-ngp writes it of every other camera."""
+    assert len(read_views(edited(folder, lambda content: content.update(is_fisheye=False))).seen) == 4
 
 
 def test_missing_folder(tmp_path: Path):

@@ -18,7 +18,7 @@ from PIL import Image
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
-from unirender.exr import channels_rgb, read_exr
+from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.files import read_result, write_png
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_reference.meshes import load_mesh_placed
@@ -26,7 +26,7 @@ from unirender_reference.optimize.commands import Optimize
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 from unirender_reference.optimize.machine import memory_bytes, require_cores, require_memory
-from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input
+from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input, unit_normals
 from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.single_render import rerendered
 from unirender_reference.optimize.solution import Solution
@@ -281,12 +281,65 @@ def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCa
     np.testing.assert_allclose(np.linalg.norm(given.normal, axis=-1), 1, atol=1e-5)
     half = np.zeros((12, 16, 1), np.float32)
     half[:, :8] = 1
-    assert not read_normals(tmp_path / "normal.png", half)[:, 8:].any()
-    with pytest.raises(UnirenderError, match="16 x 12 pixels, expected 20 x 10"):
-        read_normals(tmp_path / "normal.png", np.ones((10, 20, 1), np.float32))
+    stored = read_normals(tmp_path / "normal.png")
+    assert not unit_normals(stored, half, tmp_path / "normal.png")[:, 8:].any()
+    with pytest.raises(UnirenderError, match=r"normal\.png: the normals are 16 x 12 pixels, expected 20 x 10"):
+        unit_normals(stored, np.ones((10, 20, 1), np.float32), tmp_path / "normal.png")
     write_png(tmp_path / "flat.png", np.full((12, 16, 3), 0.5))
-    with pytest.raises(UnirenderError, match="have no normal"):
-        read_normals(tmp_path / "flat.png", half)
+    with pytest.raises(UnirenderError, match=r"flat\.png: .* have no normal"):
+        read_picture_input(tmp_path / "one.png", normal=tmp_path / "flat.png")
+
+
+def test_normals_of_the_pictures_own_size_are_reduced_with_it(tmp_path: Path):
+    """They are the mean directions; those of the reduced size are taken as they are."""
+    rng = np.random.default_rng(1)
+    write_png(tmp_path / "one.png", rng.random((24, 32, 3)))
+    slope = np.linspace(-1.2, 1.2, 32)
+    ball = np.stack([np.sin(slope), 0 * slope, np.cos(slope)], axis=-1) * np.ones((24, 1, 1))
+    write_png(tmp_path / "normal.png", ball / 2 + 0.5)
+    given = read_picture_input(tmp_path / "one.png", normal=tmp_path / "normal.png", longest_side=16)
+    assert given.normal is not None
+    assert given.normal.shape == (12, 16, 3)
+    np.testing.assert_allclose(np.linalg.norm(given.normal, axis=-1), 1, atol=1e-5)
+    means = ball.reshape(12, 2, 16, 2, 3).mean((1, 3))
+    expected = means / np.linalg.norm(means, axis=-1, keepdims=True)
+    np.testing.assert_allclose(given.normal, expected, atol=0.01)  # 8 bits
+    write_png(tmp_path / "small.png", expected / 2 + 0.5)
+    small = read_picture_input(tmp_path / "one.png", normal=tmp_path / "small.png", longest_side=16)
+    assert small.normal is not None
+    np.testing.assert_allclose(small.normal, expected, atol=0.01)
+    write_png(tmp_path / "other.png", ball[:20] / 2 + 0.5)
+    with pytest.raises(UnirenderError, match="32 x 20 pixels, expected 32 x 24 like the picture"):
+        read_picture_input(tmp_path / "one.png", normal=tmp_path / "other.png", longest_side=16)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [(0.0, "black wherever its mask covers it"), (1.0, "100% of the object's values are saturated")],
+)
+def test_a_picture_that_shows_nothing_is_refused(tmp_path: Path, value: float, message: str):
+    """Whatever it shows outside the mask; a ninth that shows something is enough."""
+    picture = np.full((12, 12, 4), value)
+    picture[..., 3] = 0
+    picture[3:9, 3:9, 3] = 1
+    picture[0, 0, :3] = 0.4
+    write_png(tmp_path / "one.png", picture)
+    with pytest.raises(UnirenderError, match=rf"one\.png: .*{message}"):
+        command(tmp_path / "one.png", "--out", tmp_path / "out").run()
+    assert not (tmp_path / "out").exists()
+    picture[3:5, 3:5, :3] = 0.5
+    write_png(tmp_path / "one.png", picture)
+    assert read_picture_input(tmp_path / "one.png").image.shape == (12, 12, 3)
+
+
+def test_a_black_linear_picture_is_refused(tmp_path: Path):
+    for name, value in (("black", 0.0), ("dim", 1e-5)):
+        rgba = np.full((8, 8, 4), value, np.float32)
+        rgba[..., 3] = 1
+        write_exr(tmp_path / f"{name}.exr", image_channels(rgba), half=False)
+    with pytest.raises(UnirenderError, match=r"black\.exr: the picture is black"):
+        read_picture_input(tmp_path / "black.exr")
+    assert read_picture_input(tmp_path / "dim.exr").hdr
 
 
 @pytest.mark.parametrize("kind", ["folder", "picture"])

@@ -151,6 +151,34 @@ def test_a_file_that_was_deleted_comes_back(whole: Path, tmp_path: Path, lost: s
     assert (out / lost).read_bytes() == (whole / lost).read_bytes()
 
 
+@pytest.mark.parametrize(("damaged", "left"), [("mesh.glb", 100), ("mitsuba/mesh.ply", 0), ("solution.json", 40)])
+def test_a_file_that_was_damaged_comes_back(whole: Path, tmp_path: Path, damaged: str, left: int):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    (out / damaged).write_bytes((whole / damaged).read_bytes()[:left])
+    run(out)
+    if damaged == "solution.json":  # tells the seconds of its own writing
+        assert (
+            json.loads((out / damaged).read_text())["figures"] == json.loads((whole / damaged).read_text())["figures"]
+        )
+    else:
+        assert (out / damaged).read_bytes() == (whole / damaged).read_bytes()
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.is_file()}
+    run(out)
+    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*.*") if path.is_file()}
+
+
+def test_no_steps_at_all_are_a_run():
+    """The held-out views are looked at once, at the start, which is returned."""
+    reports: list[Report] = []
+    config = dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, iterations=0))
+    start = flat_start(truth().obj)
+    found = run(None, config=config, init=start, progress=reports.append)
+    assert [report.step.iteration for report in reports] == [0]
+    assert reports[0].remaining is None
+    np.testing.assert_allclose(found.environment, start.environment, rtol=1e-3)
+
+
 @pytest.mark.long
 def test_pictures_may_be_drawn_later(whole: Path, tmp_path: Path):
     out = tmp_path / "run"
