@@ -156,6 +156,11 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
 
 
+def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
+    """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`unirender.icc`)."""
+    return display_values(in_srgb(image, name), name)
+
+
 def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
     """What RGB or RGBA values say as a mask: the alpha channel if it varies, else the mean of the colours."""
     if values.shape[-1] == 4 and values[..., 3].min() < 1:
@@ -195,7 +200,7 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
 
 
 def _read_display_picture(path: Path) -> Picture:
-    pixels = display_values(in_srgb(open_picture(path), str(path)), str(path))
+    pixels = display_colors(open_picture(path), str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
     return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name)
 

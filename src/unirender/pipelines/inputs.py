@@ -8,9 +8,8 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.errors import UnirenderError
-from unirender.icc import in_srgb
 from unirender.intrinsics import Intrinsics
-from unirender.pictures import coverage, display_values
+from unirender.pictures import coverage, display_colors, display_values
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import constant_map
@@ -28,7 +27,7 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         UnirenderError: wrong type, shape or range, NaN, or an empty mask.
     """
     if isinstance(image, Image.Image):
-        values = display_values(in_srgb(image, "image"), "image")
+        values = display_colors(image, "image")
         picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):
         picture, alpha = image, None
