@@ -128,7 +128,7 @@ def test_unlit_is_base_color_alone(tmp_path):
     obj = load_mesh(path)
     assert obj.albedo == pytest.approx([0.2, 0.3, 0.4])
     assert obj.metallic == pytest.approx(np.zeros((2, 2)))
-    assert obj.provenance["ignored"] == "unlit"
+    assert obj.provenance["ignored"] == "", "it is converted"
 
 
 def test_what_is_ignored_is_listed(tmp_path):

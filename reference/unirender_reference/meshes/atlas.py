@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from unirender_reference.meshes.bake import baked_tile
-from unirender_reference.meshes.limits import texture_side
+from unirender_reference.meshes.limits import MAX_ATLAS_TEXELS, texture_side
 from unirender_reference.meshes.surface import Material, unit_vectors
 from unirender_reference.meshes.tiles import Patch, Tile, constant_tile, refined, unrolled_tile
 
@@ -35,8 +35,8 @@ class Atlas:
 
 def build_atlas(patches: Sequence[Patch]) -> Atlas:
     """Packs the materials of the patches; faces keep the order of the patches."""
-    side = texture_side(sum(bool(patch.textures) or patch.colors is not None for patch in patches))
-    made = [_tile(patch, side) for patch in patches]
+    textured = sum(bool(patch.textures) or patch.colors is not None for patch in patches)
+    made = [_tile(patch, textured) for patch in patches]
     tiles = [tile for tile, _ in made]
     names = {name: None for tile in tiles for name in tile.maps}
     place, (height, width) = shelves([tile.size for tile in tiles])
@@ -66,12 +66,13 @@ def build_atlas(patches: Sequence[Patch]) -> Atlas:
     return Atlas(maps, None if constant else uv, len(tiles), averaged, baked)
 
 
-def _tile(patch: Patch, side: int) -> tuple[Tile, bool]:
-    """The tile of a patch, and whether its pictures were resampled face by face."""
+def _tile(patch: Patch, textured: int) -> tuple[Tile, bool]:
+    """The tile of a patch, one of `textured` in the atlas, and whether its pictures were resampled face by face."""
+    side, room = texture_side(textured), MAX_ATLAS_TEXELS // max(textured, 1)
     patch = _with_flat_color(patch)
     textures = list(patch.textures.values())
     if patch.colors is not None:
-        return baked_tile(patch, side**2), bool(textures)
+        return baked_tile(patch, room), bool(textures)
     if not textures:
         return constant_tile(patch.material.channels, len(patch.points)), False
     lookups = [patch.lookup(texture) for texture in textures]
@@ -79,7 +80,7 @@ def _tile(patch: Patch, side: int) -> tuple[Tile, bool]:
     same = all(np.array_equal(uv, lookups[0]) for uv in lookups[1:])
     if same and (inside or len({texture.wrap for texture in textures}) == 1):
         return unrolled_tile(patch, side), False
-    return baked_tile(patch, side**2), True
+    return baked_tile(patch, room), True
 
 
 def _with_flat_color(patch: Patch) -> Patch:

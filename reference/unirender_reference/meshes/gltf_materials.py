@@ -177,7 +177,7 @@ class Materials:
         if "occlusionTexture" in material:
             self.ignored.add("occlusion")
         for name in extensions:
-            if name != GLOSS:
+            if name not in (GLOSS, UNLIT):
                 self.ignored.add(name.removeprefix("KHR_materials_"))
 
 
