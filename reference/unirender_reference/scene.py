@@ -20,6 +20,7 @@ from unirender_reference.shapes import MeshObject
 
 LIGHT = "light"
 OBJECT = "object"
+POLE_SHARE = 1e-6  # of the first row, in the second one of a light that has no other
 MOST_RADIANCE = 1e12  # the sun's luminance is 1.6e9 cd/m^2; squares of far more leave the range of float32
 
 
@@ -80,6 +81,20 @@ def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
 
 def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w+2 3"]:
     """The environment as Mitsuba's `envmap` parameter stores it: one wrapped column on either side."""
+    environment = envmap_rows(environment)
+    return np.concatenate([environment[:, -1:], environment, environment[:, :1]], axis=1)
+
+
+def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """The environment, checked, as Mitsuba can sample it: itself, but for a light in the first row alone.
+
+    Mitsuba draws texels by luminance times sin(theta), which is 0 all over such a light: it would render black. The
+    second row gets `POLE_SHARE` of the first. (In the last row sin(theta) is rounded to -9e-8, which is enough
+    where that row is alone.)
+
+    Raises:
+        UnirenderError: it is too small, black, negative, not finite or above `MOST_RADIANCE`.
+    """
     environment = np.asarray(environment, dtype=np.float32)
     if environment.ndim != 3 or environment.shape[-1] != 3 or environment.shape[0] < 3 or environment.shape[1] < 2:
         # Mitsuba resamples smaller maps when it loads them.
@@ -92,7 +107,10 @@ def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
         )
     if environment.max() <= 0:
         raise UnirenderError("environment: all texels are black, expected some light")
-    return np.concatenate([environment[:, -1:], environment, environment[:, :1]], axis=1)
+    if not environment[1:].any():
+        environment = environment.copy()
+        environment[1] = POLE_SHARE * environment[0]
+    return environment
 
 
 def object_scene(
@@ -114,8 +132,8 @@ def object_scene(
     if sensor is not None:
         scene["sensor"] = sensor
     if environment is not None:
-        envmap_data(environment)  # checks
-        scene[LIGHT] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(environment, np.float32))}
+        bitmap = mi.Bitmap(np.ascontiguousarray(envmap_rows(environment)))
+        scene[LIGHT] = {"type": "envmap", "bitmap": bitmap}
     scene[OBJECT] = mesh_shape(obj, materials.white_bsdf() if bsdf is None else bsdf)
     return mi.load_dict(scene)
 

@@ -25,7 +25,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
 from unirender_reference.samplers import stratified_sampler
-from unirender_reference.scene import envmap_data, mesh_shape, sensor_dict
+from unirender_reference.scene import envmap_rows, mesh_shape, sensor_dict
 from unirender_reference.shapes import MeshObject
 
 LEAST_FACING = 0.01  # cosine to which normals that face away from the viewer are bent
@@ -242,11 +242,14 @@ def wrapped(environment: Any) -> Any:
     import drjit as dr
 
     mi = mitsuba()
-    envmap_data(environment.numpy())  # checks
-    height, width, _ = environment.shape
+    given = environment.numpy()
+    values, rows = environment.array, envmap_rows(given)
+    height, width, _ = rows.shape
+    if not np.array_equal(rows, given):
+        values = dr.replace_grad(mi.Float(rows.ravel()), values)
     column = np.arange(-1, width + 1) % width
     index = (np.arange(height)[:, None, None] * width + column[:, None]) * 3 + np.arange(3)
-    data = dr.gather(mi.Float, environment.array, mi.UInt32(index.ravel().astype(np.uint32)))
+    data = dr.gather(mi.Float, values, mi.UInt32(index.ravel().astype(np.uint32)))
     return mi.TensorXf(data, shape=(height, width + 2, 3))
 
 
