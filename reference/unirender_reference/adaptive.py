@@ -26,7 +26,7 @@ def render_sample_to_floor(
         max_spp: about where sampling ends.
     """
     renderer = renderer_of(spec, renderer)
-    factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed)
+    factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed, f"light {spec.light.name}")
     environment = (spec.light.environment * factor).astype(np.float32)
     geometry = renderer.geometry(MASK_SPP, seed, (spec.roughness, spec.metallic))
     mask = geometry.require("mask")["mask"]

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from unirender import exposure as gauge
 from unirender.errors import UnirenderError
-from unirender_reference.faults import ObjectFault
+from unirender_reference.faults import LightFault, ObjectFault
 
 PASS_SPP = 16
 PASS_SEED = 0
@@ -19,6 +19,9 @@ PASS_SEED = 0
 
 @runtime_checkable
 class _Renderer(Protocol):
+    @property
+    def obj(self) -> Any: ...
+
     def exposure_mask(self) -> Any: ...
 
     def diffuse(self, environment: Any, spp: int, seed: int, batches: int) -> Any: ...
@@ -33,7 +36,8 @@ def exposure_factor(diffuse: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray,
         seed: draws the target brightness.
 
     Raises:
-        ObjectFault: the object covers no pixel, or no light reaches it.
+        ObjectFault: the object covers no pixel.
+        LightFault: the light does not reach it.
     """
     if not (mask > gauge.MASK_THRESHOLD).any():
         raise ObjectFault(
@@ -42,15 +46,34 @@ def exposure_factor(diffuse: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray,
     try:
         return gauge.exposure_factor(diffuse, mask, gauge.draw_target(np.random.default_rng(seed)))
     except UnirenderError as error:
-        raise ObjectFault(str(error)) from error
+        raise LightFault(str(error)) from error
 
 
-def scene_exposure(renderer: _Renderer, environment: Float[np.ndarray, "h w 3"], seed: int) -> float:
+def scene_exposure(
+    renderer: _Renderer, environment: Float[np.ndarray, "h w 3"], seed: int, name: str = "the light"
+) -> float:
     """The factor of a light on a renderer's object, from a d pass of its own.
 
     That pass and the mask have a fixed seed and sample count: two truths of one scene (other seeds) share their
     exposure.
+
+    Raises:
+        ObjectFault: the object covers no pixel, or an even light does not reach it either.
+        LightFault: the light does not reach it; the message begins with the light's `name`.
     """
     mask = renderer.exposure_mask()
-    diffuse = renderer.diffuse(environment, spp=PASS_SPP, seed=PASS_SEED, batches=1).mean
-    return exposure_factor(diffuse, mask, seed)
+    try:
+        return exposure_factor(_diffuse(renderer, environment), mask, seed)
+    except LightFault as fault:
+        try:
+            exposure_factor(_diffuse(renderer, np.ones((3, 4, 3), np.float32)), mask, seed)
+        except LightFault as error:
+            raise ObjectFault("stays black even under a light from everywhere; are its normals broken?") from error
+        raise LightFault(
+            f"{name} does not reach {renderer.obj.name}, which stays black from the camera, expected light on its "
+            "visible side; turn the light, or give another"
+        ) from fault
+
+
+def _diffuse(renderer: _Renderer, environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
+    return renderer.diffuse(environment, spp=PASS_SPP, seed=PASS_SEED, batches=1).mean

@@ -24,6 +24,10 @@ class ObjectFault(UnirenderError):
     """An object cannot be rendered, wherever that is tried."""
 
 
+class LightFault(UnirenderError):
+    """A light does not reach an object that an even light reaches."""
+
+
 class FileNotSeen(UnirenderError):
     """A mesh file is not there for the process that was to load it."""
 

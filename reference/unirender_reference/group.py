@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender_reference import exposure
 from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig
-from unirender_reference.faults import FileNotSeen, ObjectFault, blamed_on
+from unirender_reference.faults import FileNotSeen, LightFault, ObjectFault, blamed_on
 from unirender_reference.lights import Light, LightPool, make_light
+from unirender_reference.lights.pool import TRIES
 from unirender_reference.members import GroupMembers
 from unirender_reference.passes import derive_seed
-from unirender_reference.plan import GroupPlan
+from unirender_reference.plan import GroupPlan, LightPlan
 from unirender_reference.processes import time_limit
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
@@ -30,6 +32,7 @@ def render(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
     Raises:
         FileFailure: the object is a file, and it cannot be loaded or rendered.
         FileNotSeen: this process does not see that file.
+        LightFault: a light does not reach the object, and there is no other in its place.
         UnirenderError: anything else went wrong.
     """
     start = time.perf_counter()
@@ -43,7 +46,11 @@ def render(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
             members, floor, negative_pixels = visibility_members(plan, renderer), None, 0
         else:
             group = GroupMembers(config, plan, renderer)
-            group.render(lights)
+            exposed = [
+                reaching_light(config, own, light, renderer) for own, light in zip(plan.lights, lights, strict=True)
+            ]
+            lights = [light for light, _ in exposed]
+            group.render(lights, [factor for _, factor in exposed])
             members, floor, negative_pixels = group.members, group.floor_count(), group.negative_pixels
     return RenderedGroup(
         key=f"{renderer.obj.name}_g{plan.number}",
@@ -72,6 +79,39 @@ def user_lights(config: DatasetConfig) -> LightPool | None:
             "same on all machines as long as it runs; run the same command again"
         )
     return pool
+
+
+def reaching_light(config: DatasetConfig, plan: LightPlan, light: Light, renderer: Renderer) -> tuple[Light, float]:
+    """The plan's light, and its exposure on the object.
+
+    A file of the user's that does not reach the object is passed over for another of the same draw, which names it
+    (`not_reaching` in its provenance).
+
+    Raises:
+        LightFault: there is no other, or `TRIES` of them do not reach it either.
+    """
+    pool, passed = user_lights(config), list[str]()
+    while True:
+        source = light.provenance["file"] if light.provenance["kind"] == "pool" else None
+        said = f"dataset: light {source or light.name}"
+        try:
+            factor = exposure.scene_exposure(renderer, light.environment, plan.exposure_seed, said)
+        except LightFault as error:
+            fault = LightFault(f"{error}; complete shards are kept")
+            passed.append(source or "")
+            left = tuple(name for name in pool.names if name not in passed) if pool and source else ()
+            if not left or len(passed) == TRIES:
+                raise fault from error
+            assert pool is not None
+            pool = dataclasses.replace(pool, names=left)
+            try:
+                light = make_light(plan.seed, config.split, pool)
+            except UnirenderError as unreadable:  # all that are left
+                raise fault from unreadable
+            continue
+        if passed:
+            light = dataclasses.replace(light, provenance={**light.provenance, "not_reaching": "\n".join(passed)})
+        return light, factor
 
 
 def _skipped(light: Light) -> list[str]:

@@ -8,7 +8,7 @@ picture by name: nobody has to take them from a file's.
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,6 @@ from jaxtyping import Float
 
 from unirender.exr import exr_bytes, image_channels, intrinsics_channels
 from unirender.intrinsics import Intrinsics
-from unirender_reference import exposure
 from unirender_reference.dataset_config import GRID, MOST_SPP, DatasetConfig
 from unirender_reference.lights import Light
 from unirender_reference.passes import Estimate, derive_seed
@@ -63,15 +62,17 @@ class GroupMembers:
         self.mask = self.geometry.mask
         self.header = {**renderer_provenance(renderer), "spp": str(config.spp), "seed": str(plan.render_seed)}
 
-    def render(self, lights: list[Light]) -> None:
-        """Fills `members`."""
+    def render(self, lights: Sequence[Light], factors: Sequence[float]) -> None:
+        """Fills `members`; `factors` are the lights' exposures."""
         scenes = [self._scenes(light, own) for light, own in zip(lights, self.plan.lights, strict=True)]
         shared = {**self.header, "spp": str(GEOMETRY_SPP)}
         shared["scene"] = shared_scene_hash(value for hashes in scenes for value in hashes.values())
         self.members["shared.exr"] = exr_bytes(intrinsics_channels(self.geometry), attributes=shared)
         records = [
-            self._light(i, light, own, hashes)
-            for i, (light, own, hashes) in enumerate(zip(lights, self.plan.lights, scenes, strict=True))
+            self._light(i, light, factor, own, hashes)
+            for i, (light, factor, own, hashes) in enumerate(
+                zip(lights, factors, self.plan.lights, scenes, strict=True)
+            )
         ]
         self.members["json"] = json.dumps(self._record(records), sort_keys=True).encode()
 
@@ -90,10 +91,11 @@ class GroupMembers:
         specs = [SceneSpec(obj, light, *_material(pair), camera, resolution, plan.exposure_seed) for pair in pairs]
         return dict(zip(pairs, scene_hashes(specs), strict=True))
 
-    def _light(self, i: int, light: Light, plan: LightPlan, scenes: Mapping[Pair, str]) -> dict[str, Any]:
+    def _light(
+        self, i: int, light: Light, factor: float, plan: LightPlan, scenes: Mapping[Pair, str]
+    ) -> dict[str, Any]:
         """Renders everything under one light; returns what the group's json says of it."""
         renderer = self.renderer
-        factor = exposure.scene_exposure(renderer, light.environment, plan.exposure_seed)
         environment = (light.environment * np.float32(factor)).astype(np.float32)
         attributes = {**self.header, "light": light.name, "exposure_factor": repr(factor)}
         lit = {**attributes, "scene": shared_scene_hash(scenes.values())}

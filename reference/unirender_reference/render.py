@@ -169,7 +169,7 @@ def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer |
         renderer: reuse this one (of the same object, camera and resolution) instead of loading the scene.
     """
     renderer = renderer_of(spec, renderer)
-    factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed)
+    factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed, f"light {spec.light.name}")
     environment = (spec.light.environment * factor).astype(np.float32)
     return assemble_sample(
         spec,

@@ -1,11 +1,14 @@
 """A data set under the user's own lights: shares, sides, as they are, their size, and files that are none."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import reference_scenes as scenes
+import trimesh
 from inline_executor import Inline
 
 from unirender.cli import main
@@ -15,7 +18,14 @@ from unirender.training.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
+from unirender_reference.exposure import scene_exposure
+from unirender_reference.faults import ObjectFault
+from unirender_reference.group import reaching_light
 from unirender_reference.lights import Placement, bundled_light, light_pool, load_light, make_light
+from unirender_reference.passes import Estimate
+from unirender_reference.plan import plan_groups
+from unirender_reference.render import Renderer
+from unirender_reference.shapes import make_object
 
 SIZE, SPP = 8, 16
 
@@ -134,6 +144,65 @@ def test_files_that_are_no_lights_are_named_by_their_place_in_the_folder(
     moved = folder.rename(tmp_path / "elsewhere")
     made(tmp_path / "moved", moved, light_share=1.0)
     assert (tmp_path / "moved" / "shard-000000.tar").read_bytes() == (out / "shard-000000.tar").read_bytes()
+
+
+def write_back_light(folder: Path) -> None:
+    """Black but for what stands right behind the object."""
+    radiance = np.zeros((64, 128), np.float32)
+    radiance[32, [0, 127]] = 1
+    write_exr(folder / "back.exr", dict.fromkeys("RGB", radiance), half=False)
+
+
+def test_a_light_that_does_not_reach_the_object_gives_way_to_another(folder: Path, tmp_path: Path) -> None:
+    """And a second run has the same bytes."""
+    write_back_light(folder)
+    own: dict[str, Any] = {"light_share": 1.0, "turn_lights": False, "pairs": 8}
+    lights = [light["provenance"] for light, _ in made(tmp_path / "out", folder, **own)]
+    assert {light["file"] for light in lights} <= {"mine0.exr", "mine1.exr", "mine2.exr"}
+    passed = [light for light in lights if light.get("not_reaching") == "back.exr"]
+    assert 0 < len(passed) < len(lights)
+    made(tmp_path / "again", folder, **own)
+    first, second = (tmp_path / name / "shard-000000.tar" for name in ("out", "again"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_a_light_that_reaches_is_the_drawn_one(folder: Path, tmp_path: Path) -> None:
+    own = config(tmp_path / "out", folder, light_share=1.0)
+    plan = plan_groups(own)[0]
+    renderer = Renderer(make_object(plan.object_seed, "train"), resolution=SIZE)
+    light = make_light(plan.lights[0].seed, "train", own.light_pool())
+    found, factor = reaching_light(own, plan.lights[0], light, renderer)
+    assert found is light
+    assert factor == scene_exposure(renderer, light.environment, plan.lights[0].exposure_seed)
+
+
+@pytest.mark.parametrize("from_meshes", [False, True])
+def test_a_light_that_reaches_nothing_ends_the_run_and_blames_no_mesh(tmp_path: Path, from_meshes: bool) -> None:
+    folder, meshes = tmp_path / "lights", tmp_path / "meshes"
+    folder.mkdir()
+    meshes.mkdir()
+    write_back_light(folder)
+    trimesh.creation.box().export(meshes / "box.obj")
+    changes: dict[str, Any] = {"objects": None, "meshes": meshes} if from_meshes else {}
+    name = "box-[0-9a-f]+" if from_meshes else "train-000000"
+    own = config(tmp_path / "out", folder, light_share=1.0, turn_lights=False, **changes)
+    with pytest.raises(UnirenderError, match=rf"^dataset: light back\.exr does not reach {name}, .*shards are kept$"):
+        generate(own, executor=Inline())
+
+
+class BlackBall(Renderer):
+    """Of what no light reaches."""
+
+    def diffuse(self, environment: np.ndarray, spp: int, seed: int = 0, batches: int = 1) -> Estimate:
+        found = super().diffuse(environment, spp, seed, batches)
+        return dataclasses.replace(found, mean=0 * found.mean)
+
+
+def test_an_object_that_an_even_light_does_not_reach_is_to_blame() -> None:
+    ball = scenes.sphere(subdivisions=2)
+    assert scene_exposure(Renderer(ball, resolution=SIZE), scenes.environment(), 0) > 0
+    with pytest.raises(ObjectFault, match="even under a light from everywhere"):
+        scene_exposure(BlackBall(ball, resolution=SIZE), scenes.environment(), 0)
 
 
 def test_only_bad_files_leave_no_folder(tmp_path: Path) -> None:

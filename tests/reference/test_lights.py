@@ -136,6 +136,32 @@ def test_exr_and_rgbe_maps_agree(tmp_path):
     assert lights.load_light(tmp_path / "map.exr", shape=(8, 16)).environment.shape == (8, 16, 3)
 
 
+RADIANCE = b"#?RADIANCE\n%bFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n" + bytes([128, 128, 128, 129]) * 512  # all 1
+
+
+@pytest.mark.parametrize(
+    ("lines", "radiance"),
+    [
+        (b"", (1, 1, 1)),
+        (b"EXPOSURE=2\n", (0.5, 0.5, 0.5)),
+        (b"EXPOSURE= 2.0e+00\nEXPOSURE=0.25\n", (2, 2, 2)),
+        (b"COLORCORR=1 2 4\nEXPOSURE=0.5\nCOLORCORR=1 1 2\n", (2, 1, 0.25)),
+        (b"\tEXPOSURE=2\nSOFTWARE=EXPOSURE=2\n", (1, 1, 1)),  # of a picture that it was made of; of something else
+    ],
+)
+def test_a_radiance_header_says_what_the_pixels_were_multiplied_by(tmp_path, lines, radiance):
+    path = bad_file(tmp_path, "map.hdr", RADIANCE % lines)
+    found = lights.load_light(path, normalise=False).environment
+    np.testing.assert_allclose(found, np.broadcast_to(np.float32(radiance), found.shape), rtol=1e-6)
+
+
+@pytest.mark.parametrize("line", [b"EXPOSURE=0", b"EXPOSURE=", b"EXPOSURE=nan", b"COLORCORR=1 1", b"COLORCORR=1 -1 1"])
+def test_a_radiance_header_that_makes_no_sense_is_refused(tmp_path, line):
+    path = bad_file(tmp_path, "map.hdr", RADIANCE % (line + b"\n"))
+    with pytest.raises(UnirenderError, match=r"map\.hdr: its header has '(EXPOSURE|COLORCORR)=.*above 0"):
+        lights.load_light(path)
+
+
 def test_area_resampling_of_a_large_picture_costs_little_memory():
     picture = np.ones((1024, 2048, 3), np.float32)
     tracemalloc.start()

@@ -13,9 +13,11 @@ A lat-long LDR panorama (`photograph=False`) gets step 1 only.
 
 **Lat-long maps.** The pixels of a map are areas: its first row ends at the pole, and it is resampled to the contract's
 grid, whose first row lies on it. An EXR that unirender wrote is on that grid already (`unirender.exr.on_pole_grid`) and
-taken as it is.
+taken as it is. Pixels of a Radiance file are divided by what its header says they were multiplied by (`EXPOSURE`,
+`COLORCORR`).
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +28,14 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
 from unirender.lighting import resample_environment
-from unirender.pictures import check_finite, display_values, negative_share, open_picture
+from unirender.pictures import check_finite, display_colors, negative_share, open_picture
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
 WINDOW_DEG, FADE_DEG = 45.0, 30.0
+MOST_HEADER_BYTES = 2**16  # of a Radiance file
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
 
@@ -131,7 +134,7 @@ def _box_resize(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     """Display values of a picture, upright; an alpha channel is dropped."""
-    return np.ascontiguousarray(display_values(open_picture(path), f"light {path}")[..., :3])
+    return np.ascontiguousarray(display_colors(open_picture(path), f"light {path}")[..., :3])
 
 
 def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
@@ -155,4 +158,28 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
-    return np.array(bitmap), {}
+    return (np.array(bitmap) / _multiplied(path)).astype(np.float32), {}
+
+
+def _multiplied(path: Path) -> Float[np.ndarray, "3"]:
+    """What the pixels of a Radiance file were multiplied by: all its `EXPOSURE` and `COLORCORR` lines; else 1."""
+    factor = np.ones(3)
+    with path.open("rb") as file:
+        header = file.read(MOST_HEADER_BYTES)
+    if not header.startswith(b"#?"):
+        return factor
+    for line in header.split(b"\n\n", 1)[0].decode(errors="replace").split("\n"):
+        name, _, text = line.partition("=")  # indented lines belong to the pictures that this one was made of
+        if name not in ("EXPOSURE", "COLORCORR"):
+            continue
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != (1 if name == "EXPOSURE" else 3) or not all(0 < value < math.inf for value in values):
+            expected = "a number" if name == "EXPOSURE" else "three numbers"
+            raise UnirenderError(
+                f"light {path}: its header has {line[:60]!r}, expected {expected} above 0; write the file again"
+            )
+        factor *= values
+    return factor
