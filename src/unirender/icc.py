@@ -27,18 +27,25 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
     data = image.info.get("icc_profile")
     if not data or image.mode.startswith(("I", "F")):
         return image
-    has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+    if image.mode in ("RGBa", "La"):  # premultiplied
+        image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
+    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
     alpha = image.convert("RGBA").getchannel("A") if has_alpha else None
     colors = image if image.mode in ("RGB", "L", "CMYK") else image.convert(_opaque_mode(image))
+    space = ""
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(data))
+        space = profile.profile.xcolor_space.strip()  # pyright: ignore[reportAttributeAccessIssue] - typed as a file
+        if colors.mode == "L" and space == "RGB":  # grey was made of colours
+            colors = colors.convert("RGB")
         if colors.mode == "RGB" and _is_srgb(profile):
             return image
         srgb, intent = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
         converted = ImageCms.profileToProfile(colors, profile, srgb, renderingIntent=intent, outputMode="RGB")
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        reason = f"for {space} and the picture is {colors.mode}" if space else str(error)
         raise UnirenderError(
-            f"{name}: its ICC profile cannot be used ({error}); convert the picture to sRGB, or save it without profile"
+            f"{name}: its ICC profile cannot be used ({reason}); convert it to sRGB, or save it without profile"
         ) from error
     assert converted is not None, "it was not converted in place"
     if alpha is not None:
@@ -48,7 +55,7 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
 
 def _opaque_mode(image: Image.Image) -> str:
     """Grey stays grey: its profile has one channel."""
-    return "L" if image.mode in ("LA", "La", "1") else "RGB"
+    return "L" if image.mode in ("LA", "1") else "RGB"
 
 
 def _is_srgb(profile: ImageCms.ImageCmsProfile) -> bool:

@@ -148,7 +148,7 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
                 "grey; save linear radiance as EXR"
             )
         return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
-    if image.mode in ("LAB", "HSV", "YCbCr"):
+    if image.mode == "LAB":
         raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")

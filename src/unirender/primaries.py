@@ -49,7 +49,7 @@ def _to_rec709(chromaticities: Sequence[float], name: str) -> Float[np.ndarray, 
         matrix = colour.matrix_RGB_to_RGB(stated, ours, chromatic_adaptation_transform="Bradford")
     except np.linalg.LinAlgError:
         matrix = np.full((3, 3), np.nan)
-    if not np.isfinite(matrix).all():
+    if not np.isfinite(matrix).all() or points[3, 1] <= 0:
         raise UnirenderError(
             f"{name}: its chromaticities {tuple(round(float(x), 4) for x in chromaticities)} are those of no colour "
             "space, expected x, y of red, green, blue and white; convert the file to linear Rec.709"

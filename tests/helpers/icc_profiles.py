@@ -12,22 +12,33 @@ WHITE_D50 = (0.9642, 1.0, 0.8249)
 
 def matrix_profile(primaries: np.ndarray, gamma: float) -> bytes:
     """A display profile (version 2): linear = value ** gamma in each channel, XYZ = primaries @ linear."""
+    tags = {name: _xyz(primaries[:, i]) for i, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ"))}
+    return _profile(b"RGB ", tags | dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), _curve(gamma)))
 
-    def fixed(value: float) -> bytes:
-        return struct.pack(">i", round(value * 65536))
 
-    def xyz(values: np.ndarray | tuple[float, ...]) -> bytes:
-        return b"XYZ \0\0\0\0" + b"".join(fixed(float(value)) for value in values)
+def grey_profile(gamma: float = 1.0) -> bytes:
+    """The same of one channel."""
+    return _profile(b"GRAY", {b"kTRC": _curve(gamma)})
 
-    curve = b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + b"\0\0"
-    tags = {b"wtpt": xyz(WHITE_D50)}
-    tags |= {name: xyz(primaries[:, i]) for i, name in enumerate((b"rXYZ", b"gXYZ", b"bXYZ"))}
-    tags |= dict.fromkeys((b"rTRC", b"gTRC", b"bTRC"), curve)
+
+def _profile(space: bytes, own: dict[bytes, bytes]) -> bytes:
+    tags = {b"wtpt": _xyz(WHITE_D50)} | own
     table, body, place = b"", b"", 128 + 4 + 12 * len(tags)
     for name, data in tags.items():
         table += name + struct.pack(">II", place + len(body), len(data))
         body += data
-    size = place + len(body)
-    header = struct.pack(">I4xI4s4s4s12x4s", size, 0x02400000, b"mntr", b"RGB ", b"XYZ ", b"acsp")
-    header += b"\0" * (68 - len(header)) + b"".join(map(fixed, WHITE_D50))
+    header = struct.pack(">I4xI4s4s4s12x4s", place + len(body), 0x02400000, b"mntr", space, b"XYZ ", b"acsp")
+    header += b"\0" * (68 - len(header)) + b"".join(map(_fixed, WHITE_D50))
     return header.ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + body
+
+
+def _fixed(value: float) -> bytes:
+    return struct.pack(">i", round(float(value) * 65536))
+
+
+def _xyz(values: np.ndarray | tuple[float, ...]) -> bytes:
+    return b"XYZ \0\0\0\0" + b"".join(map(_fixed, values))
+
+
+def _curve(gamma: float) -> bytes:
+    return b"curv\0\0\0\0" + struct.pack(">IH", 1, round(gamma * 256)) + b"\0\0"

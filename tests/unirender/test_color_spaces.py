@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from icc_profiles import P3_D50, SRGB_D50, matrix_profile
+from icc_profiles import P3_D50, SRGB_D50, grey_profile, matrix_profile
 from PIL import Image, ImageCms
 
 from unirender.color import srgb_decode, srgb_encode
@@ -76,17 +76,32 @@ def test_a_mask_has_no_colour_space(tmp_path: Path) -> None:
 def test_a_damaged_profile_is_refused(profile: bytes, tmp_path: Path) -> None:
     image = Image.fromarray(PIXELS)
     image.info["icc_profile"] = profile
-    with pytest.raises(UnirenderError, match=r"a picture: its ICC profile cannot be used .* convert the picture"):
+    with pytest.raises(UnirenderError, match=r"a picture: its ICC profile cannot be used .* convert it"):
         in_srgb(image, "a picture")
-    grey = Image.fromarray(PIXELS)
-    grey.info["icc_profile"] = matrix_profile(SRGB_D50, 1.0)
+
+
+def test_grey_with_a_profile_of_colours(tmp_path: Path) -> None:
+    """As programs leave it that take the colours out of a picture: it means what three equal channels mean."""
+    grey, profile = Image.fromarray(PIXELS[..., 0]), matrix_profile(SRGB_D50, 1.0)
+    grey.save(tmp_path / "grey.png", icc_profile=profile)
+    grey.convert("RGB").save(tmp_path / "rgb.png", icc_profile=profile)
+    one, three = (read_picture(tmp_path / f"{name}.png").image_srgb for name in ("grey", "rgb"))
+    np.testing.assert_array_equal(one, three)
+    assert np.abs(one[..., 0] - PIXELS[..., 0] / 255).max() > 0.1
+
+
+def test_grey_with_a_profile_of_grey(tmp_path: Path) -> None:
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "grey.png", icc_profile=grey_profile(1.0))
+    expected = srgb_encode((PIXELS[..., 0] / 255.0).astype(np.float32))
+    seen = read_picture(tmp_path / "grey.png").image_srgb
+    np.testing.assert_allclose(seen, np.repeat(expected[..., None], 3, axis=-1), rtol=0, atol=2 / 255)
+
+
+def test_a_profile_of_grey_in_a_colour_picture_is_refused() -> None:
+    image = Image.fromarray(PIXELS)
+    image.info["icc_profile"] = grey_profile()
     with pytest.raises(UnirenderError, match="its ICC profile cannot be used"):
-        in_srgb(_with_profile(grey.convert("L"), grey.info["icc_profile"]), "a grey picture")
-
-
-def _with_profile(image: Image.Image, profile: bytes) -> Image.Image:
-    image.info["icc_profile"] = profile
-    return image
+        in_srgb(image, "a picture")
 
 
 def test_a_lab_picture_is_refused(tmp_path: Path) -> None:
