@@ -32,7 +32,8 @@ from unirender_evaluation.specs import Column, TableSpec
 NAME = "maw"
 LAYOUT = "MAW's folders labels (with meta.csv) and images_png"
 COLUMNS = 6
-RANGE_TOLERANCE = 1e-3  # of measured colours
+RANGE_TOLERANCE = 1e-3  # of measured colours below 0
+MOST_MEASURED = 2.0  # a measurement of white may end a little above 1; far above, it is in another unit
 SIZE = (320, 240)  # width and height at which albedo and mask are compared
 
 
@@ -136,10 +137,11 @@ def adobe_to_rec709() -> Float[np.ndarray, "3 3"]:
 def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integer[np.ndarray, "h w"]]:
     """The measured colours, linear Rec.709 in [0, 1], and the labels of the pixels that have them.
 
-    Adobe RGB has colours outside Rec.709: what leaves [0, 1] on the way is clipped.
+    Adobe RGB has colours outside Rec.709: what leaves [0, 1] on the way is clipped, and so is a measurement above 1.
 
     Raises:
-        UnirenderError: a file is broken, a stored colour lies outside [0, 1], or the files do not fit together.
+        UnirenderError: a file is broken, a stored colour is in another unit (negative, or above `MOST_MEASURED`), or
+            the files do not fit together.
     """
     try:
         adobe = np.load(colours, allow_pickle=False)
@@ -149,7 +151,7 @@ def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integ
         raise UnirenderError(f"{colours}: is an archive of arrays, expected one array of (k, 3)")
     if adobe.ndim != 2 or adobe.shape[1] != 3 or adobe.dtype.kind not in "fiu" or not np.isfinite(adobe).all():
         raise UnirenderError(f"{colours}: got {adobe.dtype} of {adobe.shape}, expected finite numbers of (k, 3)")
-    if adobe.size and (adobe.min() < -RANGE_TOLERANCE or adobe.max() > 1 + RANGE_TOLERANCE):
+    if adobe.size and (adobe.min() < -RANGE_TOLERANCE or adobe.max() > MOST_MEASURED):
         raise UnirenderError(
             f"{colours}: has values from {adobe.min():g} to {adobe.max():g}, expected linear colours from 0 to 1"
         )

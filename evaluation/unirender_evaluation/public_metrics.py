@@ -171,7 +171,7 @@ def judgements(content: Mapping[str, Any]) -> list[Judgement]:
     Raises:
         KeyError, TypeError, ValueError: the content has another layout.
         UnirenderError: a point lies outside the photograph, `opaque` is neither true nor false nor null (not known), or
-            the weight of a judgement that would count is negative or not finite.
+            the weight of a judgement that would count is no finite number. (One of 0 or less does not count.)
     """
     points = {point["id"]: _point(point) for point in content["intrinsic_points"]}
     found = []
@@ -180,9 +180,9 @@ def judgements(content: Mapping[str, Any]) -> list[Judgement]:
         weight = entry["darker_score"]
         if entry["darker"] not in ("1", "2", "E") or weight is None or not (first_opaque and second_opaque):
             continue
-        if not _in_range(weight, sys.float_info.max):
+        if not _in_range(weight, sys.float_info.max, least=-sys.float_info.max):
             raise UnirenderError(
-                f"intrinsic_comparisons[{number}]: darker_score is {weight!r}, expected a finite number >= 0"
+                f"intrinsic_comparisons[{number}]: darker_score is {weight!r}, expected a finite number"
             )
         if weight > 0:
             found.append(Judgement(first, second, entry["darker"], float(weight)))
@@ -204,9 +204,9 @@ def _point(entry: Mapping[str, Any]) -> tuple[tuple[float, float], bool]:
     return (float(entry["x"]), float(entry["y"])), entry["opaque"] is True
 
 
-def _in_range(value: Any, most: float) -> bool:
-    """Whether a value of a JSON file is a number from 0 to `most`; NaN is none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= most
+def _in_range(value: Any, most: float, least: float = 0) -> bool:
+    """Whether a value of a JSON file is a number from `least` to `most`; NaN is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
 
 def whdr(albedo_linear: Rgb, judged: Sequence[Judgement], delta: float = DELTA) -> dict[str, float]:

@@ -48,6 +48,7 @@ from unirender_evaluation.public_sets import (
     need_folder,
     read_array,
     read_display,
+    read_photograph,
 )
 from unirender_evaluation.specs import TableSpec
 
@@ -155,7 +156,7 @@ class StanfordOrb:
             raise UnirenderError(f"{sample.key}: no photograph was taken from the camera of the relit one")
         mask = self._mask(frame)
         path = frame.photo(self.folder)
-        linear = srgb_decode(read_display(path, 3))
+        linear = srgb_decode(read_photograph(path))
         full = read_display(frame.mask(self.folder), 1)
         if full.shape[:2] != linear.shape[:2]:
             raise UnirenderError(
@@ -212,8 +213,11 @@ class StanfordOrb:
         """A map of the truth, with a look at the values that count: those of the eroded mask."""
         if path.suffix == ".png":
             return srgb_decode(self._reduced(read_display(path, 3), path, frame))
-        found = self._reduced(read_array(path, 1 if name == "depth" else 3), path, frame)
-        scoring.check_truth(name, found[counted[..., 0] > 0], str(path))
+        full = read_array(path, 1 if name == "depth" else 3)
+        found = self._reduced(full, path, frame)
+        block = len(full) // len(found)  # means of unit vectors are shorter: what is stored is looked at
+        inside = np.kron(counted[..., 0] > 0, np.ones((block, block), bool))
+        scoring.check_truth(name, full[: len(inside), : len(inside)][inside], str(path))
         return found
 
     def why_absent(self, table: str) -> str | None:

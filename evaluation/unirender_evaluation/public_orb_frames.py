@@ -15,8 +15,8 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 
 LDR, HDR, TRUTH = "blender_LDR", "blender_HDR", "ground_truth"
-# `teapot_scene001`, and as the evaluation code names them `scene001_obj018_teapot`
 ROTATION_TOLERANCE = 1e-3
+# `teapot_scene001`, and as the evaluation code names them `scene001_obj018_teapot`
 NAMES = (re.compile(r"(?P<object>.+)_scene\d+"), re.compile(r"scene\d+_(?P<object>.+)"))
 
 
@@ -150,12 +150,13 @@ def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Fram
     if not 0 < angle < math.pi:
         raise ValueError(f"camera_angle_x {angle:g}")
     file = PurePosixPath(entry["file_path"])
-    turn = pose[:3, :3]
-    if not (np.abs(turn.T @ turn - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(turn) > 0):
+    turn, scale = pose[:3, :3], float(np.cbrt(np.linalg.det(pose[:3, :3])))
+    if scale <= 0 or np.abs(turn.T @ turn / scale**2 - np.eye(3)).max() >= ROTATION_TOLERANCE:
         raise UnirenderError(
-            f"frame {file}: the transform_matrix is no rotation and position, expected camera to world without scale "
-            "(else divide the first three columns by their lengths) or mirroring"
+            f"frame {file}: the transform_matrix is no rotation, position and scale, expected camera to world without "
+            "mirroring or shear"
         )
+    pose[:3, :3] = turn / scale  # captures that are aligned with one another may be scaled
     rows = tuple(tuple(float(x) for x in row) for row in pose)
     return Frame(str(entry.get("scene_name", capture)), file.parent.name, file.stem, angle, rows)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, srgb_decode
-from unirender_evaluation.public_sets import MAPS, Sample, image_size, read_display, shrunk
+from unirender_evaluation.public_sets import MAPS, Sample, image_size, read_photograph, shrunk
 
 RESOLUTION = 512
 
@@ -27,7 +27,7 @@ class Scenes:
 
     def inputs(self, sample: Sample) -> dict[str, Any]:
         """The photograph in 8 bits, all of it covered, through the contract's camera."""
-        picture = read_display(sample.files[0], 3)
+        picture = read_photograph(sample.files[0])
         if max(picture.shape[:2]) > self.resolution:
             picture = image_srgb(shrunk(srgb_decode(picture), self.resolution))
         picture = (np.round(picture * 255) / 255).astype(np.float32)

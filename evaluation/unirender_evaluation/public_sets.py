@@ -19,7 +19,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.files import file_sha256
 from unirender.intrinsics import Intrinsics
-from unirender.pictures import display_values, open_picture
+from unirender.pictures import display_colors, display_values, open_picture
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.specs import TableSpec
@@ -170,6 +170,15 @@ def read_display(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
     """
     values = display_values(open_picture(path), str(path))[..., :3]
     return values if channels == 3 else values.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def read_photograph(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """Display values of a photograph, alpha dropped; in sRGB, whatever its ICC profile says.
+
+    Raises:
+        UnirenderError: no readable picture.
+    """
+    return display_colors(open_picture(path), str(path))[..., :3]
 
 
 def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
