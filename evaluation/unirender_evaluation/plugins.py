@@ -207,6 +207,4 @@ def _source(*defined: Any) -> str:
         with suppress(OSError, TypeError):
             file = inspect.getfile(what)
             files[file] = Path(file).read_bytes()
-    return (
-        hashlib.sha256(b"".join(files.values())).hexdigest() if files else "unknown"
-    )  # its config tells versions apart
+    return hashlib.sha256(b"".join(files.values())).hexdigest() if files else "unknown"

@@ -90,7 +90,7 @@ def reaching_light(config: DatasetConfig, plan: LightPlan, light: Light, rendere
     Raises:
         LightFault: there is no other, or `TRIES` of them do not reach it either.
     """
-    pool, passed = user_lights(config), list[str]()
+    pool, passed, unread = user_lights(config), list[str](), list[str]()
     while True:
         source = light.provenance["file"] if light.provenance["kind"] == "pool" else None
         said = f"dataset: light {source or light.name}"
@@ -99,6 +99,7 @@ def reaching_light(config: DatasetConfig, plan: LightPlan, light: Light, rendere
         except LightFault as error:
             fault = LightFault(f"{error}; complete shards are kept")
             passed.append(source or "")
+            unread += _skipped(light)
             left = tuple(name for name in pool.names if name not in passed) if pool and source else ()
             if not left or len(passed) == TRIES:
                 raise fault from error
@@ -110,7 +111,10 @@ def reaching_light(config: DatasetConfig, plan: LightPlan, light: Light, rendere
                 raise fault from unreadable
             continue
         if passed:
-            light = dataclasses.replace(light, provenance={**light.provenance, "not_reaching": "\n".join(passed)})
+            said_so = {"not_reaching": "\n".join(passed)}
+            if lines := dict.fromkeys([*unread, *_skipped(light)]):
+                said_so["skipped"] = "\n".join(lines)
+            light = dataclasses.replace(light, provenance={**light.provenance, **said_so})
         return light, factor
 
 

@@ -169,7 +169,8 @@ def _multiplied(path: Path) -> Float[np.ndarray, "3"]:
     if not header.startswith(b"#?"):
         return factor
     for line in header.split(b"\n\n", 1)[0].decode(errors="replace").split("\n"):
-        name, _, text = line.partition("=")  # indented lines belong to the pictures that this one was made of
+        name, _, text = line.partition("=")
+        name = name.rstrip()  # indented lines belong to the pictures that this one was made of
         if name not in ("EXPOSURE", "COLORCORR"):
             continue
         try:

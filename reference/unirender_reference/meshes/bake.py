@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from unirender.errors import UnirenderError
 from unirender_reference.meshes.surface import Texture, unit_vectors
 from unirender_reference.meshes.tiles import Patch, Tile, wrapped
 
@@ -77,6 +78,8 @@ def _block_sizes(patch: Patch, clipped: np.ndarray, texels: int) -> Int[np.ndarr
     for texture in patch.textures.values():
         uv = patch.lookup(texture) * texture.texels.shape[1::-1]
         longest = np.maximum(longest, np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=-1).max(1))
+    if not np.isfinite(longest).all():
+        raise UnirenderError("mesh: texture coordinates are not finite, or leave the range of float32")
     density = FINEST
     while True:
         chosen = np.minimum(np.searchsorted(SIZES, density * longest + 1), len(SIZES) - 1)
