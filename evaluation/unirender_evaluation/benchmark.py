@@ -325,7 +325,8 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
 
 def write_outputs(out: Path, result: BenchResult) -> None:
     """Writes tables and verdict, each moved into place when complete."""
-    from unirender_evaluation.table_formats import to_json, to_latex, to_markdown
+    from unirender_evaluation.table_formats import to_json, to_markdown
+    from unirender_evaluation.table_latex import to_latex
 
     writers: dict[str, Callable[[], str]] = {
         "tables.md": lambda: "\n\n".join(to_markdown(table) for table in result.tables) + "\n",

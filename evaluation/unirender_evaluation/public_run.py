@@ -29,7 +29,8 @@ from unirender_evaluation.public_sets import PublicSet, Sample
 from unirender_evaluation.public_tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
-from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+from unirender_evaluation.table_formats import print_table, to_json, to_markdown
+from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.tables import Table
 from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
 from unirender_reference.folder_lock import locked, made_folder

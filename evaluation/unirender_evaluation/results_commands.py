@@ -189,7 +189,8 @@ def _validate(path: Path) -> int:
 def _print_tables(tables: "list[Table]", kind: str) -> None:
     from rich.console import Console
 
-    from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+    from unirender_evaluation.table_formats import print_table, to_json, to_markdown
+    from unirender_evaluation.table_latex import to_latex
 
     if kind == "text":
         console = Console()

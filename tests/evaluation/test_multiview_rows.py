@@ -20,7 +20,8 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.report import write_report
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.suites import Suite, load_suite
-from unirender_evaluation.table_formats import to_json, to_latex, to_markdown
+from unirender_evaluation.table_formats import to_json, to_markdown
+from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.verdict import ceiling_breaches

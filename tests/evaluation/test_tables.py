@@ -19,7 +19,8 @@ from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
-from unirender_evaluation.table_formats import print_table, to_json, to_latex, to_markdown
+from unirender_evaluation.table_formats import print_table, to_json, to_markdown
+from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.table_text import TextTable, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
 

@@ -18,7 +18,7 @@ from unirender_evaluation.methods import InputAsAlbedo
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.rows import make_row, trivial_rows
-from unirender_evaluation.table_formats import to_latex
+from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions

@@ -9,9 +9,10 @@ from gltf_files import GltfWriter, bilinear, quad_uv
 from PIL import Image
 
 from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
 from unirender_reference.meshes import load_mesh
 from unirender_reference.meshes.bake import baked_tile
-from unirender_reference.meshes.surface import Material
+from unirender_reference.meshes.surface import Material, Texture
 from unirender_reference.meshes.tiles import Patch
 from unirender_reference.scene_spec import object_hash
 from unirender_reference.shapes import MeshObject
@@ -110,6 +111,15 @@ def test_blocks_take_no_more_room_than_there_is():
         assert tile.uv.max() < 1
     assert sizes == sorted(sizes)
     assert sizes[-1] > 10_000
+
+
+def test_texture_coordinates_that_are_not_finite_are_refused():
+    uv = np.random.default_rng(0).random((50, 3, 2))
+    uv[7, 1] = np.nan
+    texture = Texture(np.ones((8, 8, 3), np.float32))
+    patch = Patch(np.zeros((50, 3, 3)), {0: uv}, np.ones((50, 3, 3)), Material({"albedo": texture}))
+    with pytest.raises(UnirenderError, match="texture coordinates are not finite"):
+        baked_tile(patch, 400)
 
 
 QUAD_OBJ = """mtllib quad.mtl

@@ -144,6 +144,7 @@ RADIANCE = b"#?RADIANCE\n%bFORMAT=32-bit_rle_rgbe\n\n-Y 16 +X 32\n" + bytes([128
     [
         (b"", (1, 1, 1)),
         (b"EXPOSURE=2\n", (0.5, 0.5, 0.5)),
+        (b"EXPOSURE = 2\n", (0.5, 0.5, 0.5)),
         (b"EXPOSURE= 2.0e+00\nEXPOSURE=0.25\n", (2, 2, 2)),
         (b"COLORCORR=1 2 4\nEXPOSURE=0.5\nCOLORCORR=1 1 2\n", (2, 1, 0.25)),
         (b"\tEXPOSURE=2\nSOFTWARE=EXPOSURE=2\n", (1, 1, 1)),  # of a picture that it was made of; of something else

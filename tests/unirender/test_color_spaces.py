@@ -64,6 +64,19 @@ def test_alpha_and_palettes_go_through_a_profile(tmp_path: Path) -> None:
     np.testing.assert_array_equal(palette.image_srgb, same.image_srgb)
 
 
+@pytest.mark.parametrize(("premultiplied", "straight"), [("La", "LA"), ("RGBa", "RGBA")])
+def test_premultiplied_pictures_go_through_a_profile(premultiplied: str, straight: str) -> None:
+    image = Image.fromarray(np.dstack([PIXELS, np.full(PIXELS.shape[:2], 255, np.uint8)])).convert(straight)
+    both = [_with_profile(image.convert(mode), matrix_profile(SRGB_D50, 1.0)) for mode in (premultiplied, straight)]
+    one, other = (np.asarray(in_srgb(shown, "a picture")) for shown in both)
+    np.testing.assert_array_equal(one, other)
+
+
+def _with_profile(image: Image.Image, profile: bytes) -> Image.Image:
+    image.info["icc_profile"] = profile
+    return image
+
+
 def test_a_mask_has_no_colour_space(tmp_path: Path) -> None:
     """Coverage 0.5 is 0.5 in a file with whatever profile."""
     grey = np.full((4, 4, 3), 128, np.uint8)
@@ -146,8 +159,9 @@ def test_an_exr_in_rec709_keeps_its_values(tmp_path: Path, chromaticities: tuple
         np.testing.assert_array_equal(seen[name], value)
 
 
-def test_chromaticities_of_no_space_are_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a.exr", {name: np.ones((3, 3)) for name in "RGB"}, (0.3, 0.3) * 4)
+@pytest.mark.parametrize("chromaticities", [(0.3, 0.3) * 4, (0.0,) * 8, (*REC709[:6], 0.0, 0.0)])
+def test_chromaticities_of_no_space_are_refused(tmp_path: Path, chromaticities: tuple[float, ...]) -> None:
+    write(tmp_path / "a.exr", {name: np.ones((3, 3)) for name in "RGB"}, chromaticities)
     with pytest.raises(UnirenderError, match="are those of no colour space, expected x, y of red, green, blue"):
         read_exr(tmp_path / "a.exr")
 
