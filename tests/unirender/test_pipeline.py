@@ -407,8 +407,8 @@ def test_frame_keeps_constants_and_rays(size: tuple[int, int]) -> None:
     np.testing.assert_allclose(back[frame.leave(frame.enter(mask)) * mask > 1e-2], 0.7, rtol=1e-3)
     camera = Camera()
     padded = frame.camera(camera).rays(frame.side, frame.side)
-    top, left = frame.offset
-    inner = padded[top : top + size[0], left : left + size[1]]
+    top, left = frame.corner
+    inner = padded[-top : size[0] - top, -left : size[1] - left]
     np.testing.assert_allclose(inner, camera.rays(*size), rtol=0, atol=1e-5)
 
 

@@ -33,7 +33,7 @@ class View:
 
     def frame(self, size: int) -> Frame:
         """How it sits in a network's square."""
-        return Frame(self.mask.shape[0], self.mask.shape[1], size)
+        return Frame.around(self.mask, size)
 
 
 def decompose_views(

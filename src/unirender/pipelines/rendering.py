@@ -17,7 +17,7 @@ from unirender.pipelines.settings import Sampling
 
 def enter(network: Network, intrinsics: Intrinsics) -> tuple[Frame, Intrinsics]:
     """The intrinsics at the network's size, and how they got there."""
-    frame = Frame(intrinsics.height, intrinsics.width, network.size)
+    frame = Frame.around(intrinsics.require("mask")["mask"], network.size)
     return frame, frame.enter_intrinsics(intrinsics, network.conditioning.packing.environment_size)
 
 

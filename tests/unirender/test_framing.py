@@ -1,0 +1,82 @@
+"""How a picture of any size comes into the network's square: small objects are cut out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from unirender.camera import Camera
+from unirender.pipelines.framing import FAINT, Frame
+from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+SIZE = 32
+
+
+def disc(height: int, width: int, row: float, column: float, radius: float) -> np.ndarray:
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    return np.clip(radius + 0.5 - np.hypot(y - row, x - column), 0, 1).astype(np.float32)[..., None]
+
+
+@pytest.mark.parametrize(
+    ("size", "where"), [((100, 100), (50, 50)), ((90, 200), (20, 170)), ((200, 60), (6, 5)), ((40, 300), (36, 290))]
+)
+def test_a_small_object_is_cut_out_and_put_back(size: tuple[int, int], where: tuple[int, int]) -> None:
+    mask = disc(*size, *where, 9)
+    frame = Frame.around(mask, SIZE)
+    assert frame.side < 30
+    square = frame.enter(mask)
+    assert square[[0, -1]].max() == square[:, [0, -1]].max() == 0, "nothing touches the border"
+    assert square.sum() == pytest.approx(mask.sum() * (SIZE / frame.side) ** 2, rel=0.05)
+    value = 0.7 * (mask > 0).astype(np.float32)
+    back = frame.leave_map(frame.enter_map(value, mask), mask)
+    np.testing.assert_allclose(back[mask > 0.5], 0.7, rtol=1e-3)
+    assert not back[mask == 0].any()
+    camera = Camera(50, (0.4, 0.6))
+    top, left = frame.corner
+    rows, columns = slice(max(top, 0), size[0]), slice(max(left, 0), size[1])
+    whole, cut = camera.rays(*size)[rows, columns], frame.camera(camera).rays(frame.side, frame.side)
+    inside = cut[max(-top, 0) :, max(-left, 0) :][: whole.shape[0], : whole.shape[1]]
+    np.testing.assert_allclose(inside, whole[: inside.shape[0], : inside.shape[1]], atol=1e-5)
+
+
+def test_what_fills_the_picture_or_has_the_networks_size_is_left_as_it_is() -> None:
+    assert Frame.around(disc(64, 64, 32, 32, 25), SIZE) == Frame(64, 64, SIZE)
+    assert Frame.around(disc(SIZE, SIZE, 16, 16, 4), SIZE).identity
+    assert Frame.around(np.zeros((64, 64, 1), np.float32), SIZE) == Frame(64, 64, SIZE)
+
+
+def test_haze_is_left_out_only_where_it_hardly_counts() -> None:
+    mask = disc(128, 128, 64, 64, 12)
+    faint = np.maximum(mask, np.float32(1e-4))
+    assert Frame.around(faint, SIZE).cut == Frame.around(mask, SIZE).cut
+    assert Frame.around(np.maximum(mask, np.float32(FAINT)), SIZE).cut is None
+
+
+def test_one_pixel_in_a_corner_is_seen() -> None:
+    mask = np.zeros((300, 200, 1), np.float32)
+    mask[299, 0] = 1
+    frame = Frame.around(mask, SIZE)
+    assert frame.enter(mask).max() > 0.5
+    assert frame.leave_map(np.ones((SIZE, SIZE, 1), np.float32), mask)[299, 0] == pytest.approx(1)
+
+
+def test_a_small_object_is_what_it_is_when_somebody_cuts_it_out_before() -> None:
+    """The picture of README in one of four times its size, and the object of it alone, seen by the same camera."""
+    rgba = np.asarray(Image.open(Path(__file__).parents[2] / "docs/_static/example.png"), np.float32) / 255
+    height, width = rgba.shape[:2]
+    canvas = np.zeros((4 * height, 4 * width, 4), np.float32)
+    canvas[height : 2 * height, 2 * width : 3 * width] = rgba
+    camera = Camera(60, (0.4, 0.45))
+    cut = Frame.around(canvas[..., 3:], 64)
+    top, left = cut.corner
+    inner = np.s_[top : top + cut.side, left : left + cut.side]
+    pipeline = UniRenderPipeline.from_pretrained("tiny")
+    alone = pipeline.decompose(canvas[inner][..., :3], canvas[inner][..., 3:], camera=cut.camera(camera)).intrinsics
+    found = pipeline.decompose(canvas[..., :3], canvas[..., 3:], camera=camera).intrinsics
+    for name, value in alone.maps.items():
+        there = getattr(found, name)
+        np.testing.assert_allclose(there if name == "environment" else there[inner], value, rtol=1e-3, atol=1e-3)
+    again = pipeline.render(found)
+    np.testing.assert_allclose(again[inner], pipeline.render(alone), atol=1e-3)
+    assert not again[canvas[..., 3] == 0].any()
