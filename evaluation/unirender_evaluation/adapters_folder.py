@@ -24,6 +24,7 @@ from unirender.errors import UnirenderError
 from unirender.models.diffusers_folder import TOKENIZER_FILES, load_tokenizer, load_weights, read_config, silent
 from unirender.models.precision import resolve_device, resolve_dtype
 from unirender_evaluation.methods import Image, Mask
+from unirender_evaluation.versions import installed_version
 
 CLASSES = {
     "unet": ("_class_name", "UNet2DConditionModel"),
@@ -97,6 +98,7 @@ class FolderMethod:
             "background": self.background,
             "device": self.device,
             "dtype": self.dtype,
+            "transformers": installed_version("transformers"),  # of the text encoder; no row of ours has one
         }
 
     def generator(self) -> torch.Generator:

@@ -130,7 +130,7 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
     rows = _told_apart(rows)
     methods = tuple(row.info for row in rows)
     merged = [replace(r, method=row.info.key) for row in rows for r in row.records.values()]
-    # In the order of a run's own records, on which the bootstrap's draws depend.
+    # In the order of a run's own records, on which the draws of intervals depend.
     merged.sort(key=lambda r: (r.table, r.protocol, r.method, r.sample))
     return _merged_run([file.run for file in files], methods), merged
 
@@ -172,6 +172,7 @@ def _merged_run(runs: Sequence[RunInfo], methods: tuple[MethodInfo, ...]) -> Run
         lpips=tuple(dict.fromkeys(name for run in runs for name in run.lpips)),
         code=" and ".join(dict.fromkeys(run.code or "-" for run in runs)),
         date=" and ".join(dict.fromkeys(run.date or "-" for run in runs)),
+        carried=" and ".join(dict.fromkeys(run.carried for run in runs if run.carried)),
         limit=min((run.limit for run in runs if run.limit is not None), default=None),
         seeds=tuple(sorted({seed for run in runs for seed in run.seeds})),
         environment=environment,

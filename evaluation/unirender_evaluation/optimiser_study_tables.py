@@ -2,9 +2,8 @@
 
 import json
 import math
-import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
@@ -17,7 +16,7 @@ from unirender_evaluation.optimiser_study_ingredients import FULL, GROUPS, Ingre
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, Estimate, paired_difference
+from unirender_evaluation.statistics import CONFIDENCE, METHOD, Estimate, paired_difference
 from unirender_evaluation.table_formats import format_number, header
 from unirender_evaluation.table_text import TextTable
 
@@ -45,7 +44,7 @@ class Cell:
     Attributes:
         mean: over objects.
         n: how many.
-        difference: from the full method (None in its own row), with `paired_interval`.
+        difference: from the full method (None in its own row), paired by object.
     """
 
     mean: float
@@ -83,27 +82,9 @@ def summarise(rows: Sequence[Ingredient], records: Sequence[Record]) -> list[Lin
             key = column.key(DEFAULT_VARIANT)
             own, full = values_of(records, row.name, key), values_of(records, FULL, key)
             mean = sum(own.values()) / len(own)
-            cells.append(Cell(mean, len(own), None if row.name == FULL else paired_interval(own, full)))
+            cells.append(Cell(mean, len(own), None if row.name == FULL else paired_difference(own, full)))
         lines.append(Line(row, tuple(cells)))
     return lines
-
-
-def paired_interval(a: Mapping[str, float], b: Mapping[str, float]) -> Estimate:
-    """Mean of a - b over the objects that both have, with the interval of Student's t.
-
-    A bootstrap of four objects is too narrow: it excludes 0 for one in five rows that differ by chance alone.
-
-    Raises:
-        UnirenderError: they have no object in common, or a difference is infinite.
-    """
-    from scipy.stats import t
-
-    found = paired_difference(a, b)
-    if found.n < 2:
-        return found
-    spread = statistics.stdev(a[sample] - b[sample] for sample in a.keys() & b.keys()) / math.sqrt(found.n)
-    half = float(t.ppf((1 + CONFIDENCE) / 2, found.n - 1)) * spread
-    return replace(found, low=found.mean - half, high=found.mean + half)
 
 
 def cell_text(cell: Cell, decimals: int) -> str:
@@ -178,7 +159,7 @@ def interval() -> tuple[str, str]:
     """How intervals are made, for the protocol."""
     return (
         "interval",
-        f"{CONFIDENCE:.0%} of Student's t over objects, n - 1 degrees of freedom; no correction for many rows",
+        f"{CONFIDENCE:.0%} over objects: {METHOD}; no correction for many rows",
     )
 
 

@@ -41,6 +41,7 @@ class BenchPhysics:
         from unirender_evaluation.physics_stage import SWEEP_SPP, Stage
         from unirender_evaluation.physics_tests import TESTS
         from unirender_evaluation.rows import SAMPLE_STEPS
+        from unirender_evaluation.statistics import CONFIDENCE, METHOD
         from unirender_evaluation.suites import load_suite
         from unirender_evaluation.tasks import scene_ids
         from unirender_evaluation.versions import versions
@@ -65,7 +66,7 @@ class BenchPhysics:
             "pictures that the suite does not store": f"{SWEEP_SPP} spp",
             "ours": f"mode mean; ambiguity: {POSTERIOR} samples of {SAMPLE_STEPS} steps",
             "truth": f"Mitsuba {suite.provenance['mitsuba']}",
-            "interval": "95% bootstrap over objects",
+            "interval": f"{CONFIDENCE:.0%} over objects: {METHOD}",
             "code": versions().code[:12],
         }
         found = write(self.out, values, settings)

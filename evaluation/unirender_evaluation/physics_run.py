@@ -28,7 +28,7 @@ from unirender_evaluation.physics_stage import Stage
 from unirender_evaluation.physics_tests import TESTS, PhysicsTest
 from unirender_evaluation.physics_tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
-from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_render import item_seed
 
@@ -152,7 +152,7 @@ def findings(values: Sequence[Value]) -> list[Finding]:
         for row in ROWS:
             own = [v for v in values if (v.test, v.row) == (test.name, row)]
             if own:
-                rows[row] = bootstrap_mean([v.value for v in own], [v.object for v in own])
+                rows[row] = mean_estimate([v.value for v in own], [v.object for v in own])
         found.append(Finding(test, rows))
     return found
 

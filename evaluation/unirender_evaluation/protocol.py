@@ -7,7 +7,7 @@ from unirender_evaluation.metrics import LPIPS_SCALES, OWN_MASK, Variant
 from unirender_evaluation.published import not_stated
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import Protocol
-from unirender_evaluation.statistics import CONFIDENCE, RESAMPLES, SEED
+from unirender_evaluation.statistics import CONFIDENCE, METHOD
 
 SPACE_TEXT = {"srgb": "sRGB (clipped to [0, 1], then encoded)", "linear": "linear Rec.709, clipped to [0, 1]"}
 SCALE_TEXT = {
@@ -52,10 +52,10 @@ def protocol_line(
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
         *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
-        ("interval", f"{CONFIDENCE:.0%} bootstrap over objects, {RESAMPLES} draws, seed {SEED}"),
+        ("interval", f"{CONFIDENCE:.0%} over objects: {METHOD}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
-        ("code", f"{run.code or '-'}, {run.date or '-'}"),
+        ("code", f"{run.code or '-'}, {run.date or '-'}{f' ({run.carried})' if run.carried else ''}"),
     ]
     if with_published:
         items.append(("published", f"as printed in the paper, on its own test set; not stated there: {not_stated()}"))

@@ -56,7 +56,7 @@ class Maw(Scenes):
     variant = Variant("whole")
 
     def samples(self) -> tuple[Sample, ...]:
-        """A sample for each line of `meta.csv`; a category is what the bootstrap draws."""
+        """A sample for each line of `meta.csv`; a category is what intervals are over."""
         return self._photographs
 
     @cached_property

@@ -10,7 +10,7 @@ from unirender_evaluation.public_orb_scoring import FLOORED
 from unirender_evaluation.public_sets import PublicSet
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import Column, TableSpec
-from unirender_evaluation.statistics import CONFIDENCE, RESAMPLES, SEED
+from unirender_evaluation.statistics import CONFIDENCE, METHOD
 from unirender_evaluation.tables import Table, build_table
 
 SHOWN = 5  # names of photographs without a prediction, in a note; `missing.txt` has all
@@ -68,7 +68,7 @@ def protocol_line(
         *public.protocol(spec.name),
         *((("LPIPS backbones", f"{', '.join(run.lpips) or 'none'}{absent}"),) if wanted else ()),
         ("n", f"{len(samples)} samples of {len(objects)} objects or scenes; {means}"),
-        ("interval", f"{CONFIDENCE:.0%} bootstrap over objects or scenes, {RESAMPLES} draws, seed {SEED}"),
+        ("interval", f"{CONFIDENCE:.0%} over objects or scenes: {METHOD}"),
         ("reader", "layout and metrics from the set's own code, checked on made data"),
         ("code", f"{run.code}, {run.date}"),
     )

@@ -36,8 +36,8 @@ class Record:
     """All values of one method on one sample of one table under one protocol.
 
     `values` maps metric keys (`unirender_evaluation.metrics.metric_key`, e.g. `albedo.psnr@masked-srgb-raw`) to floats;
-    all variants lie side by side in it. Samples of one object are not independent: `object` is the cluster that the
-    bootstrap draws.
+    all variants lie side by side in it. Samples of one object are not independent: `object` is what
+    intervals are over.
     """
 
     table: str  # "rendering", "inverse", "relighting", "light", "physics", "multi-view"
@@ -123,6 +123,7 @@ class RunInfo:
     truth_spp: int | None = None
     code: str = ""  # version or hash of the code
     date: str = ""  # ISO date of the run
+    carried: str = ""  # of which date and code records are that an earlier state of the code measured, if any are
     limit: int | None = None  # --limit: tables are watermarked
     seeds: tuple[int, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)  # versions, CPU

@@ -10,7 +10,7 @@ from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import PROTOCOLS, Column, TableSpec
-from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.table_formats import format_estimate, format_number
 from unirender_evaluation.tables import Row, Table
 
@@ -60,7 +60,7 @@ def _strip_plot(
 
     rows = []
     for key, found in values.items():
-        estimate = bootstrap_mean(list(found.values()), [objects[sample] for sample in found])
+        estimate = mean_estimate(list(found.values()), [objects[sample] for sample in found])
         interval = not math.isnan(estimate.half_width)
         rows.append(
             {

@@ -91,7 +91,7 @@ class BenchTables:
 
 @dataclass(frozen=True)
 class BenchCompare:
-    """Compare two results, paired by sample: differences with bootstrap intervals, verdicts and ranks.
+    """Compare two results, paired by sample: differences with intervals, verdicts and ranks.
 
     Without `--method`: every row that both have. To compare two rows of one run, give its file twice.
     """

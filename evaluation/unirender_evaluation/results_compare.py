@@ -1,7 +1,7 @@
 """Two files' results against each other: the same row of both, or any two rows, sample by sample.
 
 Every column of every table under every protocol that both rows answered: both means over the samples that they share,
-the difference A - B with its paired bootstrap interval over objects, the verdict, and each row's rank in its own run.
+the difference A - B with its paired interval over objects, the verdict, and each row's rank in its own run.
 """
 
 import difflib

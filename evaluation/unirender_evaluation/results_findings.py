@@ -1,7 +1,7 @@
 """Questions put to stored results, answered in Markdown: what the page *What the tables say* is made of.
 
 Nothing is measured here: every figure is a mean of records, or a paired difference of two rows over the samples that
-both answered, with the interval of the bootstrap over objects.
+both answered, with the interval over objects.
 """
 
 import re
@@ -54,7 +54,7 @@ def run_line(results: Results) -> str:
     objects = len({record.object for record in results.records})
     return (
         f"`{run.suite}`: {objects} objects at {run.resolution} x {run.resolution} pixels, {len(results.records):,} "
-        f"answers; truth `{run.suite_hash[:12]}`, code `{run.code}`, {run.date}"
+        f"answers; truth `{run.suite_hash[:12]}`, code `{run.code}`, {run.date}{f' ({run.carried})' if run.carried else ''}"
     )
 
 

@@ -13,7 +13,7 @@ from unirender_evaluation.sampling_study import DECOMPOSE, MEAN, RENDER, Setting
 from unirender_evaluation.sampling_study_calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import CONFIDENCE as INTERVAL
-from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.table_formats import MISSING, format_estimate, format_number, header
 from unirender_evaluation.table_text import TextTable
 
@@ -37,7 +37,7 @@ QUALITY_NOTE = (
     "Albedo, normal, roughness, metallic: `decompose` of the picture, the network's own maps (not closed). Render: "
     "`render` of the true maps of one of the suite's edits, s and d among them. The mean of the samples is scored, "
     "inside the true mask, weighted by coverage. Mean over pictures ± half of the "
-    f"{INTERVAL:.0%} bootstrap interval over objects."
+    f"{INTERVAL:.0%} interval over objects."
 )
 CALIBRATION_NOTE = (
     "s: standard deviation of a pixel's N samples (N - 1 in the denominator). Ratio: RMS error of their mean over the "
@@ -55,7 +55,7 @@ UNITS_NOTE = (
 def estimate(records: Sequence[Record], method: str, key: str) -> Estimate | None:
     """The mean of one value over the records of a setting; None where none has it."""
     own = [record for record in records if record.method == method and key in record.values]
-    return bootstrap_mean([r.values[key] for r in own], [r.object for r in own]) if own else None
+    return mean_estimate([r.values[key] for r in own], [r.object for r in own]) if own else None
 
 
 def calibrations(records: Sequence[Record], setting: Setting, name: str) -> list[Calibration]:

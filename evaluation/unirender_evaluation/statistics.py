@@ -1,8 +1,12 @@
-"""Intervals and paired tests, by the bootstrap.
+"""Intervals and paired tests, over objects.
 
 Samples of one object (several lights, several edits) are not independent, so a *cluster* bootstrap draws objects with
 replacement and takes all samples of each; the estimate stays the plain mean over samples. Everything is seeded: the
 same records give the same interval on every machine.
+
+Of a few objects the bootstrap's interval is too narrow: of two it excludes the truth half of the time, of four one time
+in five, of ten one in ten. Below `FEW` objects the interval is Student's t over them, with the variance of a ratio of
+sums since objects may have unequal numbers of samples (Cochran 1977, section 6.4).
 
 "A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
 """
@@ -12,18 +16,20 @@ from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 0
+FEW = 20  # objects below which the interval is Student's
+METHOD = f"bootstrap, {RESAMPLES} draws, seed {SEED}, or Student's t below {FEW}"  # as protocol lines say it
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A mean with its bootstrap interval.
+    """A mean with its interval.
 
     `low` and `high` are NaN where no interval exists: fewer than two clusters, or an infinite value among them.
     """
@@ -40,7 +46,7 @@ class Estimate:
         return (self.high - self.low) / 2
 
 
-def bootstrap_mean(
+def mean_estimate(
     values: Sequence[float] | Float[np.ndarray, " n"],
     clusters: Sequence[Hashable] | None = None,
     *,
@@ -48,7 +54,7 @@ def bootstrap_mean(
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> Estimate:
-    """Mean and percentile interval.
+    """Mean with its percentile interval, or Student's of fewer than `FEW` clusters.
 
     Args:
         values: one per sample; inf allowed (then there is no interval), NaN not.
@@ -62,10 +68,10 @@ def bootstrap_mean(
     """
     x = np.asarray(values, dtype=np.float64)
     if x.ndim != 1 or x.size == 0 or np.isnan(x).any():
-        raise UnirenderError(f"bootstrap: got {x.size} values of shape {x.shape}, expected at least one and no NaN")
+        raise UnirenderError(f"mean: got {x.size} values of shape {x.shape}, expected at least one and no NaN")
     labels = list(range(x.size)) if clusters is None else list(clusters)
     if len(labels) != x.size:
-        raise UnirenderError(f"bootstrap: got {x.size} values and {len(labels)} cluster labels, expected as many")
+        raise UnirenderError(f"mean: got {x.size} values and {len(labels)} cluster labels, expected as many")
     members: dict[Hashable, int] = {}
     index = np.array([members.setdefault(label, len(members)) for label in labels])
     count = len(members)
@@ -73,10 +79,23 @@ def bootstrap_mean(
     if count < 2 or not np.isfinite(x).all():
         return Estimate(mean, math.nan, math.nan, x.size, count)
     sums, sizes = np.bincount(index, weights=x), np.bincount(index)
+    if count < FEW:
+        half = _student_half_width(sums, sizes, confidence)
+        return Estimate(mean, mean - half, mean + half, x.size, count)
     draws = np.random.default_rng(seed).integers(count, size=(resamples, count))
     means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Estimate(mean, float(low), float(high), x.size, count)
+
+
+def _student_half_width(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"], confidence: float) -> float:
+    """Half of Student's interval of sum(sums) / sum(sizes), of independent clusters."""
+    from scipy.special import stdtrit
+
+    count = len(sums)
+    residuals = sums - sizes * (sums.sum() / sizes.sum())
+    error = math.sqrt(count / (count - 1) * np.square(residuals).sum()) / sizes.sum()
+    return float(stdtrit(count - 1, (1 + confidence) / 2) * error)
 
 
 def paired_difference(
@@ -88,7 +107,7 @@ def paired_difference(
     resamples: int = RESAMPLES,
     seed: int = SEED,
 ) -> Estimate:
-    """Mean of a - b over the samples that both have, with its paired bootstrap interval.
+    """Mean of a - b over the samples that both have, with its paired interval.
 
     Args:
         a: sample -> value.
@@ -114,7 +133,7 @@ def paired_difference(
             "has an infinite PSNR; compare the MSE"
         )
     labels = None if clusters is None else [clusters[sample] for sample in common]
-    return bootstrap_mean(differences, labels, confidence=confidence, resamples=resamples, seed=seed)
+    return mean_estimate(differences, labels, confidence=confidence, resamples=resamples, seed=seed)
 
 
 def beats(

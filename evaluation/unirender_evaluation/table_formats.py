@@ -1,7 +1,7 @@
 """Tables as Markdown, JSON and terminal text; as LaTeX: `table_latex`.
 
 In every format: best in bold, second underlined (on rounded values), "-" where a value does not exist, "n/a" where it
-could not be computed here, ± half of the bootstrap interval, n where others have more samples, a dagger on a published
+could not be computed here, ± half of the interval, n where others have more samples, a dagger on a published
 value that a trivial row beats, the watermark of a partial run, and the protocol below.
 """
 

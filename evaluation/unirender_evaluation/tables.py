@@ -16,7 +16,7 @@ from unirender_evaluation.protocol import protocol_line
 from unirender_evaluation.published import PublishedRow, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
-from unirender_evaluation.statistics import Estimate, bootstrap_mean
+from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.table_counts import short_cells
 from unirender_evaluation.table_notes import table_notes
 
@@ -198,7 +198,7 @@ def _measured_row(spec: TableSpec, records: Sequence[Record], run: RunInfo, info
         asked_for = column.metric.name.startswith("lpips_") and column.variant(variant).scale in LPIPS_SCALES
         missing = asked_for and backbone not in run.lpips
         if values:
-            estimate = bootstrap_mean(list(values.values()), [objects[sample] for sample in values])
+            estimate = mean_estimate(list(values.values()), [objects[sample] for sample in values])
             cells.append(Cell(measured=estimate))
             n = max(n, estimate.n)
         else:

@@ -33,7 +33,7 @@ COLUMNS = (
 )
 NOTE = (
     f"Mean over scenes; in brackets the paired difference from the first row, ± half of its {CONFIDENCE:.0%} "
-    "bootstrap interval over objects; **bold** where the interval excludes 0. Masked, sRGB. Own maps: the network's "
+    "interval over objects; **bold** where the interval excludes 0. Masked, sRGB. Own maps: the network's "
     "decomposition (not closed), rendered by the network and shaded by Mitsuba, against the picture. The networks are "
     "far from fully trained: the table says what helps early, at this size."
 )

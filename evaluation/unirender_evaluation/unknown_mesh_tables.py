@@ -11,7 +11,7 @@ from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, bootstrap_mean
+from unirender_evaluation.statistics import CONFIDENCE, mean_estimate
 from unirender_evaluation.table_formats import format_estimate, format_number, header
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.unknown_mesh_scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
@@ -100,7 +100,7 @@ def _mean(records: Sequence[Record], key: str, column: Column) -> str:
     values = [record.values[key] for record in records if key in record.values]
     if not values:
         return "-"
-    return " ".join(format_estimate(bootstrap_mean(values), column.metric.decimals)).strip()
+    return " ".join(format_estimate(mean_estimate(values), column.metric.decimals)).strip()
 
 
 def aim_notes(records: Sequence[Record]) -> tuple[str, ...]:
@@ -121,7 +121,7 @@ def shape_notes(settings: MultiviewSettings) -> tuple[str, ...]:
         f"{min(elevations):g}° to {max(elevations):g}°. Scored from {settings.held_out} cameras midway between them; "
         "the steep ones stand where no picture was taken.",
         "; ".join(f"{metric.label}: {metric.formula}" for metric in columns) + ".",
-        f"Means: ± half of the {CONFIDENCE:.0%} bootstrap interval over objects.",
+        f"Means: ± half of the {CONFIDENCE:.0%} interval over objects.",
     )
 
 
@@ -143,7 +143,7 @@ def to_json(records: Sequence[Record], names: Mapping[str, str], run: Mapping[st
         key = column.key(DEFAULT_VARIANT)
         values = [record.values[key] for record in records if key in record.values]
         if values:
-            found = bootstrap_mean(values)
+            found = mean_estimate(values)
             means[key] = {
                 "mean": _plain(found.mean),
                 "low": _plain(found.low),

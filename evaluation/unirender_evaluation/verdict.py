@@ -1,4 +1,4 @@
-"""The verdict: which claims about the rows hold on this run, by the paired bootstrap 95 % interval."""
+"""The verdict: which claims about the rows hold on this run, by the paired 95 % interval."""
 
 import math
 from collections.abc import Sequence
@@ -110,7 +110,7 @@ def ceiling_breaches(
 
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     """The verdict section: claims, ceiling, truth check; one line each."""
-    head = "masked, sRGB and unaligned, where nothing else is said; paired bootstrap 95 % intervals over objects"
+    head = "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects"
     lines = [f"Verdict on suite {run.suite} ({head})"]
     lines += [f"  {finding}" for finding in findings(records, run_claims(records, run))]
     breaches = ceiling_breaches(records)

@@ -74,6 +74,7 @@ COMMANDS = (
     "throughput*",
     "truth",
     "validation",
+    "worker_pool",
     "workers",
 )
 FROM_RECORDS = (
@@ -169,7 +170,7 @@ PARTS: Mapping[str, Part] = {
             "unirender": ("models/**/*.py", "diffusion/**/*.py", "pipelines/**/*.py", "checkpoints/*.safetensors"),
             "unirender_evaluation": tuple(f"{name}.py" for name in ADAPTERS),
         },
-        ("torch", "diffusers", "transformers"),
+        ("torch", "diffusers"),
     ),
     REFERENCE: Part(
         {
@@ -265,7 +266,7 @@ def lpips_version(backbones: Sequence[str]) -> str:
     from unirender_evaluation.lpips import weights_path
 
     digest = hashlib.sha256(f"torch {installed_version('torch')}".encode())
-    for name in backbones:
+    for name in sorted(backbones):
         path = weights_path(name)  # type: ignore[arg-type]  # the name of a backbone
         try:
             weights = path.read_bytes()

@@ -11,7 +11,7 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, Metric
 from unirender_evaluation.multiview_tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, Estimate, bootstrap_mean, paired_difference
+from unirender_evaluation.statistics import CONFIDENCE, Estimate, mean_estimate, paired_difference
 from unirender_evaluation.table_formats import format_estimate, format_number, header
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.warm_start import COLD, PICTURE, PREDICTION, STEPS, WARM
@@ -79,7 +79,7 @@ def tables(records: Sequence[Record], geometries: Sequence[str]) -> list[TextTab
 
 
 NOTES = (
-    f"Differences are paired by picture: mean [{CONFIDENCE:.0%} bootstrap interval over objects]. Inside the true "
+    f"Differences are paired by picture: mean [{CONFIDENCE:.0%} interval over objects]. Inside the true "
     "mask, weighted by coverage. Fit and relit: `shade` of the result under its own light, against the picture, and "
     "under the object's other light, against Mitsuba's path tracing of the truth. Aligned: one "
     "least-squares factor in linear light, for albedo of the object, for relit of each picture.",
@@ -115,7 +115,7 @@ def mean(records: Sequence[Record], method: str, column: Column) -> Estimate | N
     own = [record for record in records if record.method == method and column.key(DEFAULT_VARIANT) in record.values]
     if not own:
         return None
-    return bootstrap_mean([record.values[column.key(DEFAULT_VARIANT)] for record in own], [r.object for r in own])
+    return mean_estimate([record.values[column.key(DEFAULT_VARIANT)] for record in own], [r.object for r in own])
 
 
 def _mean(records: Sequence[Record], method: str, column: Column) -> str:

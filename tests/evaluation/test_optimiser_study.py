@@ -4,12 +4,11 @@ import dataclasses
 import io
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import get_type_hints
 
-import numpy as np
 import pytest
 from multiview_pieces import ball_scene
 from rich.console import Console
@@ -37,7 +36,6 @@ from unirender_evaluation.optimiser_study_measure import RECORDS, TABLE, Starts,
 from unirender_evaluation.optimiser_study_tables import (
     Line,
     columns,
-    paired_interval,
     show,
     signed,
     summarise,
@@ -46,7 +44,6 @@ from unirender_evaluation.optimiser_study_tables import (
     to_markdown,
 )
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import Estimate, paired_difference
 from unirender_evaluation.versions import OPTIMIZER, Versions
 
 OWN = "optimiser_study_measure"
@@ -224,19 +221,6 @@ def test_the_table_says_what_was_measured() -> None:
     lines, _ = lines_of((20.0,), (19.0,))  # no interval
     (table,) = tables(lines, settings=False)
     assert table.sections[1][0][1] == "19.00 (-1.00)"
-
-
-def test_chance_is_seldom_decided() -> None:
-    """Of four objects and no difference, 5 % of the intervals exclude 0; the bootstrap's do so far too often."""
-    draws = np.random.default_rng(0).standard_normal((400, 4))
-    none = dict.fromkeys("abcd", 0.0)
-
-    def share(interval: Callable[[dict[str, float], dict[str, float]], Estimate]) -> float:
-        found = [interval(dict(zip("abcd", map(float, row), strict=True)), none) for row in draws]
-        return sum(one.low > 0 or one.high < 0 for one in found) / len(found)
-
-    assert 0.02 < share(paired_interval) < 0.09
-    assert share(paired_difference) > 0.15
 
 
 @pytest.mark.parametrize("width", [80, 130])

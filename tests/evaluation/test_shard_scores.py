@@ -14,7 +14,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.shard_scores import COLUMNS, RENDERS, minus, scored, shard_tables
 from unirender_evaluation.shard_scores_command import BenchShards
-from unirender_evaluation.statistics import bootstrap_mean
+from unirender_evaluation.statistics import mean_estimate
 
 SIZE = 16
 
@@ -88,7 +88,7 @@ def test_the_groups_of_one_object_count_as_one(tmp_path: Path) -> None:
     assert {one.object for one in found} == {"train-000000", "train-000001"}
     key, decimals = COLUMNS["albedo (dB) ↑"]
     clustered, wrong = (
-        bootstrap_mean([one.scores[key] for one in found], [getattr(one, of) for one in found])
+        mean_estimate([one.scores[key] for one in found], [getattr(one, of) for one in found])
         for of in ("object", "group")
     )
     cells = shard_tables(found, "Halves.")[0].sections[0][0]

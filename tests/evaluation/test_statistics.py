@@ -1,12 +1,13 @@
-"""Bootstrap: coverage of the interval, clusters, pairing, and what has no interval."""
+"""Coverage of the interval, clusters, pairing, and what has no interval."""
 
 import math
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.statistics import beats, bootstrap_mean, paired_difference
+from unirender_evaluation.statistics import FEW, beats, mean_estimate, paired_difference
 
 
 def coverage(clustered: bool, use_clusters: bool, trials: int = 300) -> float:
@@ -16,7 +17,7 @@ def coverage(clustered: bool, use_clusters: bool, trials: int = 300) -> float:
     for trial in range(trials):
         values = np.repeat(rng.normal(size=30), 8) + 0.2 * rng.normal(size=240) if clustered else rng.normal(size=240)
         labels = np.repeat(np.arange(30), 8).tolist() if use_clusters else None
-        estimate = bootstrap_mean(values, labels, resamples=400, seed=trial)
+        estimate = mean_estimate(values, labels, resamples=400, seed=trial)
         hits += estimate.low <= 0 <= estimate.high
     return hits / trials
 
@@ -30,20 +31,39 @@ def test_clusters_are_needed_where_samples_share_an_object() -> None:
     assert coverage(clustered=True, use_clusters=False) < 0.70  # the twin: samples drawn as if independent
 
 
+@pytest.mark.parametrize("count", [2, 4, 8, FEW - 1])
+def test_of_few_objects_the_interval_holds_the_mean_as_often(count: int) -> None:
+    rng = np.random.default_rng(0)
+    of = np.repeat(np.arange(count), rng.integers(1, 9, size=count))
+    hits = 0
+    for _ in range(1000):
+        values = rng.normal(size=count)[of] + 0.2 * rng.normal(size=len(of))
+        estimate = mean_estimate(values, of.tolist())
+        hits += estimate.low <= 0 <= estimate.high
+    assert 0.90 <= hits / 1000 <= 0.98
+
+
+def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
+    values = [1.0, 2.0, 4.0, 7.0]
+    estimate = mean_estimate(values)
+    low, high = scipy.stats.t.interval(0.95, 3, loc=np.mean(values), scale=scipy.stats.sem(values))
+    assert (estimate.low, estimate.high) == pytest.approx((low, high))
+
+
 def test_the_estimate_is_the_mean_over_samples_not_over_objects() -> None:
-    estimate = bootstrap_mean([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])
+    estimate = mean_estimate([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])
     assert (estimate.mean, estimate.n, estimate.clusters) == (2.0, 4, 2)
 
 
 def test_the_same_seed_gives_the_same_interval() -> None:
     values = np.random.default_rng(1).normal(size=50)
-    assert bootstrap_mean(values) == bootstrap_mean(values)
-    assert bootstrap_mean(values) != bootstrap_mean(values, seed=1)
+    assert mean_estimate(values) == mean_estimate(values)
+    assert mean_estimate(values) != mean_estimate(values, seed=1)
 
 
 @pytest.mark.parametrize(("values", "labels"), [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None)])
 def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | None) -> None:
-    estimate = bootstrap_mean(values, labels)
+    estimate = mean_estimate(values, labels)
     assert math.isnan(estimate.low)
     assert math.isnan(estimate.half_width)
     assert estimate.mean == np.mean(values)
@@ -51,8 +71,8 @@ def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | N
 
 @pytest.mark.parametrize("values", [[], [1.0, math.nan]])
 def test_nothing_and_nan_are_refused(values: list[float]) -> None:
-    with pytest.raises(UnirenderError, match="bootstrap"):
-        bootstrap_mean(values)
+    with pytest.raises(UnirenderError, match="mean"):
+        mean_estimate(values)
 
 
 def paired(shift: float, seed: int = 0) -> tuple[dict[str, float], dict[str, float]]:
@@ -65,7 +85,7 @@ def paired(shift: float, seed: int = 0) -> tuple[dict[str, float], dict[str, flo
 
 def test_pairing_sees_a_difference_that_intervals_of_the_means_hide() -> None:
     a, b = paired(0.4)
-    alone = [bootstrap_mean(list(values.values())) for values in (a, b)]
+    alone = [mean_estimate(list(values.values())) for values in (a, b)]
     assert alone[0].low < alone[1].high  # they overlap
     assert beats(a, b, higher_is_better=True)
     assert not beats(b, a, higher_is_better=True)

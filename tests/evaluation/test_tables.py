@@ -239,6 +239,13 @@ def test_the_protocol_is_printed_with_every_format() -> None:
     assert "published" not in [name for name, _ in table("masked").protocol]
 
 
+def test_the_protocol_says_which_records_earlier_code_measured() -> None:
+    run = replace(RUN, code="abc", date="2026-07-20")
+    assert dict(table(run=run).protocol)["code"] == "abc, 2026-07-20"
+    carried = table(run=replace(run, carried="records of July"))
+    assert dict(carried.protocol)["code"] == "abc, 2026-07-20 (records of July)"
+
+
 def test_the_protocol_says_whose_mask() -> None:
     """Maps have a mask of their own, pictures do not; without an own mask nothing is claimed."""
     relit = [replace(r, table="relighting", protocol="from-image-sd") for r in inverse("sample")]
@@ -298,7 +305,7 @@ def test_markdown_is_a_table() -> None:
     lines = [line for line in to_markdown(table()).splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(table().rows)
     assert len({line.count("|") for line in lines}) == 1
-    assert "| **23.20** | **26.15** ± 0.10 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
+    assert "| **23.20** | **26.15** ± 0.18 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
 
 
 def test_latex_is_balanced_booktabs() -> None:

@@ -30,7 +30,7 @@ RUN = RunInfo(
 )
 
 
-VERDICT = """Verdict on suite tiny (paired bootstrap 95 % intervals over objects)
+VERDICT = """Verdict on suite tiny (paired 95 % intervals over objects)
   HOLDS  inverse/single-image albedo PSNR: ours beats input, difference +8 [+7, +9] dB (n 6, 3 objects)
   FAILS  ours exceeds the noise ceiling on <this> by at least 0.10 dB
   stated inverse/single-image albedo PSNR: ours is level with input
