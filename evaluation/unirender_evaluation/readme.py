@@ -15,7 +15,7 @@ import json
 import math
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from safetensors import safe_open
@@ -23,8 +23,11 @@ from safetensors import safe_open
 from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
 from unirender.shipped import checkpoint_folder, shipped_for, shipped_names, trained_pixels
+from unirender_evaluation.claims import OPTIMISED
+from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
+from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import Table, build_tables
@@ -91,6 +94,16 @@ def place(results: Results, checkpoint: str | None) -> str:
         wanted = f"expected {expected[:12]}, those of {folder.name}"
         raise UnirenderError(f"weights: got {names}, {wanted}; run the benchmark {way}")
     return name
+
+
+def run_command(suite: str, records: Iterable[Record]) -> str:
+    """The command that prints results with these records."""
+    command = f"unirender bench run --suite {suite}"
+    # the light table asks once a scene
+    optimised = {r.sample for r in records if r.method == OPTIMISED and (r.table, r.protocol) == LIGHT}
+    if optimised and len(optimised) != STANDARD.optimise:
+        command += f" --optimise-scenes {len(optimised)}"
+    return command
 
 
 def checkpoint_text(folder: Path) -> str:
@@ -168,7 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         suite, date, folder = results.run.suite, results.run.date, place(results, arguments.of)
         if arguments.readme:
             shipped = suite == SHIPPED_SUITE
-            command = "make bench" if shipped else f"unirender bench run --suite {suite}"
+            command = "make bench" if shipped else run_command(suite, results.records)
             head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
             slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
             text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")

@@ -13,7 +13,9 @@ from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
 from unirender.shipped import checkpoint_folder
 from unirender_evaluation import readme
+from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
+from unirender_evaluation.tasks import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
@@ -89,6 +91,12 @@ def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> Non
     assert "what was here" in before
     assert "Printed by `unirender bench run --suite large`" in after
     assert "21.50" in after
+
+
+@pytest.mark.parametrize(("scenes", "option"), [(4, ""), (24, " --optimise-scenes 24"), (0, "")])
+def test_the_command_says_how_many_scenes_were_optimised(scenes: int, option: str) -> None:
+    records = [Record(*LIGHT, OPTIMISED, f"s{i}", f"o{i}", {"light.log_rmse": 1.0}) for i in range(scenes)]
+    assert readme.run_command("large", records) == f"unirender bench run --suite large{option}"
 
 
 def test_the_results_of_another_shipped_checkpoint_have_a_place_of_their_own(
