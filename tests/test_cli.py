@@ -99,6 +99,34 @@ def test_render_takes_one_file_and_the_camera_in_its_header(
     assert not (tmp_path / "out" / "environment.exr").exists()  # one file is that file
 
 
+def test_a_picture_that_was_written_here_brings_its_camera(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    channels = image_channels(np.array(Image.open(ball), np.float32)[::4, ::4] / 255)
+    (tmp_path / "film").mkdir()
+    for name, camera in {"film/b.exr": "fov_deg=60 principal=0.5,0.4", "a.exr": "Canon", "film/c.exr": None}.items():
+        write_exr(tmp_path / name, channels, attributes=None if camera is None else {"camera": camera})
+    given = ("--fov", "70")
+    for name, options, expected, words in [
+        ("film/b.exr", (), (60, [0.5, 0.4]), "field of view of 60 degrees, as the picture's header says (--fov)"),
+        ("film/b.exr", given, (70, [0.5, 0.4]), ""),
+        ("a.exr", (), (36, [0.5, 0.5]), "field of view not given: 36 degrees assumed (--fov)"),
+    ]:
+        assert run("decompose", tmp_path / name, "--output", tmp_path / "out", "--overwrite", *options) == 0
+        lines = capsys.readouterr().err
+        assert words in lines
+        assert ("field of view" in lines) == bool(words)
+        meta = json.loads((tmp_path / "out" / "meta.json").read_text())
+        assert (meta["fov_deg"], meta["principal"]) == expected
+    for _ in range(2):  # a second run keeps what is there
+        assert run("decompose", tmp_path / "film", "--output", tmp_path / "maps") == 0
+    assert "2 pictures (2 of them from before)" in capsys.readouterr().out
+    metas = [json.loads((tmp_path / "maps" / name / "meta.json").read_text()) for name in ("b.exr", "c.exr")]
+    assert [meta["fov_deg"] for meta in metas] == [60, 36]
+    assert run("decompose", tmp_path / "film", "--output", tmp_path / "maps", *given) == 1
+    assert "is a result with another fov" in capsys.readouterr().err
+
+
 def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path: Path) -> None:
     assert run("decompose", ball, "--output", tmp_path / "maps") == 0
     maps = read_result(tmp_path / "maps")
@@ -147,13 +175,17 @@ def test_what_lies_outside_the_models_range_is_reported(
     lines = capsys.readouterr().err
     assert "of the object's pixels are clipped" in lines
     assert lines.count("environment: values above 200") == 1
+    assert "come out at display white" in lines
     meta = json.loads((tmp_path / "out" / "meta.json").read_text())
     assert 0.2 < meta["clipped"] < 0.6
+    assert 0.05 < meta["at_white"] <= 1
     over = meta["above_x_max"]["environment"]
     assert over["count"] >= 3  # one texel in 16 x 32, three channels
     assert (over["share"], over["x_max"]) == (over["count"] / (3 * 16 * 32), 200.0)
     assert run("relight", ball, *arguments[:2], "--output", tmp_path / "dim") == 0  # scaled to the gauge
-    assert "clipped" not in capsys.readouterr().err
+    lines = capsys.readouterr().err
+    assert "clipped" not in lines
+    assert "display white" not in lines
 
 
 def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:

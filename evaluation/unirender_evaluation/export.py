@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from unirender.exr import intrinsics_channels, write_environment, write_exr
-from unirender.files import CAMERA_ATTRIBUTE
+from unirender.exr import CAMERA_ATTRIBUTE, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, Task, scene_ids, tasks

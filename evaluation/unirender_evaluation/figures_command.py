@@ -1,6 +1,6 @@
 """`unirender figures`. Light to import; the command loads what it needs when it runs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, at_least
+from unirender.options import Device, at_least, notice
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview", "light"]  # of checkpoints and methods
 Contract = Literal["maps", "camera"]  # of the documentation of the data contract; of nobody
-Kind = Asked | Contract
+Kind = Literal[Asked, Contract]  # and no union of the two, whose choices would be listed in no order
 ASKED: tuple[Asked, ...] = get_args(Asked)
 KINDS = ASKED[:-1]  # where none is named: few methods find the light
 CONTRACT: tuple[Contract, ...] = get_args(Contract)
@@ -145,11 +145,20 @@ class Figures:
 
     def sheet(self, subjects: "list[Subject]", suite: "Suite", pictures: "list[Picture]") -> "Grid":
         """The figure of the user's pictures, relit by lights of the suite."""
-        from unirender_evaluation.figures_panels import other_lights
         from unirender_evaluation.figures_pictures import pictures_sheet
 
-        lights = {scene.light: suite.environment(scene) for scene in other_lights(suite, [], self.lights)}
+        lights = {scene.light: suite.environment(scene) for scene in self.relit_by(suite, [])}
         return pictures_sheet(subjects, pictures, lights, suite.spec.camera)
+
+    def relit_by(self, suite: "Suite", scenes: "Sequence[Scene]") -> "list[Scene]":
+        """Scenes of the suite with the lights of relightings; a notice where there are fewer than were asked for."""
+        from unirender_evaluation.figures_panels import other_lights
+
+        found = other_lights(suite, scenes, self.lights)
+        if len(found) < self.lights:
+            has = f"suite {suite.spec.name} has {len(found)} that light no input"
+            notice(f"--lights {self.lights}: {has}, and all of them are drawn")
+        return found
 
     def subjects(self) -> "list[Subject]":
         """The checkpoints and methods that were named, checkpoints first.
@@ -194,7 +203,7 @@ class Figures:
         if kind == "comparison":
             return panels.comparison_sheet(subjects, suite, scenes)
         if kind == "relighting":
-            return panels.relighting_grid(subjects, suite, scenes, self.lights, truth)
+            return panels.relighting_grid(subjects, suite, scenes, len(self.relit_by(suite, scenes)), truth)
         return panels.material_strip(subjects, suite, scenes, kind, self.values, truth)
 
 

@@ -30,10 +30,9 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
         seen, mask, other = picture(suite, scene, base), suite.mask(scene), suite.other_light(scene)
         environment = suite.environment(other)
         for number, subject in enumerate(taking_part):
-            method = subject.row.method
-            maps = map_tiles(method.decompose(**seen), mask)
-            made = [method.edit(**seen, **edit) if subject.can("edit") else None for edit in edits]
-            made.append(method.relight(**seen, environment=environment) if subject.can("relight") else None)
+            maps = map_tiles(subject.ask("decompose", **seen), mask)
+            made = [subject.ask("edit", **seen, **edit) if subject.can("edit") else None for edit in edits]
+            made.append(subject.ask("relight", **seen, environment=environment) if subject.can("relight") else None)
             pictures = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
             lines.append(Line(subject.label, (input_tile(seen, number), *maps, *pictures), starts=number == 0))
         truth = [*(suite.image(scene, edit) for edit in suite.spec.edits), suite.image(other, base)]

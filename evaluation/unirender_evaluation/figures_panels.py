@@ -15,7 +15,7 @@ from jaxtyping import Float
 from unirender.color import image_srgb, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
-from unirender_evaluation.engine import answer
+from unirender_evaluation.engine import answer, ask
 from unirender_evaluation.figures import Grid, Line, Tile
 from unirender_evaluation.methods import Image, Mask, capabilities
 from unirender_evaluation.metrics import metric_key
@@ -40,6 +40,10 @@ class Subject:
     def can(self, capability: str) -> bool:
         """Whether it has `edit`, `relight` or `decompose`."""
         return capability in capabilities(self.row.method)
+
+    def ask(self, capability: str, **inputs: Any) -> Any:
+        """Its answer, by the rules of the benchmark (`engine.ask`)."""
+        return ask(self.row, capability, "figures", **inputs)
 
 
 class MitsubaTruth:
@@ -94,7 +98,7 @@ def material_strip(
         materials = [(v, base[1]) if what == "metallic" else (base[0], v) for v in values]
         images = [truth(scene, material, suite.environment(scene)) for material in materials]
         for number, subject in enumerate(taking_part):
-            made = [subject.row.method.edit(**seen, **{what: value}) for value in values]
+            made = [subject.ask("edit", **seen, **{what: value}) for value in values]
             tiles = [_compared(image, true, mask) for image, true in zip(made, images, strict=True)]
             lines.append(Line(subject.label, (input_tile(seen, number), *tiles), starts=number == 0))
         lines.append(Line("Mitsuba", (None, *(Tile(picture_over_white(image, mask)) for image in images))))
@@ -116,7 +120,7 @@ def relighting_grid(
         seen, mask = picture(suite, scene, base), suite.mask(scene)
         images = [truth(scene, base, environment) for environment in environments]
         for number, subject in enumerate(taking_part):
-            made = [subject.row.method.relight(**seen, environment=environment) for environment in environments]
+            made = [subject.ask("relight", **seen, environment=environment) for environment in environments]
             tiles = [_compared(image, true, mask) for image, true in zip(made, images, strict=True)]
             lines.append(Line(subject.label, (input_tile(seen, number), *tiles), starts=number == 0))
         lines.append(Line("Mitsuba", (None, *(Tile(picture_over_white(image, mask)) for image in images))))

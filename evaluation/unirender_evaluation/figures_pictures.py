@@ -95,12 +95,11 @@ def pictures_sheet(
         assert picture.mask is not None, "framed gives one"
         seen, mask = {"image_srgb": picture.image_srgb, "mask": picture.mask, "camera": camera}, picture.mask
         for number, subject in enumerate(able(subjects, "decompose", "sheet of pictures")):
-            method = subject.row.method
-            maps = method.decompose(**seen)
-            made = [method.render(maps.replace(mask=mask)) if subject.can("render") else None]
-            made += [method.edit(**seen, **edit) if subject.can("edit") else None for edit in EDITS]
+            maps = subject.ask("decompose", **seen)
+            made = [subject.ask("render", intrinsics=maps.replace(mask=mask)) if subject.can("render") else None]
+            made += [subject.ask("edit", **seen, **edit) if subject.can("edit") else None for edit in EDITS]
             made += [
-                method.relight(**seen, environment=light) if subject.can("relight") else None
+                subject.ask("relight", **seen, environment=light) if subject.can("relight") else None
                 for light in lights.values()
             ]
             tiles = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]

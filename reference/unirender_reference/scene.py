@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.intrinsics import as_radiance
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.shapes import MeshObject
@@ -95,7 +96,7 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
     Raises:
         UnirenderError: it is too small, black, negative, not finite or above `MOST_RADIANCE`.
     """
-    environment = np.asarray(environment, dtype=np.float32)
+    environment = as_radiance("environment", environment)
     if environment.ndim != 3 or environment.shape[-1] != 3 or environment.shape[0] < 3 or environment.shape[1] < 2:
         # Mitsuba resamples smaller maps when it loads them.
         raise UnirenderError(f"environment: got shape {environment.shape}, expected (height >= 3, width >= 2, 3)")

@@ -3,11 +3,13 @@
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_reference.lights import Light
 from unirender_reference.shapes import MeshObject
@@ -18,6 +20,9 @@ class SceneSpec:
     """One sample to render. `exposure_seed` draws the gauge's target.
 
     Roughness (perceptual) and metallic are one value for the object, or None for its own map.
+
+    Raises:
+        UnirenderError: one of these is of another type.
     """
 
     obj: MeshObject
@@ -27,6 +32,13 @@ class SceneSpec:
     camera: Camera = field(default_factory=Camera)
     resolution: int = 64
     exposure_seed: int = 0
+
+    def __post_init__(self) -> None:
+        kinds = {"obj": MeshObject, "light": Light, "camera": Camera, "resolution": Integral, "exposure_seed": Integral}
+        for name, kind in {**kinds, "roughness": Real | None, "metallic": Real | None}.items():
+            if not isinstance(value := getattr(self, name), kind):
+                expected = getattr(kind, "__name__", "a number, or None for the object's own map")
+                raise UnirenderError(f"scene: got {name} {value!r:.60}, expected {expected}")
 
 
 @dataclass(frozen=True)

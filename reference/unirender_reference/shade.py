@@ -16,12 +16,14 @@ noise are then correlated.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
+from unirender.intrinsics import Intrinsics, as_numbers
+from unirender.lighting import as_light
 from unirender_reference.passes import NAN_ATTEMPTS, SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
 from unirender_reference.scene import envmap_data
 from unirender_reference.shader import PARAMETERS, Parameter, Shader, gradient, tensors
@@ -65,9 +67,10 @@ def shade(
         geometry: the object in the picture: light that it blocks is left out. None: nothing is hidden.
 
     Raises:
-        UnirenderError: a map is missing, the environment is not usable, or a point stays NaN.
+        UnirenderError: an argument of another type, a map is missing, the environment is not usable, or a point stays
+            NaN.
     """
-    maps, light, mask = _arguments(intrinsics, environment)
+    maps, light, mask = _arguments(intrinsics, environment, spp, geometry)
     image = np.zeros((*mask.shape[:2], 3), np.float64)
     if not mask.any() or not light.any():
         return image.astype(np.float32)
@@ -91,7 +94,7 @@ def shade_gradients(
     seed: int = 0,
     counters: Counters | None = None,
     geometry: MeshObject | None = None,
-    wrt: Sequence[Parameter] = PARAMETERS,
+    wrt: Parameter | Sequence[Parameter] = PARAMETERS,
 ) -> Gradients:
     """Derivatives of a loss with respect to maps and light, from its derivative with respect to the image.
 
@@ -104,14 +107,17 @@ def shade_gradients(
         seed: `shade` with the same seed and samples draws the same directions.
         counters: its `nan_pixels` grows by the pixels and texels whose derivative came out NaN or infinite in some
             pass; that pass was made again with another seed.
-        wrt: what to differentiate with respect to. Under a black light the maps' derivatives are 0.
+        wrt: what to differentiate with respect to, one name or several. Under a black light the maps' derivatives
+            are 0.
 
     Raises:
         UnirenderError: as in `shade`; the image gradient has another size or is not finite; `wrt` names no parameter.
     """
+    wrt = (wrt,) if isinstance(wrt, str) else wrt
     if not wrt or not set(wrt) <= set(PARAMETERS):
         raise UnirenderError(f"shade_gradients: got wrt={tuple(wrt)}, expected some of {', '.join(PARAMETERS)}")
-    maps, light, mask = _arguments(intrinsics, environment)
+    maps, light, mask = _arguments(intrinsics, environment, spp, geometry)
+    image_gradient = as_numbers("image gradient", image_gradient)
     if image_gradient.shape != (*mask.shape[:2], 3) or not np.isfinite(image_gradient).all():
         raise UnirenderError(
             f"shade_gradients: got an image gradient of shape {image_gradient.shape}, expected finite "
@@ -140,15 +146,24 @@ def shade_gradients(
 
 
 def _arguments(
-    intrinsics: Intrinsics, environment: Float[np.ndarray, "eh ew 3"] | None
+    intrinsics: Intrinsics,
+    environment: Float[np.ndarray, "eh ew 3"] | None,
+    spp: int,
+    geometry: MeshObject | None,
 ) -> tuple[dict[str, Float[np.ndarray, "h w c"]], Float[np.ndarray, "eh ew 3"], Float[np.ndarray, "h w 1"]]:
     """Maps, light (checked; it may be black), and the mask: 0 where there is no normal."""
+    if not isinstance(intrinsics, Intrinsics):
+        raise UnirenderError(f"shade: got {type(intrinsics).__name__}, expected unirender.intrinsics.Intrinsics")
+    if not isinstance(spp, Integral):
+        raise UnirenderError(f"spp: got {spp!r:.60}, expected a whole number of samples, at least 1")
+    if geometry is not None and not isinstance(geometry, MeshObject):
+        raise UnirenderError(f"geometry: got {geometry!r:.60}, expected an object, as make_object or load_mesh gives")
     maps = intrinsics.require("albedo", "normal", "roughness", "metallic")
     if environment is None:
         environment = intrinsics.require("environment")["environment"]
     if maps["normal"].ndim != 3:
         raise UnirenderError(f"shade: got maps of shape {maps['normal'].shape}, expected one picture (h, w, c)")
-    light = np.asarray(environment, np.float32)
+    light = as_light(environment)
     envmap_data(light if light.any() else np.ones_like(light))  # checks
     inside = np.any(maps["normal"] != 0, axis=-1, keepdims=True)
     return maps, light, np.where(inside, 1 if intrinsics.mask is None else intrinsics.mask, 0).astype(np.float32)

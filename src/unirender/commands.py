@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import InputOptions, ModelOptions, OutputOptions, notice, read_input
+from unirender.options import MANY_CLIPPED, InputOptions, ModelOptions, OutputOptions, notice, read_input
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +59,7 @@ class Decompose:
             return self._run_folder()
         if self.frames:
             raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
-        picture, camera = self.input.read(), self.model.camera()
+        picture, camera = self.input.read(self.model)
         with contextlib.ExitStack() as folders:
             folder = folders.enter_context(new_folder(self.out.output, overwrite=self.out.overwrite))
             scene: Path | None = None
@@ -85,23 +85,24 @@ class Decompose:
         source, output = self.input.picture, self.out.output
         if self.export is not None:
             raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
-        pictures, camera = list_pictures(source), self.model.camera()
+        pictures = list_pictures(source)
         pipeline, sampling = self.model.load(), self.model.sampling()
         options = {"closed": self.closed, "tile": self.tile}
-        settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov_deg": camera.fov_deg}
+        settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov": self.model.fov}
         remarks: dict[str, list[str]] = {}
 
         def read(path: Path, mask: Path | None) -> "Picture":
             picture, said = read_input(path, mask)
             as_picture(picture.image_srgb, picture.mask)  # what the network would refuse is refused here, by itself
-            for kind, remark in said.items():
+            for kind, remark in (said | self.model.camera_remarks(picture)).items():
                 remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
             return picture
 
         def decompose(batch: list["Picture"]) -> list["Decomposition"]:
             images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
+            cameras = [self.model.camera(picture) for picture in batch]
             each: dict[str, Any] = sampling | {"generator": self.model.generators(len(batch))}
-            return pipeline.decompose_batch(images, masks, cameras=camera, **options, **each)
+            return pipeline.decompose_batch(images, masks, cameras=cameras, **options, **each)
 
         found = decompose_folder(
             pictures,
@@ -175,7 +176,7 @@ class Render:
             added = () if self.environment is None else of_light  # they are there, as direct light
             ready = ready_to_render(intrinsics, self.shadows, added)  # here, so that it is done once
             image = pipeline.render(ready, derived=told_derived(of_light, self.shadows), **self.model.sampling())
-            meta |= {**self.model.provenance(pipeline), **overflow(pipeline, ready)}
+            meta |= {**self.model.provenance(pipeline), **overflow(pipeline, ready), **at_white(image, ready.mask)}
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
         return 0
@@ -210,13 +211,14 @@ class Edit:
         for name, value in change.items():
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
-        picture, camera = self.input.read(), self.model.camera()
+        picture, camera = self.input.read(self.model)
         options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
             meta = {"command": "edit", "input": self.input.picture, "clipped": picture.clipped, **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
+            meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
         if result.coarse_share > MUCH_COARSE:
             notice(
@@ -253,7 +255,7 @@ class Relight:
 
         self.model.check()
         check_exposure(self.exposure)
-        picture, camera = self.input.read(), self.model.camera()
+        picture, camera = self.input.read(self.model)
         options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
@@ -269,6 +271,7 @@ class Relight:
             )
             meta = {"command": "relight", "input": self.input.picture, "clipped": picture.clipped, **options}
             meta |= {"light": self.environment, "exposure_stops": self.exposure, **self.model.provenance(pipeline)}
+            meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
         print(f"{self.out.output}")
         return 0
@@ -288,3 +291,21 @@ def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[st
     """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
     found = pipeline.overflow(intrinsics)
     return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
+
+
+def at_white(image_linear: "np.ndarray", mask: "np.ndarray | None") -> dict[str, Any]:
+    """For `meta.json`: the share of a rendering's pixels at display white, where the network's range ends; a notice
+    where there are many.
+
+    Args:
+        image_linear: premultiplied.
+        mask: its coverage.
+    """
+    from unirender.color import image_srgb, unpremultiply
+    from unirender.pictures import Picture
+
+    straight = image_linear if mask is None else unpremultiply(image_linear, mask)
+    share = Picture(image_srgb(straight), mask, "").clipped
+    if share > MANY_CLIPPED:
+        notice(f"{share:.0%} of the object's pixels come out at display white, where what the network renders ends")
+    return {"at_white": share}

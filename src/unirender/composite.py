@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
+from unirender.intrinsics import Intrinsics, unit_normals
 from unirender.surface_light import MIN_ALPHA
 
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
@@ -66,7 +66,7 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     """
     maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
-    n_v = np.sum(maps["normal"] * view, axis=-1, keepdims=True)
+    n_v = np.sum(unit_normals(maps["normal"]) * view, axis=-1, keepdims=True)
     reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
     radiance = lobes(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"], reflectance)
     return (radiance * maps["mask"]).astype(np.float32)

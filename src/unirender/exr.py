@@ -26,6 +26,7 @@ Channels = dict[str, Float[np.ndarray, "h w"]]
 
 HALF_MAX = 65504.0
 ATTRIBUTE_PREFIX = "unirender:"
+CAMERA_ATTRIBUTE = "camera"  # as `unirender.camera.Camera.describe` has it
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
 GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"

@@ -26,6 +26,7 @@ from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
+    CAMERA_ATTRIBUTE,
     channels_rgb,
     image_channels,
     intrinsics_channels,
@@ -42,7 +43,7 @@ INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "en
 FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
 ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
 
-CAMERA_ATTRIBUTE = "camera"
+LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
 
 logger = logging.getLogger(__name__)
 
@@ -207,7 +208,10 @@ def write_result(
     attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
         if any(name in IMAGE_MAPS for name in intrinsics.present):
-            write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=attributes)
+            of_maps = attributes
+            if intrinsics.environment is not None and _is_lit(intrinsics):
+                of_maps = attributes | {LIGHT_ATTRIBUTE: _light_sha256(intrinsics.environment)}
+            write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=of_maps)
         if intrinsics.environment is not None:
             write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
@@ -263,7 +267,8 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
         light: whether the folder's environment is wanted; else it is not looked at.
 
     Raises:
-        UnirenderError: there is nothing of the kind, or a file is broken.
+        UnirenderError: there is nothing of the kind, a file is broken, or the folder's environment is another one than
+            s and d were written with.
     """
     path = Path(path)
     file = path / INTRINSICS_FILE if path.is_dir() else path
@@ -290,9 +295,25 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
         intrinsics = intrinsics_from_channels(channels, environment, camera)
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}") from error
+    stored = attributes.get(LIGHT_ATTRIBUTE)
+    if environment is not None and stored and _is_lit(intrinsics) and stored != _light_sha256(environment):
+        raise UnirenderError(
+            f"{path}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
+            "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
+            "as it is): they are then derived from it"
+        )
     if not intrinsics.present:
         raise UnirenderError(f"{path}: has the channels {', '.join(sorted(channels))}, expected maps like albedo.R")
     return intrinsics
+
+
+def _is_lit(intrinsics: Intrinsics) -> bool:
+    """Whether there is s or d."""
+    return intrinsics.specular is not None or intrinsics.diffuse is not None
+
+
+def _light_sha256(environment: Float[np.ndarray, "eh ew 3"]) -> str:
+    return hashlib.sha256(repr(environment.shape).encode() + environment.tobytes()).hexdigest()
 
 
 def _read_environment(file: Path) -> Float[np.ndarray, "eh ew 3"]:

@@ -27,9 +27,13 @@ MAPS: dict[str, int] = {
     "mask": 1,
 }
 IMAGE_MAPS = tuple(name for name in MAPS if name != "environment")
+RADIANCE_MAPS = ("specular", "diffuse", "environment")
 UNIT_RANGE_MAPS = ("albedo", "roughness", "metallic", "mask")
 RANGE_TOLERANCE = 1e-3  # half-precision files round 1 up
 NORMAL_TOLERANCE = 0.02
+LEAST_SIDE = 2  # rows and columns of an environment: its poles, and two directions between them
+SHORTEST_NORMAL = 1e-3  # a shorter mean of normals has no direction
+UNIT_TOLERANCE = 1e-3  # of a length: half precision rounds it by up to 0.0005
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,8 @@ class Intrinsics:
 
     Attributes:
         albedo: principled `base_color`, linear, [0, 1].
-        normal: shading normal in camera axes, unit; 0 outside the mask.
+        normal: shading normal in camera axes, unit; 0 outside the mask. A shorter one, as averages are, is kept as
+            given; whatever uses a normal uses its direction (`unit_normals`).
         roughness: perceptual roughness, [0, 1]; the GGX alpha is its square.
         metallic: [0, 1].
         specular: s, radiance of the same surface as a perfect mirror-tinted reflector of the same roughness under the
@@ -62,17 +67,26 @@ class Intrinsics:
     camera: Camera = field(default_factory=Camera)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.camera, Camera):
+            raise UnirenderError(
+                f"camera: got {self.camera!r:.60}, expected a unirender.camera.Camera, like {Camera()}"
+            )
         size: tuple[int, ...] | None = None
         for name, channels in MAPS.items():
             value = getattr(self, name)
             if value is None:
                 continue
-            value = np.asarray(value, dtype=np.float32)
+            value = as_radiance(name, value) if name in RADIANCE_MAPS else as_numbers(name, value)
             object.__setattr__(self, name, value)
             if value.ndim < 3 or value.shape[-1] != channels:
                 raise UnirenderError(
                     f"{name}: got shape {value.shape}, expected [..., height, width, {channels}]; "
                     "single-channel maps keep their last axis"
+                )
+            if name == "environment" and min(value.shape[-3:-1]) < LEAST_SIDE:
+                raise UnirenderError(
+                    f"environment: got shape {value.shape}, expected a lat-long map of at least {LEAST_SIDE} rows (the "
+                    f"first and the last lie at the poles) and {LEAST_SIDE} columns"
                 )
             if name in IMAGE_MAPS:
                 if size is not None and value.shape[:-1] != size:
@@ -111,6 +125,11 @@ class Intrinsics:
         """A copy with some maps (or the camera) replaced; `None` forgets a map."""
         return dataclasses.replace(self, **changes)
 
+    def with_unit_normals(self) -> "Intrinsics":
+        """The same with normals of length 1 (`unit_normals`); itself where they are, or where there are none."""
+        normal = None if self.normal is None else unit_normals(self.normal)
+        return self if normal is self.normal else self.replace(normal=normal)
+
     def require(self, *names: str) -> dict[str, Float[np.ndarray, "..."]]:
         """The named maps as a dict.
 
@@ -124,6 +143,54 @@ class Intrinsics:
                 f"{', '.join(self.present) or 'none'}"
             )
         return {name: getattr(self, name) for name in names}
+
+
+def as_numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    """What somebody handed in as float32.
+
+    Raises:
+        UnirenderError: it is no array of numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's
+        raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
+
+
+def as_radiance(name: str, value: Any) -> Float[np.ndarray, "..."]:
+    """The same of linear radiance, which no whole numbers are: those are display values of a picture.
+
+    Raises:
+        UnirenderError: it is no array of numbers, or one of whole numbers.
+    """
+    numbers = as_numbers(name, value)
+    check_radiance(name, value)
+    return numbers
+
+
+def check_radiance(name: str, value: Any) -> None:
+    """Looks at the type of an array of radiance.
+
+    Raises:
+        UnirenderError: it is one of whole numbers.
+    """
+    given = np.asarray(value).dtype
+    if given.kind in "biu":
+        raise UnirenderError(
+            f"{name}: got {type(value).__name__} of {given} values, expected linear radiance as floats; read a "
+            "photograph or a light file with unirender_reference.lights.load_light(path).environment"
+        )
+
+
+def unit_normals(normal: Float[np.ndarray, "*size 3"]) -> Float[np.ndarray, "*size 3"]:
+    """Normals of length 1; unit ones stay as they are, to the bit, and 0, no surface, stays 0."""
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    known = length > SHORTEST_NORMAL
+    off = np.where(known, np.abs(length - 1) > UNIT_TOLERANCE, length > 0)
+    if not off.any():
+        return normal
+    unit = np.where(known, normal / np.where(known, length, 1), 0)
+    return np.where(off, unit, normal).astype(normal.dtype)
 
 
 def _check_range(name: str, value: Float[np.ndarray, "..."]) -> None:

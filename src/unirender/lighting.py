@@ -12,18 +12,37 @@ receives from a map is in `unirender.surface_light`.
 """
 
 import functools
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.intrinsics import as_radiance, check_radiance
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
+LEAST_ROWS, LEAST_COLUMNS = 3, 2  # of a light to render by: Mitsuba resamples smaller ones
 MOST_ALIASING = 0.005  # share of a texel's energy, away from the poles, that may come of how two grids lie together
+
+
+def as_light(environment: Any) -> Float[np.ndarray, "h w 3"]:
+    """An environment that somebody handed in, as float32; it may be black.
+
+    Raises:
+        UnirenderError: it is no array of floats, of a wrong shape, too small, NaN, infinite or negative.
+    """
+    light = as_radiance("environment", environment)
+    if light.ndim != 3 or light.shape[-1] != 3 or light.shape[0] < LEAST_ROWS or light.shape[1] < LEAST_COLUMNS:
+        raise UnirenderError(
+            f"environment: got shape {light.shape}, expected a lat-long map [height, width, 3] of at least "
+            f"{LEAST_ROWS} x {LEAST_COLUMNS} texels"
+        )
+    if not np.isfinite(light).all() or light.min() < 0:
+        raise UnirenderError("environment: got NaN, infinite or negative radiance, expected finite values >= 0")
+    return light
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
@@ -48,6 +67,7 @@ def sample_environment(
     environment: Float[np.ndarray, "h w 3"], directions: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
     """Bilinear radiance in the given unit directions, as Mitsuba interpolates it."""
+    check_radiance("environment", environment)
     height, width = environment.shape[:2]
     _check_shape((height, width))
     row = np.arccos(np.clip(directions[..., 1], -1, 1)) * ((height - 1) / np.pi)
@@ -78,6 +98,7 @@ def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.n
 
 def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
     """Average over the sphere, by solid angle."""
+    check_radiance("environment", environment)
     weights = texel_solid_angles(*environment.shape[:2])
     return (np.einsum("hw,hwc->c", weights, environment, dtype=np.float64) / (4 * np.pi)).astype(np.float32)
 
@@ -90,6 +111,7 @@ def resample_environment(
     Where it grows by a factor that is no whole number, texels of the old map would be met by more or fewer of the new
     one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
     """
+    check_radiance("environment", environment)
     height, width = environment.shape[:2]
     rows, columns = resampling_operators((height, width), shape)
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)

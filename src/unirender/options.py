@@ -63,7 +63,8 @@ class ModelOptions:
     """Side of the square at which the network runs, pixels: a multiple of 32 (of 64 for some checkpoints). None: the
     size it was trained at, which it is best at."""
     fov: float | None = None
-    """Vertical field of view of the picture in degrees. None: 36, and a notice."""
+    """Vertical field of view of the picture in degrees. None: that in the header of an EXR of ours, else 36, and a
+    notice."""
     progress: bool = True
     """Show progress."""
 
@@ -131,14 +132,20 @@ class ModelOptions:
 
         return same_noise(self.seed, count)
 
-    def camera(self) -> "Camera":
-        """The picture's camera; a notice is printed where its field of view is assumed."""
-        from unirender.camera import DEFAULT_FOV_DEG, Camera
+    def camera(self, picture: "Picture") -> "Camera":
+        """The picture's camera: that of its header, else the contract's, with the field of view that is given."""
+        from unirender.camera import Camera
 
-        if self.fov is None:
-            notice(f"field of view not given: {DEFAULT_FOV_DEG:g} degrees assumed (--fov)")
-            return Camera()
-        return Camera(fov_deg=self.fov)
+        camera = picture.camera or Camera()
+        return camera if self.fov is None else dataclasses.replace(camera, fov_deg=self.fov)
+
+    def camera_remarks(self, picture: "Picture") -> dict[str, str]:
+        """By kind, what the camera was taken from where it is not given."""
+        if self.fov is not None:
+            return {}
+        if picture.camera is None:
+            return {"camera": f"field of view not given: {self.camera(picture).fov_deg:g} degrees assumed (--fov)"}
+        return {"header": f"field of view of {picture.camera.fov_deg:g} degrees, as the picture's header says (--fov)"}
 
     def provenance(self, pipeline: "UniRenderPipeline") -> dict[str, Any]:
         """What goes into `meta.json` and the headers: which model ran, and how."""
@@ -184,24 +191,25 @@ class InputOptions:
     """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
     None: the alpha channel, else the whole frame."""
 
-    def read(self) -> "Picture":
-        """The picture with a mask; notices say what was assumed, and what the picture cannot show.
+    def read(self, model: ModelOptions) -> tuple["Picture", "Camera"]:
+        """The picture with a mask, and its camera; notices say what was assumed, and what the picture cannot show.
 
         Raises:
             UnirenderError: an unreadable file, or a mask that does not fit.
         """
         picture, remarks = read_input(self.picture, self.mask)
-        for remark in remarks.values():
+        for remark in (remarks | model.camera_remarks(picture)).values():
             notice(remark)
-        return picture
+        return picture, model.camera(picture)
 
 
-def read_input(path: Path, mask: Path | None) -> tuple["Picture", dict[str, str]]:
+def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
     """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
 
     Args:
         path: of the picture.
         mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
+        option: what remarks on a mask that is not there add: how one is given.
 
     Raises:
         UnirenderError: an unreadable file, or a mask that does not fit.
@@ -216,10 +224,10 @@ def read_input(path: Path, mask: Path | None) -> tuple["Picture", dict[str, str]
     if mask is not None:
         picture = dataclasses.replace(picture, mask=read_mask(mask, (height, width)))
     elif picture.mask is None:
-        remarks["mask"] = "no mask and no alpha channel: the whole frame is taken as the object (--mask)"
+        remarks["mask"] = f"no mask and no alpha channel: the whole frame is taken as the object{option}"
         picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
     elif picture.mask.min() == 1:
-        remarks["mask"] = "the alpha channel covers the whole frame, which is taken as the object (--mask)"
+        remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
     if picture.negative:
         remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"
     if picture.clipped > MANY_CLIPPED:

@@ -1,5 +1,6 @@
 """Pictures and masks from files: PNG, JPG and whatever else Pillow knows, and linear OpenEXR."""
 
+import contextlib
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,15 +9,16 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr
+from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
 from unirender.icc import in_srgb
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 MAX_PIXELS = 100_000_000
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
-DISPLAY_MAX_16_BIT = 65535  # display white of 16-bit grey
+DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
 
 
@@ -29,12 +31,14 @@ class Picture:
         mask: coverage; None where the file has no alpha channel.
         name: what to call it in messages.
         negative: share of the file's radiance that was negative, and is 0 here; display formats have none.
+        camera: that took it, where the header of an EXR of ours says so.
     """
 
     image_srgb: Float[np.ndarray, "h w 3"]
     mask: Float[np.ndarray, "h w 1"] | None
     name: str
     negative: float = 0.0
+    camera: Camera | None = None
 
     @property
     def clipped(self) -> float:
@@ -138,10 +142,16 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
         name: what to call it in messages.
 
     Raises:
-        UnirenderError: a floating-point or 32-bit picture, whose values have no display white, or one of L*a*b*.
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; or
+            one of L*a*b*.
     """
     if image.mode.startswith("I;16") or image.mode in ("I", "F"):
         values = np.asarray(image, dtype=np.float32)
+        if image.mode == "I" and 0 < values.max(initial=0) <= DISPLAY_MAX_8_BIT:
+            raise UnirenderError(
+                f"{name}: a picture of mode I whose values end at {values.max():g} may be 8-bit or very dark 16-bit "
+                'grey; convert it to mode "L", or to "I;16" if display white is 65535'
+            )
         if image.mode == "F" or values.min(initial=0) < 0 or values.max(initial=0) > DISPLAY_MAX_16_BIT:
             raise UnirenderError(
                 f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
@@ -222,7 +232,7 @@ def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:
 
 
 def _read_exr_picture(path: Path) -> Picture:
-    channels, _ = read_exr(path)
+    channels, attributes = read_exr(path)
     if not set("RGB") <= set(channels):
         raise UnirenderError(
             f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A)"
@@ -235,4 +245,7 @@ def _read_exr_picture(path: Path) -> Picture:
     if alpha is not None:
         mask = check_mask(alpha[..., None], f"{path} (A)")
         rgb = unpremultiply(rgb, mask)
-    return Picture(image_srgb(rgb), mask, path.name, negative)
+    camera = None
+    with contextlib.suppress(UnirenderError):  # other programs may write what they call a camera
+        camera = Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
+    return Picture(image_srgb(rgb), mask, path.name, negative, camera)

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.ggx import facing_normal, halton, mirror_direction, unit
+from unirender.intrinsics import unit_normals
 from unirender.lobes import TAIL_SHAPE, grid_lobes, sampled_cores, texels
 from unirender.subpixel import MEAN_WEIGHTS, MIRRORED, Surroundings, inside
 
@@ -28,7 +29,8 @@ _CHUNK = 1 << 21  # evaluations at a time
 def diffuse_light(
     normal: Float[np.ndarray, "h w 3"], environment: Float[np.ndarray, "eh ew 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """d without shadows: irradiance / pi at each normal; 0 where the normal is 0."""
+    """d without shadows: irradiance / pi at each normal, whose direction counts; 0 where the normal is 0."""
+    normal = unit_normals(normal)
     directions, radiance = texels(environment, QUADRATURE_SHAPE)
     there = np.any(normal != 0, axis=-1)
     n = normal[there]
@@ -51,12 +53,13 @@ def specular_light(
     """s without shadows: the GGX lobe of a reflector with F = 1, along the true view rays, averaged over the pixel.
 
     Args:
-        normal: camera axes, unit; 0 gives 0.
+        normal: camera axes; its direction counts, and 0 gives 0.
         roughness: perceptual, [0, 1], a map or one number.
         environment: lat-long radiance, any resolution.
         camera: gives the view direction of each pixel; the contract's default if None.
         where: pixels to light, the others are 0; all if None.
     """
+    normal = unit_normals(normal)
     height, width = normal.shape[:2]
     view = (camera or Camera()).view_directions(height, width)
     there = np.any(normal != 0, axis=-1)

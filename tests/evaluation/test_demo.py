@@ -20,6 +20,7 @@ from tiny_models import make_pipeline
 
 from unirender.cli import main
 from unirender.errors import UnirenderError, UsageError
+from unirender.exr import exr_bytes, image_channels
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
@@ -109,7 +110,18 @@ def test_a_picture_comes_with_its_alpha_channel_or_with_a_mask_or_as_a_whole() -
     whole, remarks = read_upload(plain, None, LIMITS)
     assert whole.mask is not None
     assert (whole.mask == 1).all()
-    assert "whole frame is taken as the object" in remarks[0]
+    assert remarks == ("No mask and no alpha channel: the whole frame is taken as the object.",)
+
+
+def test_what_the_command_line_would_remark_of_a_picture_the_page_says() -> None:
+    opaque = np.concatenate([ball().image_srgb, np.ones((SIZE, SIZE, 1))], axis=-1)
+    _, remarks = read_upload(Upload("opaque.png", png(opaque)), None, LIMITS)
+    assert remarks == ("The alpha channel covers the whole frame, which is taken as the object.",)
+    rgb = np.full((8, 16, 3), 0.5, np.float32)
+    rgb[2, 3, 1] = -1.0
+    negative = Upload("filtered.exr", exr_bytes(image_channels(rgb), half=False))
+    _, remarks = read_upload(negative, Upload("mask.png", png(np.ones((8, 16, 3)))), LIMITS)
+    assert remarks == ("0.5% of the picture's radiance is negative and was set to 0.",)
 
 
 NAN = nan_exr()

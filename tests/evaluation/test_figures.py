@@ -297,6 +297,14 @@ def test_what_cannot_be_drawn_is_a_usage_error(options: dict, said: str) -> None
         Figures(**options).run()
 
 
+def test_fewer_lights_than_were_asked_for_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    tiny = load_suite("tiny")
+    assert len(Figures(lights=2).relit_by(tiny, tiny.scenes[:1])) == 2
+    assert not capsys.readouterr().err
+    there = len(Figures(lights=1000).relit_by(tiny, tiny.scenes[:1]))
+    assert f"--lights 1000: suite tiny has {there} that light no input, and all of them" in capsys.readouterr().err
+
+
 def test_an_unknown_scene_or_checkpoint_is_named_and_nothing_is_written(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="has no scene 'none'"):
         Figures(out=tmp_path / "out", scenes=("none",)).run()

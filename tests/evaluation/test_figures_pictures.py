@@ -117,3 +117,22 @@ def test_what_cannot_be_drawn_is_named_before_a_model_is_loaded(tmp_path: Path) 
             Figures(pictures=(tmp_path / "opaque.png",), **beside).check()  # pyright: ignore[reportArgumentType] - two shapes
     with pytest.raises(UsageError, match="expected none of them twice"):
         Figures(pictures=(tmp_path / "a.png", tmp_path / "a.png")).check()
+
+
+class Careless(InputAsAlbedo):
+    """Writes into what it is handed."""
+
+    name = "careless"
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        image_srgb[...], mask[...] = 0, 0
+        return Intrinsics(albedo=image_srgb, mask=mask, camera=camera)
+
+
+def test_a_method_that_writes_into_the_picture_spoils_no_other_row() -> None:
+    picture = framed(disc(64, 64, (32, 32), 20), 32)
+    careless, other = (Subject(m.name, make_row(m, "external")) for m in (Careless(), InputAsAlbedo()))
+    last = [pictures_sheet(who, [picture], {}, Camera()).lines[-1] for who in ([other], [careless, other])]
+    for alone, beside in zip(last[0].tiles[1:], last[1].tiles[1:], strict=True):
+        assert (alone is None) == (beside is None)
+        assert alone is None or beside is None or np.array_equal(alone.picture, beside.picture)

@@ -229,10 +229,10 @@ def test_light_is_checked_even_where_nothing_is_shaded() -> None:
     assert not shade(nothing, light, 16).any()
     for given in (intrinsics, nothing):
         for wrong in (-light, np.full_like(light, np.nan)):
-            with pytest.raises(UnirenderError, match="negative, infinite or NaN radiance"):
+            with pytest.raises(UnirenderError, match="NaN, infinite or negative radiance"):
                 shade(given, wrong, 16)
         for wrong in (light[:2], 0 * light[:2]):
-            with pytest.raises(UnirenderError, match=r"got shape \(2, 8, 3\), expected \(height >= 3"):
+            with pytest.raises(UnirenderError, match=r"got shape \(2, 8, 3\), expected .* of at least 3 x 2"):
                 shade(given, wrong, 16)
 
 

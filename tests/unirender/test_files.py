@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
-from unirender.exr import image_channels, intrinsics_channels, read_exr, write_exr
+from unirender.exr import image_channels, intrinsics_channels, read_exr, write_environment, write_exr
 from unirender.files import checkpoint_sha256, new_folder, read_result, replace_file, write_result
 from unirender.intrinsics import Intrinsics
 
@@ -124,7 +125,7 @@ def test_a_checkpoints_hash_is_of_weights_and_configuration(tmp_path: Path) -> N
 
 def test_headers_say_where_a_file_comes_from(tmp_path: Path) -> None:
     mask = np.ones((4, 4, 1), dtype=np.float32)
-    intrinsics = Intrinsics(mask=mask, environment=np.ones((2, 4, 3), dtype=np.float32), camera=Camera(40))
+    intrinsics = Intrinsics(mask=mask, environment=np.ones((3, 4, 3), dtype=np.float32), camera=Camera(40))
     meta = {"input": Path("private/mug.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
     with new_folder(tmp_path / "out") as folder:
         write_result(folder, intrinsics, meta, image_linear=np.ones((4, 4, 3), dtype=np.float32))
@@ -142,7 +143,7 @@ def test_the_camera_is_that_of_meta_json_else_of_the_header_else_the_default(
 ) -> None:
     mask, camera = np.ones((4, 6, 1), dtype=np.float32), Camera(100 / 3, (0.25, 2 / 3))
     with new_folder(tmp_path / "out") as folder:
-        write_result(folder, Intrinsics(mask=mask, environment=mask[:2, :4].repeat(3, axis=-1), camera=camera), {})
+        write_result(folder, Intrinsics(mask=mask, environment=mask[:3, :4].repeat(3, axis=-1), camera=camera), {})
     alone = read_result(tmp_path / "out" / "intrinsics.exr")
     assert alone.camera == camera
     assert alone.environment is None
@@ -238,3 +239,25 @@ def test_a_meta_file_that_is_no_account_is_refused(text: str, tmp_path: Path) ->
     (tmp_path / "meta.json").write_text(text)
     with pytest.raises(UnirenderError, match=r"meta\.json: (not readable|expected)"):
         read_result(tmp_path)
+
+
+def test_a_light_that_was_exchanged_is_noticed(tmp_path: Path) -> None:
+    mask, light = np.ones((4, 5, 1), np.float32), np.random.default_rng(0).random((4, 8, 3), np.float32)
+    surface = Intrinsics(mask=mask, roughness=mask)
+    lit = surface.replace(diffuse=mask.repeat(3, axis=-1), environment=light)
+    other = tmp_path / "other.exr"
+    write_environment(other, 2 * light)
+    for name, maps in {"lit": lit, "surface": surface.replace(environment=light)}.items():
+        with new_folder(tmp_path / name) as folder:
+            write_result(folder, maps, {})
+        np.testing.assert_array_equal(read_result(tmp_path / name).environment, light)
+        shutil.copy(other, tmp_path / name / "environment.exr")
+    assert read_result(tmp_path / "surface").environment is not None  # nothing there comes from a light
+    assert read_result(tmp_path / "lit", light=False).diffuse is not None
+    with pytest.raises(
+        UnirenderError, match=r"environment.exr is another light than .* pass the other light as --envi"
+    ):
+        read_result(tmp_path / "lit")
+    # maps of before the record, and of others
+    write_exr(tmp_path / "lit" / "intrinsics.exr", intrinsics_channels(lit))
+    np.testing.assert_array_equal(read_result(tmp_path / "lit").environment, 2 * light)

@@ -46,6 +46,14 @@ def test_what_fills_the_picture_or_has_the_networks_size_is_left_as_it_is() -> N
     assert Frame.around(np.zeros((64, 64, 1), np.float32), SIZE) == Frame(64, 64, SIZE)
 
 
+def test_a_cut_out_object_is_reduced_and_not_enlarged() -> None:
+    mask = disc(400, 400, 200, 200, 20)
+    frame = Frame.reduced(mask, 256)
+    assert frame.size == frame.side < 60
+    assert Frame.reduced(mask, 32).size == 32
+    np.testing.assert_allclose(frame.leave(frame.enter(mask)), mask, atol=1e-6)
+
+
 def test_haze_is_left_out_only_where_it_hardly_counts() -> None:
     mask = disc(128, 128, 64, 64, 12)
     faint = np.maximum(mask, np.float32(1e-4))

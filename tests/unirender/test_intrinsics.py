@@ -16,7 +16,7 @@ from unirender.exr import (
     read_exr_bytes,
     write_exr,
 )
-from unirender.intrinsics import MAPS, Intrinsics
+from unirender.intrinsics import MAPS, Intrinsics, unit_normals
 
 
 def random_intrinsics(height: int = 6, width: int = 5) -> Intrinsics:
@@ -133,3 +133,21 @@ def test_a_map_with_some_of_its_channels_is_refused() -> None:
     for missing in ("albedo.R", "albedo.B", "normal.X"):
         with pytest.raises(UnirenderError, match=f"EXR channels {missing} missing"):
             intrinsics_from_channels({name: value for name, value in channels.items() if name != missing})
+
+
+def test_unit_normals_keep_their_bits_and_others_get_length_1() -> None:
+    normal = np.random.default_rng(0).normal(size=(2, 5, 6, 3)).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal[:, 0] = 0
+    for kept in (normal, normal.astype(np.float16).astype(np.float32)):
+        assert unit_normals(kept) is kept
+    maps = Intrinsics(normal=normal)
+    assert maps.with_unit_normals() is maps
+    short = normal.copy()
+    short[:, 1] *= 0.5
+    short[:, 2] *= 1e-4
+    made = unit_normals(short)
+    np.testing.assert_array_equal(made[:, 3:], normal[:, 3:])
+    np.testing.assert_allclose(made[:, 1], normal[:, 1], atol=1e-6)
+    assert not made[:, [0, 2]].any()
+    assert Intrinsics(normal=short).normal is short  # the contract keeps what it is given

@@ -19,6 +19,7 @@ from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.losses import DROPPABLE
 
+GROWN = ("albedo", "normal", "roughness", "metallic", "mask")
 SUBSETS = [known for count in range(5) for known in itertools.combinations(DROPPABLE, count)]
 
 
@@ -89,3 +90,15 @@ def test_without_albedo_the_closed_form_is_unknown_and_the_network_renders_alone
     assert not np.allclose(without, rendered(pipeline, given))
     black = given.replace(albedo=np.zeros((SIZE, SIZE, 3), np.float32))
     assert not np.allclose(without, rendered(pipeline, black))  # unknown is not black
+
+
+@pytest.mark.parametrize("missing", [("albedo",), ("specular", "diffuse", "environment")])
+def test_at_another_size_no_pixel_is_above_its_coverage(pipeline: UniRenderPipeline, missing: tuple[str, ...]) -> None:
+    """What the network adds outside the object is spread over its rim, and divided by a small coverage."""
+    given = scene()
+    doubled = given.replace(
+        **{name: np.kron(value, np.ones((2, 2, 1), np.float32)) for name, value in given.maps.items() if name in GROWN}
+    )
+    image = rendered(pipeline, doubled.replace(**dict.fromkeys(missing)))
+    assert image.min() >= 0
+    assert (image <= doubled.require("mask")["mask"]).all()

@@ -134,6 +134,16 @@ def test_sixteen_bit_pil_pictures_and_masks_keep_their_values() -> None:
         assert np.abs(saturated - expected).max() > 0.4
 
 
+def test_eight_bit_values_in_a_picture_of_more_bits_are_refused() -> None:
+    values = np.arange(256, dtype=np.int32).reshape(16, 16)
+    for grey in (Image.fromarray(values), Image.fromarray(values.astype(np.uint8)).convert("I")):
+        assert grey.mode == "I"
+        for read in (as_picture, lambda picture: as_mask(picture, (16, 16))):
+            with pytest.raises(UnirenderError, match=r'mode I whose values end at 255 may .* convert it to mode "L"'):
+                read(grey)
+    assert not as_picture(Image.fromarray(0 * values))[0].any()  # black either way
+
+
 def test_the_same_pixels_from_a_file_and_from_pil(tmp_path: Path) -> None:
     rgba = RNG.integers(0, 256, (9, 12, 4), dtype=np.uint8)
     rgba[0, 0, 3] = 255

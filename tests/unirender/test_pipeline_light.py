@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from unirender.camera import Camera
+from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
 from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
 from unirender.pipelines.editing import specular_for_roughness, specular_share, trust, under_light
+from unirender.pipelines.framing import Frame
 from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.revealed_light import agreeing_light
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 
@@ -104,7 +107,7 @@ def test_the_cost_is_bounded_by_the_small_size(monkeypatch: pytest.MonkeyPatch) 
     given = surface(560, 700)
     derived_specular(given, light(16))
     pixels = int(given.require("mask")["mask"].sum())
-    share = (LIGHT_SIDE / 700) ** 2
+    share = (LIGHT_SIDE / Frame.reduced(given.require("mask")["mask"], LIGHT_SIDE).side) ** 2
     assert lit[0] == pytest.approx(share * pixels, rel=0.05)
     assert sum(lit[1:]) < 0.1 * pixels  # the rim, whose normals the small size does not show
 
@@ -172,3 +175,21 @@ def test_edits_relighting_and_rendering_use_it() -> None:
     assert not np.allclose(edited[inside], old[inside], rtol=4 * TOLERANCE)  # the twin: something changes
     same, _ = specular_for_roughness(before, given.require("roughness")["roughness"])
     np.testing.assert_allclose(same, before.require("specular")["specular"], rtol=1e-5)
+
+
+def test_of_a_normal_the_direction_counts() -> None:
+    """Resampled and averaged normals are shorter than 1, each by another factor."""
+    given = surface(40, 48, roughness=0.2)
+    normal, mask = given.require("normal", "mask").values()
+    lengths = np.random.default_rng(0).uniform(0.3, 1, mask.shape).astype(np.float32)
+    short = given.replace(normal=normal * lengths)
+    everything = {"albedo": np.repeat(0.5 * mask, 3, -1), "metallic": 0.3 * mask, "environment": light(16)}
+    whole, halved = (ready_to_render(maps.replace(**everything)) for maps in (given, short))
+    for name in ("normal", "specular", "diffuse"):
+        np.testing.assert_allclose(getattr(halved, name), getattr(whole, name), rtol=1e-3, atol=1e-3, err_msg=name)
+    np.testing.assert_allclose(
+        split_sum_image(halved.replace(normal=short.normal)), split_sum_image(whole), rtol=1e-3, atol=1e-3
+    )
+    np.testing.assert_allclose(agreeing_light(halved.replace(normal=short.normal)), agreeing_light(whole), rtol=1e-3)
+    for lit, same in zip(every_pixel(short, light(16)), every_pixel(given, light(16)), strict=True):
+        np.testing.assert_allclose(lit, same, rtol=1e-3, atol=1e-3)

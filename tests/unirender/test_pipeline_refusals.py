@@ -12,6 +12,7 @@ from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultist
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 from tiny_models import SIZE, make_pipeline
 
+from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.inputs import as_picture
@@ -164,3 +165,35 @@ def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRende
     metal = pipeline.edit(image, mask, metallic=1.0, decomposition=decomposition)
     assert metal.coarse is None
     assert (metal.coarse_share, metal.bounded) == (0, 0)
+
+
+@pytest.mark.parametrize("task", ["edit", "relight"])
+def test_a_decomposition_at_hand_must_be_of_this_picture(pipeline: UniRenderPipeline, task: str) -> None:
+    image, mask = picture()
+    found = pipeline.decompose(image, mask)
+
+    def changed(image: np.ndarray, mask: np.ndarray, **given: Any) -> np.ndarray:
+        if task == "edit":
+            return pipeline.edit(image, mask, metallic=1.0, **given).image_linear
+        return pipeline.relight(image, LIGHT, mask, **given).image_linear
+
+    same = changed(image, mask, decomposition=found)
+    rounded = np.round(254.4 * mask) / 255
+    own = {"camera": found.intrinsics.camera, "tile": False, "closed": True, "material": None}
+    np.testing.assert_array_equal(changed(image, mask, decomposition=found, **own), same)
+    assert changed(image, rounded.astype(np.float32), decomposition=found).shape == same.shape
+    with pytest.raises(UnirenderError, match=r"decomposition: its mask differs from this one by up to 1, expected the"):
+        changed(image, np.roll(mask, 3, axis=0), decomposition=found)
+    with pytest.raises(
+        UnirenderError, match=r"decomposition: is of a picture of \(.*\) pixels, expected \(.*\) like this"
+    ):
+        changed(image[:-2], mask[:-2], decomposition=found)
+    wrong: list[tuple[str, Any, str]] = [
+        ("camera", Camera(80.0), r"camera: got Camera\(fov_deg=80.0.*, expected Camera\(fov_deg=36.0"),
+        ("tile", True, "tile: got True beside a decomposition, which is taken as it is"),
+        ("closed", False, "closed: got False beside a decomposition"),
+        ("material", "map", "material: got 'map' beside a decomposition"),
+    ]
+    for name, value, words in wrong:
+        with pytest.raises(UnirenderError, match=words):
+            changed(image, mask, decomposition=found, **{name: value})

@@ -15,7 +15,14 @@ import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
+from PIL import Image
+from unirender.lighting import rotate_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.surface_light import diffuse_light
+from unirender_reference.lights import make_light
+from unirender_reference.render import SceneSpec
+from unirender_reference.shade import shade, shade_gradients
+from unirender_reference.shapes import make_object
 
 logging.disable_progress_bar()
 pipeline = UniRenderPipeline.from_pretrained()
@@ -24,6 +31,8 @@ mask[4:-4, 4:-4] = 1
 image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
+maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
+photograph = Image.fromarray(bytes_8)
 for case in %r:
     try:
         print(case, "->", "fine" if eval(case) is not None else "None")
@@ -46,11 +55,42 @@ CASES = {
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics",
     "pipeline.render(decomposition.intrinsics, derived=('shadow',))": "derived: got shadow, expected names out of",
     "pipeline.relight(image, 'sky.exr', mask)": "environment: got str 'sky.exr', expected numbers",
+    "pipeline.relight(image, photograph, mask)": "environment: got Image of uint8 values, expected linear radiance as",
+    "pipeline.relight(image, bytes_8, mask)": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "Intrinsics(environment=photograph)": "environment: got Image of uint8 values, expected linear radiance as floats;",
+    "Intrinsics(environment=bytes_8.tolist())": "environment: got list of int64 values, expected linear radiance as",
+    "Intrinsics(diffuse=bytes_8)": "diffuse: got ndarray of uint8 values, expected linear radiance as floats; read a",
+    "diffuse_light(maps.normal, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "rotate_environment(bytes_8, np.eye(3))": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "shade(maps, photograph)": "environment: got Image of uint8 values, expected linear radiance as floats; read a",
+    "shade_gradients(maps, image, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "shade(maps, light[:2])": "environment: got shape (2, 32, 3), expected a lat-long map [height, width, 3]",
+    "pipeline.relight(image, light[:2], mask)": "environment: got shape (2, 32, 3), expected a lat-long map [height,",
+    "Intrinsics(environment=light[:1])": "environment: got shape (1, 32, 3), expected a lat-long map of at least 2",
+    "Intrinsics(albedo='x')": "albedo: got str 'x', expected numbers",
+    "Intrinsics(albedo=[[[1, 2, 3]], [[1]]])": "albedo: got list [[[1, 2, 3]], [[1]]], expected numbers",
+    "Intrinsics(camera='x')": "camera: got 'x', expected a unirender.camera.Camera",
+    "shade(maps, light, spp=2.5)": "spp: got 2.5, expected a whole number of samples",
+    "shade(maps, light, geometry='x')": "geometry: got 'x', expected an object",
+    "shade(None, light)": "shade: got NoneType, expected unirender.intrinsics.Intrinsics",
+    "shade_gradients(maps, [[1.0]], light)": "shade_gradients: got an image gradient of shape (1, 1), expected finite",
+    "shade_gradients(maps, 'x', light)": "image gradient: got str 'x', expected numbers",
+    "shade_gradients(maps, image, light, wrt='gloss')": "shade_gradients: got wrt=('gloss',), expected some of albedo,",
+    "SceneSpec(make_object(1, 'train'), make_light(1, 'train'), 'a', 0.0)": "scene: got roughness 'a', expected a",
+    "SceneSpec('ball', make_light(1, 'train'), 0.5, 0.0)": "scene: got obj 'ball', expected MeshObject",
+    "make_object('a', 'train')": "make_object: got seed 'a', split 'train'; expected seed >= 0",
+    "UniRenderPipeline.from_pretrained(123)": "checkpoint: got 123, expected the path of a pipeline folder",
+    "pipeline.render(maps, derived='shadow')": "derived: got shadow, expected names out of",
+    "pipeline.edit(image, mask, metallic=1.0, decomposition=maps)": "decomposition: got Intrinsics, expected the",
     "Camera('36')": "camera: got Camera(fov_deg='36'",
     "Camera(36, None)": "camera: got Camera(fov_deg=36, principal=None)",
     "Camera(36, 'ab')": "camera: got Camera(fov_deg=36, principal='ab')",
 }
 FINE = (
+    "pipeline.render(maps, derived='diffuse')",
+    "pipeline.render(maps.replace(environment=0 * light))",
+    "shade_gradients(maps, np.zeros((16, 24, 3)).tolist(), light, spp=1, wrt='albedo').albedo",
+    "rotate_environment(light.astype(np.float64), np.eye(3))",
     "hash(Camera(36, [0.5, 0.4])) == hash(Camera(36, (0.5, 0.4)))",
     "pipeline.edit(image, mask, metallic=np.full((16, 24), 0.2), decomposition=decomposition)",
     "pipeline.edit(image, mask, metallic=np.array([0.2]), decomposition=decomposition)",

@@ -11,7 +11,7 @@ import re
 import tempfile
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,8 @@ from PIL import Image
 
 from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
-from unirender.options import MANY_CLIPPED
-from unirender.pictures import Picture, read_mask, read_picture
+from unirender.options import read_input
+from unirender.pictures import Picture
 from unirender_evaluation.figures_pictures import framed
 from unirender_reference.lights import load_light
 
@@ -87,21 +87,11 @@ def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[P
     Raises:
         UnirenderError: a file is too large, or no readable picture; or the mask does not fit or is empty.
     """
-    remarks = []
-    with _as_file(picture, limits) as path:
-        found = read_picture(path)
-    height, width = found.image_srgb.shape[:2]
-    if mask is not None:
-        with _as_file(mask, limits) as path:
-            found = replace(found, mask=read_mask(path, (height, width)))
-    elif found.mask is None:
-        remarks.append(
-            "The picture has no alpha channel, and there is no mask: the whole frame is taken as the object."
-        )
-        found = replace(found, mask=np.ones((height, width, 1), dtype=np.float32))
-    if found.clipped > MANY_CLIPPED:
-        remarks.append(f"{found.clipped:.0%} of the object is clipped at display white: radiance is lost there.")
-    return found, tuple(remarks)
+    with contextlib.ExitStack() as files:
+        path = files.enter_context(_as_file(picture, limits))
+        beside = None if mask is None else files.enter_context(_as_file(mask, limits))
+        found, remarks = read_input(path, beside, option="")
+    return found, tuple(f"{remark[0].upper()}{remark[1:]}." for remark in remarks.values())
 
 
 def square(picture: Picture, side: int) -> Picture:

@@ -8,6 +8,7 @@ up to floating-point rounding.
 
 from collections.abc import Callable
 from dataclasses import replace
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -75,8 +76,8 @@ def draw_family(seed: int, split: Split) -> tuple[str, np.random.Generator]:
     Raises:
         UnirenderError: unknown split or negative seed.
     """
-    if split not in SPLIT or seed < 0:
-        raise UnirenderError(f"make_object: got seed {seed}, split {split!r}; expected seed >= 0, 'train' or 'test'")
+    if split not in SPLIT or not isinstance(seed, Integral) or seed < 0:
+        raise UnirenderError(f"make_object: got seed {seed!r}, split {split!r}; expected seed >= 0, 'train' or 'test'")
     rng = np.random.default_rng([SPLIT[split], seed])
     names = list(HELD_OUT_FAMILIES if split == "test" and seed % 2 == 0 else TRAIN_FAMILIES)
     weights = np.array([WEIGHT.get(name, 1.0) for name in names])

@@ -43,7 +43,7 @@ def _mean_radiance(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     """B, found at the size at which shadows are."""
     mask = intrinsics.require("mask")["mask"]
     if max(intrinsics.height, intrinsics.width) > SHADOW_SIDE:
-        frame = Frame(intrinsics.height, intrinsics.width, SHADOW_SIDE)
+        frame = Frame.reduced(mask, SHADOW_SIDE)
         return frame.leave_map(_mean_radiance(frame.enter_intrinsics(intrinsics)), mask)
     image = split_sum_image(intrinsics)
     sigma = AROUND * np.sqrt(np.maximum(mask, 0).sum())

@@ -40,7 +40,7 @@ def derived_diffuse(intrinsics: Intrinsics, environment: Float[np.ndarray, "eh e
         intrinsics: with normal and mask.
         environment: lat-long radiance in camera axes, any resolution.
     """
-    surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
+    surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera).with_unit_normals()
 
     def light(surface: Intrinsics, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, "h w 3"]:
         normal = surface.require("normal")["normal"]
@@ -60,7 +60,7 @@ def derived_specular(
         mirrors: whether sharp reflections are derived at the picture's own size.
     """
     maps = intrinsics.require("normal", "roughness", "mask")
-    surface = Intrinsics(**maps, camera=intrinsics.camera)
+    surface = Intrinsics(**maps, camera=intrinsics.camera).with_unit_normals()
 
     def light(surface: Intrinsics, where: Bool[np.ndarray, "h w"] | None) -> Float[np.ndarray, "h w 3"]:
         maps = surface.require("normal", "roughness")
@@ -103,7 +103,7 @@ def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | boo
     if max(surface.height, surface.width) <= LIGHT_SIDE:
         return light(surface, None)
     normal, mask = surface.require("normal", "mask").values()
-    frame = Frame(surface.height, surface.width, LIGHT_SIDE)
+    frame = Frame.reduced(mask, LIGHT_SIDE)
     small = frame.enter_intrinsics(surface)
     maps = {name: frame.leave_map(value, mask) for name, value in small.maps.items() if name != "mask"}
     distance = np.linalg.norm(unit_normal(maps["normal"]) - normal, axis=-1)

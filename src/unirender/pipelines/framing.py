@@ -5,7 +5,7 @@ model's size passes through untouched.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -67,6 +67,12 @@ class Frame:
         cut = cls(height, width, size, ((top + bottom - side) // 2, (left + right - side) // 2, side))
         inside = mask[cut._slices()[0]].sum(dtype=np.float64)
         return cut if inside >= (1 - MOST_LEFT_OUT) * mask.sum(dtype=np.float64) else whole
+
+    @classmethod
+    def reduced(cls, mask: Float[np.ndarray, "h w 1"], most: int) -> "Frame":
+        """The same with a square of at most `most` pixels a side: what is smaller is not enlarged."""
+        frame = cls.around(mask, most)
+        return replace(frame, size=min(most, frame.side))
 
     @property
     def identity(self) -> bool:

@@ -1,6 +1,6 @@
 """What a user hands to the pipeline, checked: pictures, masks and intrinsics. Each error says what to do about it."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -8,16 +8,20 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics
+from unirender.intrinsics import Intrinsics, as_numbers
+from unirender.lighting import as_light
 from unirender.pictures import coverage, display_colors, display_values
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import constant_map
+from unirender.pipelines.results import Decomposition
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
+MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
+TAKING_APART = {"tile": False, "material": None, "closed": True}  # settings of `decompose` alone, and their defaults
 
 
 def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
@@ -68,13 +72,9 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     """Radiance of a lat-long map.
 
     Raises:
-        UnirenderError: no array of numbers, wrong shape, NaN, negative, or black.
+        UnirenderError: as `unirender.lighting.as_light`; or it is black.
     """
-    light = _numbers("environment", environment)
-    if light.ndim != 3 or light.shape[-1] != 3 or min(light.shape[:2]) < 2:
-        raise UnirenderError(f"environment: got shape {light.shape}, expected a lat-long map [height, width, 3]")
-    if not np.isfinite(light).all() or light.min() < 0:
-        raise UnirenderError("environment: got NaN, infinite or negative radiance, expected finite values >= 0")
+    light = as_light(environment)
     if light.max() <= 0:
         raise UnirenderError("environment: the light is black, expected some radiance")
     return light
@@ -115,11 +115,11 @@ def ready_to_render(intrinsics: Intrinsics, shadows: bool = True, derived: Colle
         raise UnirenderError(
             f"render: got maps of shape {intrinsics.roughness.shape}, expected one picture [height, width, channels]"
         )
-    intrinsics = with_mask(intrinsics)
+    intrinsics = with_mask(intrinsics).with_unit_normals()
     as_mask(intrinsics.mask, (intrinsics.height, intrinsics.width))
     if intrinsics.environment is None:
         return intrinsics
-    light = as_environment(intrinsics.environment)
+    light = as_light(intrinsics.environment)
     names = to_derive(intrinsics)
     direct = intrinsics.replace(**derived_light(intrinsics, light, names, shadows=shadows))
     names = names.union(derived)
@@ -144,6 +144,46 @@ def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
         raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
 
 
+def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: Mapping[str, Any]) -> None:
+    """Looks at a decomposition that is handed in beside a picture, instead of one being made of it.
+
+    Args:
+        found: that decomposition.
+        mask: of the picture.
+        settings: of the call; those of how a picture is taken apart have no effect here, and are refused.
+
+    Raises:
+        UnirenderError: it is no `Decomposition`, of another size or mask, or a setting would have no effect.
+    """
+    if not isinstance(found, Decomposition):
+        raise UnirenderError(
+            f"decomposition: got {type(found).__name__}, expected the Decomposition that `decompose` returns; maps "
+            "alone are rendered by `render`"
+        )
+    own = found.intrinsics.require("mask")["mask"]
+    if own.shape != mask.shape:
+        raise UnirenderError(
+            f"decomposition: is of a picture of {own.shape[:-1]} pixels, expected {mask.shape[:-1]} like this one; "
+            "leave it out, or decompose this picture"
+        )
+    if (furthest := float(np.abs(own - mask).max())) > MASK_TOLERANCE:
+        raise UnirenderError(
+            f"decomposition: its mask differs from this one by up to {furthest:.2g}, expected the same; leave it out, "
+            "or decompose the picture with this mask"
+        )
+    if (camera := settings.get("camera")) not in (None, found.intrinsics.camera):
+        raise UnirenderError(
+            f"camera: got {camera}, expected {found.intrinsics.camera}, with which the decomposition was made; leave "
+            "one of them out"
+        )
+    for name, default in TAKING_APART.items():
+        if settings.get(name) not in (None, default):
+            raise UnirenderError(
+                f"{name}: got {settings[name]!r} beside a decomposition, which is taken as it is; pass {name} to "
+                "`decompose`, or leave the decomposition out"
+            )
+
+
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     """The intrinsics with a mask: the whole frame where none is known."""
     if intrinsics.mask is not None:
@@ -162,7 +202,7 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
     Raises:
         UnirenderError: it is no number, outside [0, 1], or of another size.
     """
-    given = _numbers(name, value)
+    given = as_numbers(name, value)
     if given.size != 1 and given.shape not in (mask.shape, mask.shape[:2]):
         raise UnirenderError(
             f"{name}: got shape {given.shape}, expected one number, or a map of shape {mask.shape}, the picture's size"
@@ -171,15 +211,8 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
     return constant_map(given.reshape(mask.shape if given.size != 1 else ()), mask)
 
 
-def _numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
-    try:
-        return np.asarray(value, dtype=np.float32)
-    except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's
-        raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
-
-
 def _checked(name: str, value: np.ndarray, advice: str) -> Float[np.ndarray, "..."]:
-    value = _numbers(name, value)
+    value = as_numbers(name, value)
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value)))
         raise UnirenderError(f"{name}: {bad} of {value.size} values are NaN or infinite, expected values in [0, 1]")

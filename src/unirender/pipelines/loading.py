@@ -22,6 +22,11 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
     Raises:
         UnirenderError: no such folder, or no pipeline in it.
     """
+    if not isinstance(checkpoint, str | Path | None):
+        raise UnirenderError(
+            f"checkpoint: got {checkpoint!r:.60}, expected the path of a pipeline folder, or one of the names "
+            f"{', '.join(shipped_names())}"
+        )
     path = checkpoint_folder(checkpoint)
     if not (path / INDEX_FILE).is_file():
         inside = path / "pipeline"

@@ -62,7 +62,7 @@ def _leave(
     inside = small.require("mask")["mask"]
     radiance = frame.leave_map(divide(rendered, inside), mask)
     if not {"albedo", "specular", "diffuse"} <= set(intrinsics.present):
-        return radiance * mask
+        return np.clip(radiance, 0, 1) * mask
     # The detail of a larger picture is in its closed form; the model adds what it lacks, in display values.
     closed_form = network.conditioning.physics_prior or PRIORS["split_sum"]
     small_image = frame.leave_map(divide(closed_form.image(small), inside), mask)

@@ -58,7 +58,8 @@ def _revealed(intrinsics: Intrinsics, by: tuple[str, ...], steps: int) -> Float[
         **intrinsics.require("normal", "roughness", *by, "mask", "environment"), camera=intrinsics.camera
     )
     if max(given.height, given.width) > SIDE:
-        given = Frame(given.height, given.width, SIDE).enter_intrinsics(given)
+        given = Frame.reduced(given.require("mask")["mask"], SIDE).enter_intrinsics(given)
+    given = given.with_unit_normals()
     maps = given.require("normal", "roughness", *by, "mask")
     environment = intrinsics.require("environment")["environment"]
     rows, columns = environment.shape[:2]

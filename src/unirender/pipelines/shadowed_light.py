@@ -54,7 +54,8 @@ def seen_shadows(intrinsics: Intrinsics) -> "SeenShadows":
     Args:
         intrinsics: as for `SeenShadows`.
     """
-    return _looked_at(_Surface(Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)))
+    surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
+    return _looked_at(_Surface(surface.with_unit_normals()))
 
 
 def forget_shadows() -> None:
@@ -71,11 +72,11 @@ class SeenShadows:
         Args:
             intrinsics: with normal and mask; the camera gives the pixels' rays.
         """
-        surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
+        surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera).with_unit_normals()
         self._mask = surface.require("mask")["mask"].copy()  # it outlives this call, and the caller's array is his
         self._frame = None
         if max(surface.height, surface.width) > SHADOW_SIDE:
-            self._frame = Frame(surface.height, surface.width, SHADOW_SIDE)
+            self._frame = Frame.reduced(self._mask, SHADOW_SIDE)
             surface = self._frame.enter_intrinsics(surface)
         normal, mask = surface.require("normal", "mask").values()
         shadow = SelfShadow.of(normal, mask, surface.camera)

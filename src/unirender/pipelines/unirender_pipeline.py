@@ -37,6 +37,7 @@ from unirender.pipelines.inputs import (
     as_environment,
     as_material,
     as_picture,
+    check_decomposition,
     check_rendered,
     ready_to_render,
     told_derived,
@@ -238,7 +239,7 @@ class UniRenderPipeline(DiffusionPipeline):
         generator: torch.Generator | None = None,
         sampler: str | None = None,
         size: int | None = None,
-        derived: Collection[str] = (),
+        derived: str | Collection[str] = (),
         shadows: bool = True,
     ) -> Float[np.ndarray, "h w 3"]:
         """Rendering; several samples are averaged in linear light.
@@ -265,6 +266,7 @@ class UniRenderPipeline(DiffusionPipeline):
         Raises:
             UnirenderError: a map that is needed is missing, or a setting is not usable.
         """
+        derived = (derived,) if isinstance(derived, str) else derived
         check_rendered(intrinsics, derived)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
@@ -304,18 +306,20 @@ class UniRenderPipeline(DiffusionPipeline):
             roughness: new value or map, [0, 1]; None: unchanged.
             metallic: new value or map, [0, 1]; None: unchanged.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
-            decomposition: of this picture, if it is at hand.
+            decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, tile,
+                material and closed are its own.
             **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, tile, material and
                 closed, as for `decompose`.
 
         Raises:
-            UnirenderError: as `decompose`; or nothing to change; or a value outside [0, 1].
+            UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does
+                not fit.
         """
         if roughness is None and metallic is None:
             raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
         check_settings(sampling)
         picture, cover = as_picture(image_srgb, mask)
-        decomposition = decomposition or self.decompose(picture, cover, **sampling)
+        decomposition = self._decomposition(picture, cover, decomposition, sampling)
         before = decomposition.with_network_light
         edited, bounded, coarse = before, 0.0, None
         if metallic is not None:
@@ -357,11 +361,12 @@ class UniRenderPipeline(DiffusionPipeline):
             specular: s under the new light, if known.
             diffuse: d under the new light, if known.
             shadows: as for `render`; off, since predicted normals say less of where they fall.
-            decomposition: of this picture, if it is at hand.
+            decomposition: as for `edit`.
             **sampling: as for `edit`.
 
         Raises:
-            UnirenderError: as `decompose`; or neither a light nor both s and d are given.
+            UnirenderError: as `decompose`; or neither a light nor both s and d are given; or a decomposition that does
+                not fit.
         """
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
@@ -370,7 +375,7 @@ class UniRenderPipeline(DiffusionPipeline):
         picture, cover = as_picture(image_srgb, mask)
         if environment is not None:
             environment = as_environment(environment)
-        decomposition = decomposition or self.decompose(picture, cover, **sampling)
+        decomposition = self._decomposition(picture, cover, decomposition, sampling)
         before = decomposition.with_network_light
         if environment is not None:
             edited = under_light(before, environment, exposure, specular, diffuse, mirrors=False, shadows=shadows)
@@ -380,6 +385,18 @@ class UniRenderPipeline(DiffusionPipeline):
         derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)
+
+    def _decomposition(
+        self,
+        picture: Float[np.ndarray, "h w 3"],
+        cover: Float[np.ndarray, "h w 1"],
+        at_hand: Decomposition | None,
+        sampling: dict[str, Any],
+    ) -> Decomposition:
+        if at_hand is None:
+            return self.decompose(picture, cover, **sampling)
+        check_decomposition(at_hand, cover, sampling)
+        return at_hand
 
     def _rerender(
         self,
