@@ -5,6 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
+import diffusers
 import numpy as np
 import pytest
 import torch
@@ -19,6 +20,7 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.calibrate import Calibrate, Line, fit, object_of, readings, write_calibrated
 from unirender.training.data import GroupDataset
+from unirender.training.facts import dataset_facts
 from unirender.training.start import read_start
 from unirender.training.trainer import RunConfig, Trainer
 
@@ -229,6 +231,24 @@ def test_wrong_calls_are_refused(data: Path, checkpoint: Path, tmp_path: Path) -
     with pytest.raises(UnirenderError, match="was trained on this folder"):
         Calibrate(data, out, tmp_path / "trained").run()
     assert not out.exists()
+
+
+def test_data_that_share_a_shard_with_the_training_are_refused(
+    data: Path, checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A part of them, or a folder that has grown since; and no bar of loading is shown."""
+    diffusers.utils.logging.enable_progress_bar()
+    part, other = tmp_path / "part", tmp_path / "other"
+    for folder, source in ((part, data), (other, write_dataset(tmp_path / "new", size=SIZE, shards=1, groups=2))):
+        folder.mkdir()
+        shutil.copy(source / "shard-000000.tar", folder)
+    shutil.copytree(checkpoint, tmp_path / "trained")
+    (tmp_path / "trained" / "training.json").write_text(json.dumps({"data": dataset_facts(part, GroupDataset(part))}))
+    with pytest.raises(UnirenderError, match=r"was trained on 1 of its 2 shards, such as shard-000000\.tar"):
+        Calibrate(data, tmp_path / "out", tmp_path / "trained").run()
+    with pytest.raises(UnirenderError, match="got 2 objects"):  # another shard of that name
+        Calibrate(other, tmp_path / "out", tmp_path / "trained").run()
+    assert "Loading" not in capsys.readouterr().err
 
 
 def test_the_account_of_a_training_tells_of_it(checkpoint: Path, tmp_path: Path) -> None:

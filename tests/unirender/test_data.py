@@ -366,7 +366,7 @@ def _broken(tmp_path: Path, change) -> Path:
             lambda m: m.update({"visible.npy": b""}),
             "has no pictures but visible.npy.* `unirender train-visibility` learns",
         ),
-        (lambda m: m.update({"l0.maps.exr": m["l0.m050_r040.exr"]}), "is missing"),
+        (lambda m: m.update({"l0.maps.exr": m["l0.m050_r040.exr"]}), "write vary independent"),
     ],
 )
 def test_broken_groups_are_refused(tmp_path: Path, change, message: str) -> None:

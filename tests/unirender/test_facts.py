@@ -42,6 +42,17 @@ def test_the_log_counts_up_to_the_step_of_the_weights(
     assert found.get("scores", {}).get("albedo.psnr") == psnr
 
 
+@pytest.mark.parametrize(("steps", "minutes", "expected"), [(8, None, {"steps": 8}), (None, 2.5, {"minutes": 2.5})])
+def test_the_configuration_has_the_length_of_the_run(
+    steps: int | None, minutes: float | None, expected: dict[str, float], tmp_path: Path
+) -> None:
+    """And not the 20,000 steps of its preset, beside the 8 that it had."""
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=steps, minutes=minutes), torch.device("cpu"), torch.float32)
+    found = training_facts(trainer)["train"]
+    assert {name: found[name] for name in ("steps", "minutes") if name in found} == expected
+    assert found["batch_size"] == TRAIN.batch_size
+
+
 def test_a_run_without_a_log_or_open_data_says_nothing_of_them(tmp_path: Path) -> None:
     trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=1), torch.device("cpu"), torch.float32)
     found = training_facts(trainer)

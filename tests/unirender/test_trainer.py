@@ -691,6 +691,51 @@ def test_a_resume_forgets_what_the_log_says_of_later_steps(tmp_path: Path) -> No
     assert log.read_text() == known
 
 
+def test_a_run_that_was_killed_before_its_first_save_leaves_no_log(tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").write_text('{"step": 0, "validation": {}}\n{"step": 1, "image": 2.0}\n{"step": 2, "im')
+    Trainer(TRAIN, RunConfig(tmp_path, steps=1, log_every=1), CPU, torch.float32).fit(SyntheticSource())
+    (line,) = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert line["step"] == 1
+    assert "samples_per_s" in line
+
+
+class Poisoned(SyntheticSource):
+    """A source of batches with a value that is none."""
+
+    def next(self) -> dict[str, Tensor]:
+        batch = super().next()
+        batch["albedo"][1, 0, 3, 3] = math.nan
+        return batch
+
+    def last_keys(self) -> list[str]:
+        return [f"object-{row}" for row in range(TRAIN.batch_size)]
+
+
+def test_a_gradient_that_is_none_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32)
+    with pytest.raises(UnirenderError, match=r"the gradient at step 0 is nan; .* not finite \(albedo of object-1\)"):
+        trainer.fit(Poisoned())
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda weights, norm: torch.tensor(math.inf))
+    with pytest.raises(UnirenderError, match=r"is inf; lower the learning rate \(--learning-rate\)"):
+        Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
+    save_state(tmp_path, trainer.state_dict() | {"source": {"place": 0}})
+    with pytest.raises(UnirenderError, match="is inf; begin anew with a lower --learning-rate and another --out"):
+        Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
+
+
+def test_a_source_knows_the_groups_of_its_last_batch(tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data", vary="independent", shards=1, groups=3)
+    plain = NO_AUGMENTATION
+    source = ShardSource(tmp_path / "data", 4, seed=2, workers=0, augmentation=plain, rows=slice(1, None, 2))
+    for _ in range(2):
+        batch, keys, dataset = source.next(), source.last_keys(), source.open()
+        assert len(keys) == len(batch["albedo"]) == 2
+        for albedo, key in zip(batch["albedo"], keys, strict=True):
+            number = dataset.keys.index(key)
+            own = dataset.stored(number, dataset.pairs(number)[0])[1].require("albedo")["albedo"]
+            np.testing.assert_array_equal(albedo.permute(1, 2, 0).numpy(), own)
+
+
 def test_a_folder_is_there_before_and_after_its_replacement(tmp_path: Path) -> None:
     def finished(text: str) -> Path:
         (tmp_path / "new").mkdir()

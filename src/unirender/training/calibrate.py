@@ -13,7 +13,7 @@ than chance. It stands in the configuration of the checkpoint's pipeline, whose 
 import contextlib
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -107,6 +107,8 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
         UnirenderError: no such checkpoint, a broken account of its training, no data, too few objects or pictures that
             are smaller than the network's; or the copy cannot be written.
     """
+    import diffusers
+
     from unirender.files import new_folder
     from unirender.models.precision import resolve_device
     from unirender.pipelines.calibration import NAMES
@@ -117,6 +119,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.training.facts import dataset_facts
     from unirender.writing import writing
 
+    diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     checkpoint = checkpoint_folder(options.checkpoint)
     pipeline = UniRenderPipeline.from_pretrained(checkpoint, calibration=None).to(resolve_device("auto"))
     pipeline.set_progress_bar_config(disable=True)
@@ -127,8 +130,8 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
             f"{options.data}: got pictures of {data.resolution[1]} x {data.resolution[0]} pixels, expected at least "
             f"{pipeline.size}, the size of {checkpoint}; render larger ones"
         )
-    if data.fingerprint in {facts.get("data", {}).get("fingerprint") for facts in history}:
-        raise UnirenderError(f"{options.data}: {checkpoint} was trained on this folder, expected one of other objects")
+    if seen := _trained_on(data, history):
+        raise UnirenderError(f"{options.data}: {checkpoint} was trained on {seen}, expected a folder of other objects")
     if (count := len(set(map(object_of, data.keys)))) < LEAST_OBJECTS:
         raise UnirenderError(f"{options.data}: got {count} objects, expected {LEAST_OBJECTS} or more")
     with contextlib.suppress(_NothingKept), new_folder(options.out) as folder:
@@ -148,6 +151,21 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
 
 class _NothingKept(Exception):
     """No folder is to appear."""
+
+
+def _trained_on(data: "GroupDataset", history: Sequence[Mapping[str, Any]]) -> str | None:
+    """What of a data folder the runs behind a checkpoint were trained on, in words; None: nothing that is known of.
+
+    Accounts of earlier versions know the folder as a whole alone.
+    """
+    from unirender.training.facts import HASH_DIGITS
+
+    known = [facts.get("data") or {} for facts in history]
+    if data.fingerprint in {facts.get("fingerprint") for facts in known}:
+        return "this folder"
+    hashes = {part for facts in known for part in facts.get("shard_hashes", "").split()}
+    seen = [shard.name for shard in data.shards if shard.sha256[:HASH_DIGITS] in hashes]
+    return f"{len(seen)} of its {len(data.shards)} shards, such as {seen[0]}" if seen else None
 
 
 def object_of(key: str) -> str:

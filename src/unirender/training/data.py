@@ -139,7 +139,8 @@ class GroupDataset:
             raise UnirenderError(
                 f"{folder}: groups {', '.join(twice[:5])} occur in several shards, expected each key once"
             )
-        self._basis = {i: _basis(group) for i, (_, group) in enumerate(self._groups) if group.vary == "basis"}
+        basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
+        self._basis = {i: _basis(*self._groups[i]) for i in basis}
         self._items: list[tuple[int, Pair | None]] = []
         for i, (_, group) in enumerate(self._groups):
             self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
@@ -176,11 +177,10 @@ class GroupDataset:
         The lights of one shard are kept in memory: ask in the order of groups.
         """
         entry = self._groups[group][1]
-        number = sorted({other.light for other in entry.pairs}).index(pair.light)
-        return self._whole_lights(self._shard_of[group])[entry.key][number]
+        return self._whole_lights(self._shard_of[group])[entry.key][pair.light]
 
     @functools.lru_cache(maxsize=1)  # noqa: B019 - a dataset lives as long as what reads it
-    def _whole_lights(self, shard: int) -> dict[str, list[Float[np.ndarray, "eh ew 3"]]]:
+    def _whole_lights(self, shard: int) -> dict[str, dict[int, Float[np.ndarray, "eh ew 3"]]]:
         return dict(read_environments(self._paths[shard]))
 
     def sample(self, index: int, seed: int, augmentation: Augmentation) -> Maps:
@@ -219,7 +219,10 @@ class GroupDataset:
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
         factor = 1.0
         if drawn.exposure_target is not None:
-            factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
+            try:
+                factor = exposure_factor(maps["diffuse"], maps["mask"], drawn.exposure_target)
+            except UnirenderError as error:
+                raise UnirenderError(f"{shard.name}: group {entry.key}: {error}") from error
         light = self._derived_light(rows, drawn) if drawn.derived else None
         return scale_light(maps, factor) | self._named_derived(light, drawn.shadowed, factor, maps["diffuse"])
 
@@ -289,23 +292,30 @@ def make_batch(
     return moved(batch, [draw.move for _, _, draw in drawn])
 
 
-def _basis(group: Group) -> _Basis:
+def _basis(shard: Shard, group: Group) -> _Basis:
     """Sorts a basis group's pairs into its grid.
 
     Raises:
         UnirenderError: the grid is not complete.
     """
+    where = f"{shard.name}: group {group.key}"
     lights = sorted({pair.light for pair in group.pairs})
     roughness = sorted({pair.roughness for pair in group.pairs if pair.roughness is not None})
+    if not roughness:  # of a shard that was packed by an earlier version
+        raise UnirenderError(f"{where}: has no picture of a roughness and metallic, expected a full basis grid")
     by_node = {(pair.light, pair.roughness, pair.metallic): pair for pair in group.pairs}
     try:
         grid = [[[by_node[light, r, m] for m in METALLIC_NODES] for r in roughness] for light in lights]
     except KeyError as error:
         raise UnirenderError(
-            f"group {group.key}: no picture for (light, roughness, metallic) {error}, expected a full basis grid"
+            f"{where}: no picture for (light, roughness, metallic) {error}, expected a full basis grid"
         ) from error
     if len(by_node) != len(lights) * len(roughness) * len(METALLIC_NODES):
-        raise UnirenderError(f"group {group.key}: got metallic values other than {METALLIC_NODES} in a basis group")
+        others = {"maps" if m is None else f"{m:g}" for _, _, m in by_node if m not in METALLIC_NODES}
+        raise UnirenderError(
+            f"{where}: got pictures at metallic {', '.join(sorted(others))} in a basis group, expected "
+            f"{', '.join(map(str, METALLIC_NODES))} alone; write vary independent"
+        )
     return _Basis(
         roughness=tuple(roughness),
         image=np.array([[[pair.image for pair in nodes] for nodes in row] for row in grid]),

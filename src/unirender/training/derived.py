@@ -14,7 +14,7 @@ their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/de
 import logging
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,16 +112,15 @@ def _derive(path: Path, shard: Shard) -> None:
 
 
 def _of_group(
-    shard: Shard, group: Group, lights: list[Float[np.ndarray, "eh ew 3"]]
+    shard: Shard, group: Group, lights: Mapping[int, Float[np.ndarray, "eh ew 3"]]
 ) -> list[tuple[int, Float16[np.ndarray, "2 3 h w"]]]:
     """(row of the packed shard, derived light without and with shadows) of every s and d of a group, once each."""
     shared = np.moveaxis(shard.shared[group.shared].astype(np.float32), 0, -1)
     normal, mask = shared[..., 3:6], shared[..., 6:7]
     shadows = SeenShadows(Intrinsics(normal=normal, mask=mask))
     found: dict[int, Float[np.ndarray, "2 h w 3"]] = {}
-    numbers = {row: number for number, row in enumerate(sorted({pair.light for pair in group.pairs}))}
     for pair in group.pairs:
-        light = lights[numbers[pair.light]]
+        light = lights[pair.light]
         rough = shared[..., 7:8] if pair.roughness is None else np.float32(pair.roughness) * (mask > 0)
         if pair.diffuse not in found:
             d = diffuse_light(normal, light)

@@ -46,6 +46,9 @@ class DeviceSource:
         own.consumed += own.batch_size
         return batch
 
+    def last_keys(self) -> list[str]:
+        return self.source.last_keys()
+
     def read_ahead(self) -> None:
         """There is nothing to read: all lies on the device."""
 

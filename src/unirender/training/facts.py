@@ -3,7 +3,6 @@
 A fact that is not known is left out.
 """
 
-import json
 import platform
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,9 @@ import diffusers
 import torch
 
 import unirender
+from unirender.training.checkpoint import plain
 from unirender.training.device_data import DeviceSource
+from unirender.training.run_log import LOG_FILE, read_lines
 from unirender.training.source import BatchSource, ShardSource
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
 
 CPU_INFO = Path("/proc/cpuinfo")
+HASH_DIGITS = 10  # by which a shard is known: of 100 others one is taken for one of 10,000 in a case of a million
 
 
 def training_facts(trainer: "Trainer") -> dict[str, Any]:
@@ -47,7 +49,7 @@ def training_facts(trainer: "Trainer") -> dict[str, Any]:
         "losses": log.latest("samples_per_s"),
         "scores": scores["validation"] if scores and scores["step"] == trainer.step else None,
         "scored_on": run.scored_on,
-        "train": trainer.state_dict()["config"],
+        "train": _resolved(trainer),
         "continues": trainer.continues,
     }
     return {name: value for name, value in facts.items() if value is not None}
@@ -63,14 +65,20 @@ def data_facts(source: BatchSource | None) -> dict[str, Any] | None:
 
 
 def dataset_facts(folder: Path, dataset: "GroupDataset") -> dict[str, Any]:
-    """Name, fingerprint and size of a data folder."""
+    """Name, fingerprint and size of a data folder, and by what its shards are known again."""
     return {
         "folder": folder.resolve().name,
         "fingerprint": dataset.fingerprint,
+        "shard_hashes": shard_hashes(dataset),
         "shards": len(dataset.shard_names),
         "groups": len(dataset.keys),
         "pairs": dataset.num_pairs,
     }
+
+
+def shard_hashes(dataset: "GroupDataset") -> str:
+    """The first digits of each shard's sha256, in order, with a space between two: one line, whatever their number."""
+    return " ".join(shard.sha256[:HASH_DIGITS] for shard in dataset.shards)
 
 
 def processor_name(device: torch.device) -> str | None:
@@ -92,13 +100,18 @@ def _hardware(trainer: "Trainer") -> dict[str, Any]:
     return {name: value for name, value in facts.items() if value is not None}
 
 
+def _resolved(trainer: "Trainer") -> dict[str, Any]:
+    """The configuration with the length that the run has: that of its preset may be another."""
+    config, run = plain(trainer.config), trainer.run
+    length = {"steps": run.steps, "minutes": run.minutes}
+    return {name: value for name, value in (config | length).items() if name not in length or value is not None}
+
+
 class _Log:
     """The lines of a run's log up to a step; the newest of a kind is the one with an entry of a name."""
 
     def __init__(self, folder: Path, step: int) -> None:
-        path = folder / "log.jsonl"
-        lines = path.read_text().splitlines() if path.is_file() else []
-        self.lines = [line for line in map(json.loads, lines) if line["step"] <= step]
+        self.lines = [line for line in read_lines(folder / LOG_FILE) if line["step"] <= step]
 
     def latest(self, name: str) -> dict[str, Any] | None:
         return next((line for line in reversed(self.lines) if name in line), None)

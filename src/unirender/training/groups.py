@@ -10,14 +10,13 @@ Decoding the fifty EXRs of a group takes longer than a training step, so `open_p
 memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
 
     pixels.npy       float16 [n, 3, h, w]          images, s and d
-    shared.npy       float16 [groups, 7, h, w]     albedo, normal, mask; 9 with roughness and metallic maps
+    shared.npy       float16 [groups, 7, h, w]     albedo, normal, mask; 9 where a group has maps of the others
     environment.npy  float32 [lights, 4, 3, 16, 32]  the light at the model's size under 0 to 3 quarter turns
     index.json       which row is what
 """
 
 import contextlib
 import json
-import re
 import tarfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -28,45 +27,13 @@ import numpy as np
 from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
-from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
+from unirender.exr import channels_rgb, read_exr_bytes
 from unirender.files import file_sha256
 from unirender.paths import cache_dir, cached_folder
-from unirender.training.environments import turned_environments
+from unirender.training.packing import SCALAR_CHANNELS, Group, Packer, Pair
 
 PACK_VERSION = 1  # part of the cache's path: raise it when the packed layout changes
-ENVIRONMENT_SIZE = (16, 32)  # the environment that the model predicts
-
-SCALAR_CHANNELS = 7  # of `Shard.shared` without maps of roughness and metallic
-
-_LIGHT = re.compile(
-    r"l(?P<light>\d+)\.(?:(?P<environment>environment)|(?P<diffuse>diffuse)|(?:r(?P<level>\d+)|maps)\.(?P<specular>specular)"
-    r"|m(?P<metallic>\d+)_r(?P<roughness>\d+)|maps)\.exr"
-)
-
-
-@dataclass(frozen=True)
-class Pair:
-    """One picture of a group and the rows of its buffers in `Shard.pixels` (`light`: row of `Shard.environment`).
-
-    Metallic and roughness are both None where they are the group's maps.
-    """
-
-    light: int
-    metallic: float | None
-    roughness: float | None
-    image: int
-    specular: int
-    diffuse: int
-
-
-@dataclass(frozen=True)
-class Group:
-    """An object under its lights; `shared` is a row of `Shard.shared`, `light_index[i]` names the light of pairs[i]."""
-
-    key: str
-    vary: str
-    shared: int
-    pairs: tuple[Pair, ...]
+END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends
 
 
 @dataclass(frozen=True)
@@ -150,8 +117,9 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
     """Yields (key, members by name without the key) of a tar shard, in its order.
 
     Raises:
-        UnirenderError: not a readable tar, or a member occurs twice (two groups would merge).
+        UnirenderError: not a readable tar, one that was cut off, or a member occurs twice (two groups would merge).
     """
+    path = Path(path)
     key, members, seen = "", {}, set()
     try:
         with tarfile.open(path, "r:") as tar:
@@ -170,22 +138,31 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                     raise UnirenderError(f"{path}: member {info.name} occurs twice, expected each member once")
                 stream = tar.extractfile(info)
                 members[rest] = stream.read() if stream else b""
+            with path.open("rb") as file:  # a file that was cut off reads like a shorter one
+                file.seek(tar.offset)
+                if file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
+                    raise UnirenderError(
+                        f"{path}: stops after group {key} without the two empty blocks that end a tar: it was "
+                        "cut off or is damaged; copy it again, or remake it"
+                    )
     except (tarfile.TarError, OSError) as error:
         raise UnirenderError(f"{path}: not a readable tar shard ({error})") from error
     if members:
         yield key, members
 
 
-def read_environments(path: str | Path) -> Iterator[tuple[str, list[Float[np.ndarray, "eh ew 3"]]]]:
-    """Yields (key, lights at their stored resolution, in the order of their rows in the packed shard) of a tar shard.
+def read_environments(path: str | Path) -> Iterator[tuple[str, dict[int, Float[np.ndarray, "eh ew 3"]]]]:
+    """Yields (key, lights at their stored resolution by their rows in `Shard.environment`) of a tar shard.
 
     Raises:
         UnirenderError: as `read_groups`, or a light is no readable EXR.
     """
+    row = 0
     for key, members in read_groups(path):
         names = sorted(name for name in members if name.endswith(".environment.exr"))
-        files = ((members[name], f"{path}: group {key}.{name}") for name in names)
-        yield key, [channels_rgb(read_exr_bytes(data, name=name)[0]) for data, name in files]
+        read = (read_exr_bytes(members[name], name=f"{path}: group {key}.{name}")[0] for name in names)
+        yield key, {number: channels_rgb(channels) for number, channels in enumerate(read, start=row)}
+        row += len(names)
 
 
 def open_packed(path: str | Path, sha256: str | None = None, name: str | None = None) -> Shard:
@@ -217,96 +194,23 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
 
 def _pack(path: Path, folder: Path) -> None:
     """Decodes a shard into `folder`, which appears when it is complete."""
-    packer = _Packer(str(path))
+    packer = Packer(str(path))
     groups = [packer.add(key, members) for key, members in read_groups(path)]
     if not groups:
         raise UnirenderError(f"{path}: the shard has no groups; delete it and remake the dataset")
     with cached_folder(folder) as made:
-        np.save(made / "pixels.npy", packer.stack(packer.pixels))
-        np.save(made / "shared.npy", packer.stack(packer.shared))
-        np.save(made / "environment.npy", np.stack(packer.environment))
+        for name, array in packer.arrays().items():
+            np.save(made / f"{name}.npy", array)
         (made / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
 
 
-class _Packer:
-    """Collects the rows of a shard's arrays."""
-
-    def __init__(self, path: str) -> None:
-        self.path = path
-        self.pixels: list[Float16[np.ndarray, "3 h w"]] = []
-        self.shared: list[Float16[np.ndarray, "7 h w"]] = []
-        self.environment: list[Float[np.ndarray, "4 3 16 32"]] = []
-
-    def add(self, key: str, members: dict[str, bytes]) -> Group:
-        where = f"{self.path}: group {key}"
-        rows: dict[tuple, int] = {}
-        images: list[tuple[int, int | None, int | None]] = []  # light, metallic, roughness in percent
-        lights: dict[int, int] = {}
-        for name in sorted(members):
-            if name in ("json", "shared.exr"):
-                continue
-            match = _LIGHT.fullmatch(name)
-            if name == "visible.npy":
-                raise UnirenderError(
-                    f"{where}: has no pictures but {name}, which directions the object hides; `unirender "
-                    "train-visibility` learns from that, `unirender train` from data of another --vary"
-                )
-            if match is None:
-                raise UnirenderError(f"{where}: unknown member {name!r}; was it written by another version?")
-            light = int(match["light"])
-            channels, _ = read_exr_bytes(members[name], name=f"{where}.{name}")
-            if match["environment"]:
-                turned = turned_environments(channels_rgb(channels), ENVIRONMENT_SIZE)
-                lights[light] = len(self.environment)
-                self.environment.append(np.ascontiguousarray(np.moveaxis(turned, -1, 1)))
-            elif match["diffuse"]:
-                rows[light, "diffuse"] = self._row(channels, name, "diffuse")
-            elif match["specular"]:
-                rows[light, "specular", _percent(match["level"])] = self._row(channels, name, "specular")
-            else:
-                image = (light, _percent(match["metallic"]), _percent(match["roughness"]))
-                rows[image] = self._row(channels, name, "")
-                images.append(image)
-        own_maps = any(metallic is None for _, metallic, _ in images)
-        try:
-            vary = json.loads(members["json"])["vary"]
-            shared, _ = read_exr_bytes(members["shared.exr"], name=f"{where}.shared.exr")
-            pairs = tuple(
-                Pair(
-                    light=lights[light],
-                    metallic=None if metallic is None else metallic / 100,
-                    roughness=None if roughness is None else roughness / 100,
-                    image=rows[light, metallic, roughness],
-                    specular=rows[light, "specular", roughness],
-                    diffuse=rows[light, "diffuse"],
-                )
-                for light, metallic, roughness in sorted(images, key=lambda image: tuple(part or 0 for part in image))
-            )
-        except KeyError as error:
-            raise UnirenderError(f"{where}: member or entry {error} is missing; remake the dataset") from error
-        maps = [
-            channels_rgb(shared, "albedo"),
-            channels_rgb(shared, "normal", "XYZ"),
-            channels_rgb(shared, "mask", "Y"),
-        ]
-        if own_maps:
-            maps += [channels_rgb(shared, "roughness", "Y"), channels_rgb(shared, "metallic", "Y")]
-        self.shared.append(np.moveaxis(np.concatenate(maps, axis=-1), -1, 0).astype(np.float16))
-        return Group(key=key, vary=vary, shared=len(self.shared) - 1, pairs=pairs)
-
-    def _row(self, channels: Channels, name: str, prefix: str) -> int:
-        rgb = channels_rgb(channels, prefix if f"{prefix}.R" in channels else "")
-        if not np.isfinite(rgb).all() or np.abs(rgb).max() > HALF_MAX:
-            raise UnirenderError(f"{self.path}: {name}: values are not finite or overflow half precision")
-        self.pixels.append(np.moveaxis(rgb, -1, 0).astype(np.float16))
-        return len(self.pixels) - 1
-
-    def stack(self, rows: list[np.ndarray]) -> np.ndarray:
-        sizes = {row.shape for row in rows}
-        if len(sizes) != 1:
-            raise UnirenderError(f"{self.path}: pictures have sizes {sorted(sizes)}, expected one size")
-        return np.stack(rows)
-
-
-def _percent(digits: str | None) -> int | None:
-    return None if digits is None else int(digits)
+__all__ = [
+    "SCALAR_CHANNELS",
+    "Group",
+    "Pair",
+    "Shard",
+    "list_shards",
+    "open_packed",
+    "read_environments",
+    "read_groups",
+]

@@ -1,26 +1,27 @@
 """Objects elsewhere in the frame: rolled about the view axis, nearer or farther, and to one side.
 
-A roll is exact but for the resampling: normals and light turn with the picture. Zoom and shift are close: seen from
+A roll is exact but for the resampling: normals and light turn with the picture, the light without losing or gaining
+energy (`unirender.training.environments`). Zoom and shift are close: seen from
 another distance or side, an object would show a little more or less of its flanks, and a pixel's view direction changes
 by up to 6 degrees of the 36 that the camera sees. An object that fills the frame may lose an edge of itself. What they
 buy: an object of the training data is no longer bound to its place, and its outline falls on other pixels each time.
 
-All is resampled once, bilinearly. What is defined on the object alone (everything but image and mask) is averaged over
-those of the four pixels that show it.
+All but the light is resampled once, bilinearly. What is defined on the object alone (everything but image and mask) is
+averaged over those of the four pixels that show it.
 """
 
-import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from scipy.sparse import block_diag
 from torch import Tensor
 
 from unirender.errors import UnirenderError
-from unirender.lighting import environment_directions
+from unirender.training.environments import ANGLE_STEP, small_turn_operator
 
 ROLL_DEG = 25.0  # at most, either way
 ZOOM = 0.18  # at most, the logarithm
@@ -67,28 +68,20 @@ def moved(maps: Maps, moves: Sequence[Move | None]) -> Maps:
         x, y, z = part["normal"].unbind(dim=1)
         part["normal"] = F.normalize(torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=1), dim=1)
     if "environment" in maps:
-        part["environment"] = rolled_environment(maps["environment"][rows], roll)
+        part["environment"] = rolled_environment(maps["environment"][rows], [move.roll for _, move in chosen])
     return maps | {name: maps[name].index_copy(0, rows, value) for name, value in part.items()}
 
 
-def rolled_environment(
-    environment: Float[Tensor, "b 3 eh ew"], roll: Float[Tensor, " b"]
-) -> Float[Tensor, "b 3 eh ew"]:
-    """Lights turned about +z, towards the viewer: twin of `unirender.lighting.rotate_environment`."""
-    height, width = environment.shape[-2:]
-    x, y, z = torch.from_numpy(_directions(height, width)).to(environment).unbind(dim=-1)
-    cosine, sine = (of(roll)[:, None, None] for of in (torch.cos, torch.sin))
-    x, y, z = cosine * x + sine * y, cosine * y - sine * x, z.expand(len(roll), -1, -1)
-    row = torch.arccos(y.clamp(-1, 1)) * ((height - 1) / math.pi)
-    column = torch.atan2(x, -z) * (width / (2 * math.pi)) % width  # from the left border of the first texel
-    at = torch.stack([2 * (column + 0.5) / (width + 1) - 1, 2 * row / (height - 1) - 1], dim=-1)
-    around = torch.cat([environment[..., -1:], environment, environment[..., :1]], dim=-1)
-    return F.grid_sample(around, at, mode="bilinear", padding_mode="border", align_corners=True)
-
-
-@functools.cache
-def _directions(height: int, width: int):
-    return environment_directions(height, width)
+def rolled_environment(environment: Float[Tensor, "b 3 eh ew"], rolls: Sequence[float]) -> Float[Tensor, "b 3 eh ew"]:
+    """Lights turned about +z, towards the viewer, to a quarter of a degree; their energy is kept."""
+    size = (environment.shape[-2], environment.shape[-1])
+    operators = [small_turn_operator(size, round(roll / ANGLE_STEP)) for roll in rolls]
+    matrix = block_diag(operators, format="coo")
+    at = torch.from_numpy(np.stack(matrix.coords).astype(np.int64))
+    turn = torch.sparse_coo_tensor(at, torch.from_numpy(matrix.data), matrix.shape, check_invariants=False)
+    channels = environment.permute(0, 2, 3, 1).reshape(-1, 3)
+    turned = torch.sparse.mm(turn.to(environment.device), channels)
+    return turned.reshape(-1, *size, 3).permute(0, 3, 1, 2).contiguous()
 
 
 def _grid(like: Tensor, roll: Tensor, zoom: Tensor, right: Tensor, down: Tensor) -> Float[Tensor, "b h w 2"]:

@@ -6,7 +6,7 @@ a resumed run are those of an uninterrupted one.
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -50,10 +50,30 @@ class RunLog:
         report(line)
 
     def forget_after(self, step: int) -> None:
-        """Drops the lines that a killed run wrote after its last state: their steps come again."""
-        if not self.processes.is_main or not self.path.is_file():
-            return
-        lines = self.path.read_text().splitlines(keepends=True)
-        kept = [line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step]
-        with writing(self.path):
-            replace_file(self.path, "".join(kept))
+        """Drops the lines that a killed run wrote after its last state, whose steps come again, and unreadable ones."""
+        if self.processes.is_main:
+            forget_after(self.path, step)
+
+
+def forget_after(path: Path, step: int) -> None:
+    """Keeps the readable lines of a log up to a step, if there is one."""
+    if path.is_file():
+        kept = [line for line, values in _read(path) if values["step"] <= step]
+        with writing(path):
+            replace_file(path, "".join(kept))
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """The lines of a log that are whole; none of a file that is not there."""
+    return [values for _, values in _read(path)] if path.is_file() else []
+
+
+def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Lines and what they hold, without those that a kill cut short or that are no line of a log."""
+    for line in path.read_text(errors="replace").splitlines(keepends=True):
+        try:
+            values = json.loads(line)
+        except ValueError:
+            continue
+        if line.endswith("\n") and isinstance(values, dict) and isinstance(values.get("step"), int):
+            yield line, values

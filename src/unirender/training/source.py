@@ -36,6 +36,15 @@ class BatchSource(Protocol):
         ...
 
 
+@runtime_checkable
+class NamesGroups(Protocol):
+    """A source that knows which groups its batches are made of."""
+
+    def last_keys(self) -> list[str]:
+        """Of each sample of the last batch, the key of its group."""
+        ...
+
+
 class ShardSource:
     """Batches from a data folder; the folder may still be growing.
 
@@ -86,6 +95,10 @@ class ShardSource:
         batch = next(self._batches)
         self.consumed += self.batch_size
         return batch
+
+    def last_keys(self) -> list[str]:
+        dataset, last = self.open(), range(self.consumed - self.batch_size, self.consumed)[self.rows]
+        return [dataset.keys[dataset.drawn(index, self.seed, self.augmentation)[0]] for index in last]
 
     def read_ahead(self) -> None:
         if self._batches is not None:

@@ -29,7 +29,7 @@ from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
 from unirender.training.beginning import Beginning, check_beginning
-from unirender.training.checkpoint import differences, load_state, plain, save_state
+from unirender.training.checkpoint import STATE_FILE, differences, load_state, plain, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
@@ -40,11 +40,13 @@ from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
-from unirender.training.source import BatchSource
+from unirender.training.source import BatchSource, NamesGroups
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
 from unirender.writing import writing
+
+MOST_NAMED = 5  # maps and groups of a batch in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,13 +143,25 @@ class Trainer:
         when_idle()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.optimizer.clip_norm)
         if not torch.isfinite(norm):
-            raise UnirenderError(
-                f"training: the gradient at step {self.step} is {float(norm)}; lower the learning rate"
-            )
+            raise UnirenderError(f"training: the gradient at step {self.step} is {float(norm)}; {self._why(batch)}")
         self.optimizer.step()
         self.ema.update(self.model)
         self.step += 1
         return terms | {"grad_norm": float(norm), "lr": rate}
+
+    def _why(self, batch: Maps) -> str:
+        """Why a gradient is not finite, as far as it can be told: the batch is not, or the steps are too large."""
+        rows = {name: (~value.isfinite().flatten(1).all(dim=1)).nonzero().flatten() for name, value in batch.items()}
+        keys = self.source.last_keys() if isinstance(self.source, NamesGroups) else None
+        own = [
+            f"{name} of {keys[row] if keys else f'sample {row}'}" for name, of in rows.items() for row in of.tolist()
+        ]
+        if wrong := [each for one in self.processes.gather(own) for each in one]:
+            named = ", ".join(wrong[:MOST_NAMED])
+            return f"the data have values that are not finite ({named}); mend these groups, or leave them out"
+        if (self.run.out / STATE_FILE).exists():
+            return "begin anew with a lower --learning-rate and another --out: that of a saved run is fixed"
+        return "lower the learning rate (--learning-rate)"
 
     def fit(
         self,
@@ -305,6 +319,7 @@ class Trainer:
         """
         state = load_state(self.run.out)
         if state is None:
+            self.log.forget_after(-1)  # all of a run that was killed before its first save
             return False
         if differing := differences(state["config"], self.config):
             raise UnirenderError(

@@ -157,7 +157,7 @@ class _Run:
             self._tell(validate(self.net, held_out, options.seed))  # before anything was learned
 
     def _resume(self, state: Mapping[str, Any]) -> None:
-        from unirender.files import replace_file
+        from unirender.training.run_log import forget_after
 
         if state["options"] != self.asked:
             raise UnirenderError(
@@ -167,9 +167,7 @@ class _Run:
         self.optimizer.load_state_dict(state["optimizer"])
         self.ema.load_state_dict(state["ema"])
         self.step = int(state["step"])
-        lines = [line for line in self.log.read_text().splitlines(keepends=True) if line.endswith("\n")]
-        with writing(self.log):
-            replace_file(self.log, "".join(line for line in lines if json.loads(line)["step"] <= self.step))
+        forget_after(self.log, self.step)
 
     def train_step(self) -> None:
         """One step of the optimiser."""

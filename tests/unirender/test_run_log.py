@@ -1,0 +1,30 @@
+"""The log of a run: what a kill left half written costs no other line."""
+
+from pathlib import Path
+
+import pytest
+
+from unirender.training.processes import ALONE, Processes
+from unirender.training.run_log import RunLog, read_lines
+
+LINES = '{"step": 1, "image": 2.0}\n', '{"step": 2, "image": 1.5}\n', '{"step": 3, "image": 1.0}\n'
+
+
+@pytest.mark.parametrize(
+    "broken", ["{not json\n", "[1, 2]\n", '{"image": 1.0}\n', "\n", '{"step": "2"}\n', "\0\0\n", b"\xff\xfe\n"]
+)
+def test_a_broken_line_is_dropped_and_no_other(tmp_path: Path, broken: str | bytes) -> None:
+    log = RunLog(tmp_path, ALONE)
+    unreadable = broken.encode() if isinstance(broken, str) else broken
+    log.path.write_bytes(LINES[0].encode() + unreadable + LINES[1].encode() + LINES[2].encode() + b'{"step": 2, "im')
+    assert [line["step"] for line in read_lines(log.path)] == [1, 2, 3]
+    RunLog(tmp_path, Processes(rank=1, size=2)).forget_after(2)
+    assert len(log.path.read_bytes()) > len("".join(LINES))  # the first process alone writes
+    log.forget_after(2)
+    assert log.path.read_text() == "".join(LINES[:2])
+
+
+def test_a_run_without_a_log_has_no_lines(tmp_path: Path) -> None:
+    RunLog(tmp_path, ALONE).forget_after(-1)
+    assert read_lines(tmp_path / "log.jsonl") == []
+    assert not list(tmp_path.iterdir())
