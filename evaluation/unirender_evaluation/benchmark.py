@@ -13,6 +13,7 @@ Running the same command again reuses what is done.
 
 import platform
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -245,10 +246,11 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
     else:
         done = frozenset(store.used)
         found = run_in_workers(here, partial(build_rows, config), scenes, done, min(config.jobs, len(scenes)))
-    for records in found:
-        for record in records:
-            store.add(record)
-        progress.advance(bar, len(records))
+    with closing(found) as finished:
+        for records in finished:
+            for record in records:
+                store.add(record)
+            progress.advance(bar, len(records))
 
 
 def anywhere(config: BenchConfig) -> BenchConfig:

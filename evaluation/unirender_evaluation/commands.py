@@ -3,6 +3,7 @@
 import json
 import secrets
 import sys
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -223,8 +224,9 @@ class BenchTruth:
         folders = {"out": self.out, "objects": self.objects, "lights": self.lights}
         with Progress(console=console, transient=not console.is_terminal) as progress:
             bar = progress.add_task("truth", total=None)
-            for done, total in make_truth(self.suite, work, self.workers, **folders):
-                progress.update(bar, completed=done, total=total)
+            with closing(make_truth(self.suite, work, self.workers, **folders)) as finished:
+                for done, total in finished:
+                    progress.update(bar, completed=done, total=total)
         suite = load_suite(target(self.suite, **folders)[0].path)
         print(f"{suite.spec.path}: {len(suite.scenes)} scenes, truth {suite.sha256[:12]}")
         for kind, row in quality_summary(suite).items():

@@ -106,7 +106,8 @@ def check_light(row: Row, task: Task, maps: Intrinsics | None) -> None:
 
 
 def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
-    """Calls one capability of a row's method.
+    """Calls one capability of a row's method. A stranger's is handed arrays of its own and may write into them; what it
+    returns is copied, so that it may use its arrays again.
 
     Raises:
         UnirenderError: a stranger's method fails, or returns something else than maps or a finite picture of the
@@ -119,22 +120,49 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     asked = inputs.get("intrinsics")
     size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
-        result = function(**inputs)
+        result = function(**{argument: _own(value) for argument, value in inputs.items()})
     except Exception as error:
         raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
-    if capability == "decompose":
-        if not isinstance(result, Intrinsics):
-            raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
-        if any(name in IMAGE_MAPS for name in result.present) and (result.height, result.width) != size:
-            raise UnirenderError(f"{name}: got maps of size {(result.height, result.width)}, expected {size}")
-        return result
-    picture = np.asarray(result)
-    if picture.shape != (*size, 3) or picture.dtype.kind != "f" or not np.isfinite(picture).all():
+    if capability != "decompose":
+        return _picture(result, size, name)
+    if not isinstance(result, Intrinsics):
+        raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
+    if any(name in IMAGE_MAPS for name in result.present) and (result.height, result.width) != size:
+        raise UnirenderError(f"{name}: got maps of size {(result.height, result.width)}, expected {size}")
+    return _own(result)
+
+
+def _own(value: Any) -> Any:
+    """An array, or maps, in memory that nobody else has; anything else as it is."""
+    if isinstance(value, Intrinsics):
+        return value.replace(**{name: _own(array) for name, array in value.maps.items()})
+    return value.copy(order="K") if isinstance(value, np.ndarray) else value
+
+
+def _picture(result: Any, size: tuple[int, int], name: str) -> Image:
+    """The picture that a stranger's method returned, as an array of float32.
+
+    Args:
+        result: what it returned.
+        size: (height, width) of the question.
+        name: of method and question, for messages.
+
+    Raises:
+        UnirenderError: it is no array of finite floats of that size.
+    """
+    expected = f"expected finite linear radiance, floats of shape {(*size, 3)}"
+    try:
+        picture = np.asarray(result)
+    except Exception as error:  # of a tensor's or a list's own: it has a gradient, or is elsewhere than in memory
         raise UnirenderError(
-            f"{name}: got {picture.dtype} of shape {picture.shape}, expected finite linear radiance, floats of shape "
-            f"{(*size, 3)}"
-        )
-    return picture.astype(np.float32)
+            f"{name}: got {type(result).__name__}, of which no array can be made ({error}), {expected}"
+        ) from error
+    if picture.shape != (*size, 3) or picture.dtype.kind != "f":
+        raise UnirenderError(f"{name}: got {picture.dtype} of shape {picture.shape}, {expected}")
+    picture = picture.astype(np.float32)
+    if bad := int(np.count_nonzero(~np.isfinite(picture))):
+        raise UnirenderError(f"{name}: {bad} of {picture.size} values are NaN or infinite, {expected}")
+    return picture
 
 
 def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[str, float]:

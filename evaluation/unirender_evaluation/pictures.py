@@ -66,6 +66,11 @@ class Pictures:
         """Whether a prediction is stored under this key."""
         return sheet_key(self._path(task.identity, method)) == key
 
+    def absent(self, records: Sequence[Record]) -> list[Record]:
+        """Those of the records whose predictions are not stored, though predictions of their questions are."""
+        asked = [record for record in records if (record.table, record.protocol) in PROTOCOLS]
+        return [r for r in asked if not self._path(f"{r.table}/{r.protocol}/{r.sample}", r.method).is_file()]
+
     def items(self, records: Sequence[Record], main: str) -> list[GalleryItem]:
         """The gallery.
 

@@ -47,7 +47,7 @@ class Sample:
     Attributes:
         table: of the record.
         key: of the record: unique in its table.
-        object: what the bootstrap draws: samples of one object or scene are not independent.
+        object: what intervals are over: samples of one object or scene are not independent.
         asks: what of a method.
         folder: name of the subfolder in which a folder of predictions answers it.
         answer: name of the answer's file there, without suffix.

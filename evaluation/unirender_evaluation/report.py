@@ -8,6 +8,7 @@ of a finished run again.
 """
 
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -37,10 +38,12 @@ from unirender_evaluation.table_formats import (
     to_json,
 )
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import Cell, Row, Table, build_tables
+from unirender_evaluation.tables import RANKED_KINDS, Cell, Row, Table, build_tables
 
 if TYPE_CHECKING:
     from unirender_evaluation.suites import Suite
+
+logger = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).parent / "templates"
 VERDICT = "verdict.txt"  # in a run's folder
@@ -271,7 +274,7 @@ def read_results(folder: Path, variants: Sequence[Variant] | None = None) -> tup
 
 
 def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] | None = None) -> Path:
-    """Writes `report.html` of a finished run again; nothing is measured.
+    """Writes `report.html` of a finished run again; nothing is measured. Warns where pictures of it are gone.
 
     Args:
         folder: that `unirender bench run --out` wrote.
@@ -281,6 +284,7 @@ def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] 
     Raises:
         UnirenderError: no run in the folder, or the suite is not the one that it scored.
     """
+    from unirender_evaluation.pictures import Pictures
     from unirender_evaluation.suites import load_suite  # what runs need, a report alone does not
 
     run, records, tables = read_results(folder, variants)
@@ -296,6 +300,13 @@ def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] 
         raise UnirenderError(
             f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
             f"{folder} scored; name it with --suite"
+        )
+    answers = [record for record in records if run.method(record.method).kind in RANKED_KINDS]
+    if absent := Pictures(folder / "pictures", loaded, []).absent(answers):
+        logger.warning(
+            "%s: the pictures of %d answers are not there, and the report lacks them; `unirender bench run` as it "
+            "was given makes them again",
+            *(folder / "pictures", len(absent)),
         )
     return report_run(folder, loaded, run, records, tables)
 

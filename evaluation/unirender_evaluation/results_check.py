@@ -172,7 +172,7 @@ def _key_problem(key: str, backbones: Iterable[str]) -> str:
 
 
 def _twice(records: Iterable[Record]) -> Iterator[Problem]:
-    """One measurement must not count twice, nor a sample belong to two objects: the bootstrap draws objects."""
+    """One measurement must not count twice, nor a sample belong to two objects: intervals are over objects."""
     seen: dict[tuple[str, ...], int] = {}
     owners: dict[str, tuple[str, int]] = {}
     for i, record in enumerate(records):

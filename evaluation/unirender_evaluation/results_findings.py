@@ -52,9 +52,10 @@ def run_line(results: Results) -> str:
     """Which results these are, in a line."""
     run = results.run
     objects = len({record.object for record in results.records})
+    carried = f" ({run.carried})" if run.carried else ""
     return (
         f"`{run.suite}`: {objects} objects at {run.resolution} x {run.resolution} pixels, {len(results.records):,} "
-        f"answers; truth `{run.suite_hash[:12]}`, code `{run.code}`, {run.date}{f' ({run.carried})' if run.carried else ''}"
+        f"answers; truth `{run.suite_hash[:12]}`, code `{run.code}`, {run.date}{carried}"
     )
 
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+LEAST = 31  # `lpips.SMALLEST["alex"]`, which imports torch; SSIM needs 11
 FILES_KEYS = {"files", "holdout", "without", "count", "seed"}
 
 
@@ -59,7 +60,7 @@ RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("truth_file", lambda v: _text(v) and re.fullmatch(r"[\w.-]+", v) is not None, "a file's name without a folder"),
     ("split", lambda v: v in ("train", "test"), "'train' or 'test'"),
     ("objects procedural_lights", _different(_integer(0)), "a list of different whole numbers from 0"),
-    ("resolution", _integer(8), "a whole number of pixels, at least 8"),
+    ("resolution", _integer(LEAST), f"a whole number of pixels, at least {LEAST}: LPIPS-Alex asks for so many"),
     ("fov_deg", _number(1, 170), "degrees from 1 to 170"),
     ("bundled_lights assignment_seed", _integer(0), "a whole number from 0"),
     ("lights_per_object", _integer(2), "at least 2: relighting asks for the object's other light"),

@@ -122,8 +122,15 @@ def target(
             raise UnirenderError(f"--{kind} {given}: no such folder")
         folder = spec.folder(kind) if given is None else given.expanduser()
         if folder is not None and (given is not None or path != source):
-            text = with_folder(text, source, kind, os.path.abspath(folder))
+            text = with_folder(text, source, kind, _from(path.parent, folder))
     return parse_spec(text, path), text
+
+
+def _from(home_folder: Path, folder: Path) -> str:
+    """The path of a folder of files as a suite's TOML file has it: relative where it lies in that file's own folder, so
+    that both can be moved together; else absolute."""
+    start, absolute = Path(os.path.abspath(home_folder)), Path(os.path.abspath(folder))
+    return absolute.relative_to(start).as_posix() if absolute.is_relative_to(start) else str(absolute)
 
 
 def with_folder(text: str, path: Path, key: str, value: str) -> str:

@@ -26,6 +26,7 @@ from unirender_evaluation.stratification import (
     roughness_key,
     stratified_materials,
 )
+from unirender_evaluation.suite_definition import check_definition
 from unirender_evaluation.suite_home import found_spec, truth_command
 from unirender_evaluation.suite_spec import SuiteSpec, read_spec, suite_path
 from unirender_evaluation.truth_file import (
@@ -109,9 +110,11 @@ class Suite:
         return self._members[name].read()
 
     def _channels(self, name: str) -> Channels:
-        """A member decoded; those used last are kept, up to `CACHE_BYTES`."""
+        """A member decoded; those used last are kept, up to `CACHE_BYTES`, and cannot be written into."""
         if name not in self._cache:
             self._cache[name] = read_exr_bytes(self._member(name))[0]
+            for channel in self._cache[name].values():
+                channel.flags.writeable = False
             self._cached_bytes += _bytes(self._cache[name])
             while self._cached_bytes > CACHE_BYTES and len(self._cache) > 1:
                 self._cached_bytes -= _bytes(self._cache.popitem(last=False)[1])
@@ -223,12 +226,15 @@ class Suite:
 
 
 def load_suite(name_or_path: str | Path = "tiny") -> Suite:
-    """Reads a suite by name (of the package) or TOML path and checks its truth's hash.
+    """Reads a suite by name (of the package) or TOML path, and checks that its truth is the one that the file is of.
 
     Raises:
-        UnirenderError: no such suite, or no truth of it: the message says which command makes it.
+        UnirenderError: no such suite, or no truth of it: the message says which command makes it. Or the truth has
+            another hash, or was made from other values than the file has.
     """
-    return Suite(found_spec(name_or_path))
+    suite = Suite(found_spec(name_or_path))
+    check_definition(suite)
+    return suite
 
 
 def _bytes(channels: Channels) -> int:

@@ -1,8 +1,8 @@
 """How many samples stand behind a row and each of its cells, and where a table says so.
 
 A cell on fewer samples than the fullest row of its column is *short*: it is not ranked, and its n is printed. A row
-whose cells are all short has the n of the fullest of them behind its label; the other short cells have their own beside
-the number, unless they are the same share of their columns.
+whose cells are all short has the n of the fullest of them behind its label; short cells of another n have it beside the
+number.
 """
 
 from collections.abc import Sequence
@@ -32,12 +32,6 @@ def label_n(rows: Sequence["Row"], row: "Row") -> int | None:
 
 
 def cell_counts(rows: Sequence["Row"], row: "Row") -> dict[int, int]:
-    """Column -> n of the short cells of which the row's label does not say it.
-
-    It says so of a cell on its own n, and of one on the same share of its column, as where a row ran on a third of the
-    scenes, and a column asks half as much of each.
-    """
+    """Column -> n of the short cells whose n is not the one behind the row's label."""
     label = label_n(rows, row)
-    whole = max((fullest(rows, i) for i in range(len(row.cells))), default=0)
-    short = short_cells(rows, row).items()
-    return {i: n for i, n in short if label is None or (n != label and n * whole != label * fullest(rows, i))}
+    return {i: n for i, n in short_cells(rows, row).items() if n != label}

@@ -8,11 +8,11 @@ import hashlib
 import importlib.metadata
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from importlib import resources
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,15 @@ import numpy as np
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
 from unirender.files import replace_file
+from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import ObjectSource, broken_meshes, suite_sources
-from unirender_evaluation.suite_spec import SuiteSpec
-from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.suite_spec import SuiteSpec, read_spec
+from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
+from unirender_evaluation.worker_pool import WorkerPool
 
 CODE = {  # what a rendered part depends on
     "unirender": ("camera.py", "color.py", "exposure.py", "exr.py", "intrinsics.py", "lighting.py"),
@@ -47,7 +49,7 @@ def make_truth(
     out: Path | None = None,
     objects: Path | None = None,
     lights: Path | None = None,
-) -> Iterator[tuple[int, int]]:
+) -> Generator[tuple[int, int], None, None]:
     """Renders a suite's truth, writes the tar, and beside it the suite's TOML file with the truth's hash.
 
     Args:
@@ -82,12 +84,13 @@ def make_truth(
     jobs = _jobs(spec, sources, assigned, used, folder)
     parts: dict[int, Path] = {}
     failures: list[str] = []
-    for number, outcome in _rendered(jobs, workers):
-        if isinstance(outcome, UnirenderError):
-            failures.append(f"{jobs[number].source.name}: {outcome}")
-        else:
-            parts[number] = outcome
-            yield len(parts), len(jobs)
+    with closing(_rendered(jobs, workers)) as outcomes:
+        for number, outcome in outcomes:
+            if isinstance(outcome, UnirenderError):
+                failures.append(f"{jobs[number].source.name}: {outcome}")
+            else:
+                parts[number] = outcome
+                yield len(parts), len(jobs)
     if failures:
         raise UnirenderError(
             f"suite {spec.name!r}: {len(failures)} of its objects could not be rendered; repair them and run the "
@@ -106,7 +109,7 @@ def _keep_truth(spec: SuiteSpec, sources: Sequence[ObjectSource]) -> None:
     if not (spec.truth_sha256 and spec.truth_path.is_file() and spec.path.is_file()):
         return
     try:
-        made = load_suite(spec.path).provenance["objects"].values()
+        made = Suite(read_spec(spec.path)).provenance["objects"].values()
     except UnirenderError:
         return  # no results can be had on it
     before = {entry["file"]: entry["file_sha256"] for entry in made if "file" in entry}
@@ -146,14 +149,14 @@ def _checked(
     return used
 
 
-def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Iterator[tuple[int, Path | UnirenderError]]:
+def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Generator[tuple[int, Path | UnirenderError], None, None]:
     """The part of each object, or why there is none, as they are done; the numbers are those of the jobs.
 
     Raises:
         UnirenderError: a worker process died.
     """
-    with ProcessPoolExecutor(workers, get_context("spawn"), _start_worker) as executor:
-        numbers = {executor.submit(render_object, job): number for number, job in enumerate(jobs)}
+    with WorkerPool(workers, _start_worker) as pool:
+        numbers = {pool.submit(render_object, job): number for number, job in enumerate(jobs)}
         try:
             for future in as_completed(numbers):
                 try:
@@ -164,9 +167,6 @@ def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Iterator[tuple[int, Pa
             raise UnirenderError(
                 "a worker process died, perhaps for want of memory; run the same command again, with fewer --workers"
             ) from error
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
 
 
 def _jobs(
@@ -242,6 +242,7 @@ def pack_truth(spec: SuiteSpec, text: str, parts: Iterable[Path], lights: Mappin
     files = {name: dict(light.provenance) for name, light in lights.items() if light.provenance}
     provenance = {
         "suite": spec.name,
+        **recorded(spec),
         **made,
         "batches": spec.batches,
         "objects": objects,

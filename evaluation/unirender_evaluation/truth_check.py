@@ -163,9 +163,10 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     chosen_from = (len(scenes_here(suite)), len(suite.scenes))
     if chosen_from[0] < chosen_from[1]:
         where = suite.spec.folder("objects") or "any folder"
+        source = suite.spec.objects_from or f"name their folder as `objects` under [folders] in {suite.spec.path}"
         logger.warning(
             "the truth check chooses from %d of %d scenes: the meshes of the others are not in %s (%s)",
-            *(*chosen_from, where, suite.spec.objects_from),
+            *(*chosen_from, where, source),
         )
     checks: list[Check] = []
     others: list[str] = []

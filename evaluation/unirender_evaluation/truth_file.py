@@ -1,7 +1,8 @@
 """The file format of a suite's truth: a tar of OpenEXR members with the contract's channel names, and `suite.json`.
 
     suite.json                                     how it was made: samples, noise ceilings, exposures, materials;
-                                                   seeds, or files with their sha256, of objects and lights
+                                                   seeds, or files with their sha256, of objects and lights; of a
+                                                   suite of one's own what its TOML file said (`definition`)
     light_<name>.exr                               R,G,B: a light as rendered, before exposure and turn (float32)
     <object>.shared.exr                            albedo.R/G/B, normal.X/Y/Z, mask.Y
     <object>_l<k>.diffuse.exr                      diffuse.R/G/B (d)                        and std.R/G/B

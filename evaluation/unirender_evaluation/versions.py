@@ -69,6 +69,7 @@ COMMANDS = (
     "shard_scores",
     "subsets",
     "suite_check",
+    "suite_definition",
     "suite_home",
     "suite_lights",
     "throughput*",

@@ -7,10 +7,9 @@ records and pictures travel back, and the process that was started is the only w
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -27,6 +26,7 @@ from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions, versions
+from unirender_evaluation.worker_pool import WorkerPool
 
 AHEAD = 2  # scenes under way on a cluster for each of its workers
 PAUSE = 0.1  # seconds between two looks at what is under way there; a scene takes many
@@ -112,7 +112,7 @@ def _scene(key: str) -> list[Record]:
 
 def run_in_workers(
     run: Run, build: Callable[[], Sequence[Row]], scenes: list[Scene], known: frozenset[str], jobs: int
-) -> Iterator[list[Record]]:
+) -> Generator[list[Record], None, None]:
     """Records of `scenes`, a scene at a time as they come, from `jobs` processes; `build` makes the rows in each."""
     arguments = (
         build,
@@ -124,14 +124,10 @@ def run_in_workers(
         run.subsets,
         known,
     )
-    with ProcessPoolExecutor(jobs, get_context("spawn"), _start, arguments) as pool:
+    with WorkerPool(jobs, _start, *arguments) as pool:
         futures = [pool.submit(_scene, scene.key) for scene in scenes]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for future in as_completed(futures):
+            yield future.result()
 
 
 @dataclass(frozen=True)
@@ -200,7 +196,7 @@ def cluster_scene(order: Order, scene: str, wanted: frozenset[str]) -> tuple[lis
 
 def run_on_cluster(
     run: Run, build: Callable[[], Sequence[Row]], suite: str, wanted: Mapping[str, frozenset[str]], address: str
-) -> Iterator[list[Record]]:
+) -> Generator[list[Record], None, None]:
     """Records of scenes from a cluster's workers, a scene at a time as they come; pictures are written here.
 
     Args:

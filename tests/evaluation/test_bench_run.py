@@ -63,7 +63,12 @@ def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:
         ("return intrinsics", r"got object of shape \(\), expected finite linear radiance"),
         ("return intrinsics.albedo[..., 0]", r"expected finite linear radiance, floats of shape"),
         ("return intrinsics.albedo[:1]", r"of shape \(1, 2, 3\), expected finite linear radiance"),
-        ("return intrinsics.albedo / 0", r"expected finite linear radiance"),
+        ("return intrinsics.albedo / 0", r"render \(x\): 12 of 12 values are NaN or infinite, expected finite linear"),
+        ("return [[0.5], [0.5, 0.5]]", r"render \(x\): got list, of which no array can be made .*, expected finite"),
+        (
+            "import torch; return torch.ones((2, 2, 3), requires_grad=True)",
+            r"render \(x\): got Tensor, of which no array can be made .*requires grad.*, expected finite",
+        ),
     ],
 )
 def test_what_a_strangers_method_does_wrong_is_named(body: str, message: str) -> None:

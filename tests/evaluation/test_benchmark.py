@@ -4,6 +4,7 @@ verdict."""
 import json
 import weakref
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -86,6 +87,38 @@ class Halved(Guess):
     def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
         half = mask * (np.arange(mask.shape[1]) < mask.shape[1] // 2)[:, None].astype(np.float32)
         return super().decompose(image_srgb, mask, camera).replace(mask=half)
+
+
+class Careless:
+    """The same as another method, and spoils everything that it is handed, and what it has returned before."""
+
+    def __init__(self, method: Guess) -> None:
+        self.method, self.name, self.config = method, method.name, method.config
+        self._before: list[np.ndarray] = []
+
+    def decompose(self, **given: Any) -> Intrinsics:
+        return self._spoilt(self.method.decompose, given)
+
+    def edit(self, **given: Any) -> np.ndarray:
+        return self._spoilt(self.method.edit, given)
+
+    def relight(self, **given: Any) -> np.ndarray:
+        return self._spoilt(self.method.relight, given)
+
+    def render(self, **given: Any) -> np.ndarray:
+        return self._spoilt(self.method.render, given)
+
+    def _spoilt(self, answer: Any, given: dict[str, Any]) -> Any:
+        made = answer(**{name: deepcopy(value) for name, value in given.items()})
+        self._before += [array for value in given.values() for array in _arrays(value)]
+        for array in self._before:
+            array[...] = 0.125
+        self._before = list(_arrays(made))
+        return made
+
+
+def _arrays(value: Any) -> Iterator[np.ndarray]:
+    yield from value.maps.values() if isinstance(value, Intrinsics) else [value] * isinstance(value, np.ndarray)
 
 
 def evaluate(suite: Suite, rows: list[Row], path: Path, stop_after: int | None = None) -> list[Record]:
@@ -195,7 +228,7 @@ def test_a_cluster_gets_what_is_missing_most_first(
     given: list[dict[str, frozenset[str]]] = []
     monkeypatch.setattr(
         "unirender_evaluation.benchmark.run_on_cluster",
-        lambda _run, _build, _suite, wanted, _: given.append(wanted) or [],
+        lambda _run, _build, _suite, wanted, _: given.append(wanted) or (records for records in ()),
     )
     _work(run, BenchConfig(out=tmp_path / "run", cluster="tcp://nowhere:1"), store, Progress(disable=True))
     assert [(key, len(keys)) for key, keys in given[0].items()] == [
@@ -319,6 +352,19 @@ def test_maps_are_scored_with_the_mask_that_they_bring_and_pictures_with_the_tru
                 assert 0.2 < own[OWN_MASK] < 0.8
             assert bool(different) == (own.keys() - pasted.keys() == {OWN_MASK})
     assert with_maps == {("inverse", "single-image"), ("relighting", "from-image-sd")}
+
+
+def test_a_method_that_writes_into_what_it_is_handed_changes_nothing(suite: Suite) -> None:
+    """Neither the truth, nor what is asked next of it or of others, nor what it said before."""
+    asked = [task for question in PROTOCOLS for task in tasks(suite, *question, list(suite.scenes))]
+    careful, careless = (make_row(method, "external") for method in (Guess(), Careless(Guess())))
+    answers = [[engine.answer(row, task) for row in (careless, careful)] for task in asked]
+    for task, (spoilt, right) in zip(asked, answers, strict=True):
+        assert np.array_equal(task.mask, suite.mask(task.scene))
+        for one, other in ((spoilt.image, right.image), (spoilt.maps, right.maps)):
+            arrays = list(_arrays(one)), list(_arrays(other))
+            assert len(arrays[0]) == len(arrays[1])
+            assert all(map(np.array_equal, *arrays))
 
 
 def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:

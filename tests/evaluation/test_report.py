@@ -344,8 +344,10 @@ def test_the_gallery_is_led_by_our_row_else_by_a_strangers() -> None:
     assert leading_row(replace(RUN, methods=(trivial,))) == ""
 
 
-def test_a_report_made_again_is_the_same_without_a_row_of_ours(tmp_path: Path) -> None:
-    """The gallery's order and leader are those of the run: the stranger's."""
+def test_a_report_made_again_is_the_same_without_a_row_of_ours(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The gallery's order and leader are those of the run: the stranger's. Without its pictures it says how many."""
     suite = make_suite(tmp_path / "suite")
     method = MethodInfo("theirs", "Theirs", "external")
     keeper, made = Pictures(tmp_path / "pictures", suite, list(suite.scenes)), []
@@ -364,6 +366,10 @@ def test_a_report_made_again_is_the_same_without_a_row_of_ours(tmp_path: Path) -
     rebuild(tmp_path, str(suite.spec.path))
     assert "ranked by Theirs" in first
     assert (tmp_path / "report.html").read_text(encoding="utf-8") == first
+    assert not caplog.text
+    (tmp_path / "pictures").rename(tmp_path / "elsewhere")
+    rebuild(tmp_path, str(suite.spec.path))
+    assert f"{tmp_path / 'pictures'}: the pictures of {len(made)} answers are not there" in caplog.text
 
 
 def samples_of(page: str) -> list[dict]:

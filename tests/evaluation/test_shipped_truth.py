@@ -213,6 +213,9 @@ def test_standard_comes_with_the_checkout(
         next(check_truth(bare, 0, 0))
     assert "chooses from 120 of 200 scenes" in caplog.text
     assert "apt-get download" in caplog.text
+    with pytest.raises(UsageError, match="got 0 scenes"):
+        next(check_truth(Suite(replace(bare.spec, objects_from="")), 0, 0))
+    assert f"(name their folder as `objects` under [folders] in {bare.spec.path})" in caplog.text
 
 
 @pytest.mark.slow

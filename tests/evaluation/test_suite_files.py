@@ -1,10 +1,11 @@
 """Suites of files: which meshes and lights a TOML file takes, what is refused, and where made suites are found."""
 
-import hashlib
 import json
 import re
+import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +17,12 @@ from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.files import file_sha256
 from unirender_evaluation import results_check, suite_home
+from unirender_evaluation.lpips import SMALLEST
 from unirender_evaluation.results_listing import suites as listed_suites
 from unirender_evaluation.stratification import constant_mse
+from unirender_evaluation.suite_check import LEAST
+from unirender_evaluation.suite_definition import DEFINITION, check_definition
+from unirender_evaluation.suite_definition import recorded as recorded_values
 from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
 from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import broken_meshes, scene_object, suite_sources
@@ -192,6 +197,7 @@ def test_a_scene_with_a_twin_is_of_an_object_of_the_suite(scenes: str, strangers
     ("more", "changes", "messages"),
     [
         ("", {"resolution": '"64"', "batches": "2"}, ["resolution is '64', expected", "batches is 2, expected"]),
+        ("", {"resolution": "30"}, ["resolution is 30, expected a whole number of pixels, at least 31: LPIPS-Alex"]),
         ("", {"lights_per_object": "1"}, ["lights_per_object is 1, expected at least 2"]),
         ("", {"edits": "[[1.0, 0.1]]"}, ["differ from the base in one of"]),
         ("", {"name": '"../x"'}, ["name is '../x'"]),
@@ -207,12 +213,16 @@ def test_every_wrong_value_is_named(more: str, changes: dict[str, str], messages
     assert all(message in str(error.value) for message in messages), str(error.value)
 
 
+def test_pictures_are_large_enough_for_every_metric() -> None:
+    assert max(SMALLEST.values()) == LEAST
+
+
 def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) -> None:
     """All of them at once, before anything is rendered; the good one is not among them."""
     write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
     (tmp_path / "models" / "a.obj").write_text("v 0 0 0\n")
     (tmp_path / "models" / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 0 1\nf 1 2 3\n")
-    spec = spec_with(tmp_path, MESHES, objects="[]", ceiling_scenes="[]", resolution="16")
+    spec = spec_with(tmp_path, MESHES, objects="[]", ceiling_scenes="[]", resolution="32")
     reasons = list(broken_meshes(suite_sources(spec), spec))
     assert [reason.partition(":")[0] for reason in reasons] == ["a.obj", "flat.obj"]
     assert "has no faces" in reasons[0]
@@ -288,14 +298,19 @@ def mesh_suite(folder: Path) -> Suite:
     """The closed-form suite of two scenes, whose first object says that it is a file."""
     write_meshes(folder / "models", ["a.obj"])
     path = write_suite(folder)
-    suite = load_suite(path)
-    provenance = suite.provenance
+    provenance = load_suite(path).provenance
     made = {"file": "a.obj", "file_sha256": file_sha256(folder / "models" / "a.obj"), "sha256": "none"}
     provenance["objects"]["ball-0"] = made
-    members = {**list_tar(folder / "ball.tar"), "suite.json": json.dumps(provenance).encode()}
-    write_tar(folder / "ball.tar", members)
-    digest = hashlib.sha256((folder / "ball.tar").read_bytes()).hexdigest()
-    path.write_text(path.read_text().replace(suite.sha256, digest) + MESHES)
+    text = path.read_text().replace("objects = [0, 1]", "objects = [1]").replace("[[0, 0]]", '[["a.obj", 0]]')
+    path.write_text(text + MESHES)
+    return repacked(path, provenance)
+
+
+def repacked(path: Path, provenance: dict[str, Any]) -> Suite:
+    """The closed-form suite with another `suite.json`."""
+    tar, spec = path.with_name("ball.tar"), read_spec(path)
+    write_tar(tar, {**list_tar(tar), "suite.json": json.dumps(provenance).encode()})
+    path.write_text(path.read_text().replace(spec.truth_sha256, file_sha256(tar)))
     return load_suite(path)
 
 
@@ -317,6 +332,57 @@ def test_the_true_shape_of_a_mesh_is_read_again_or_refused(tmp_path: Path) -> No
     suite.spec = unnamed
     with pytest.raises(UnirenderError, match=r"its mesh a\.obj is not in any folder"):
         scene_object(suite, scene)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_file_that_is_not_what_its_truth_was_made_from_is_refused(recorded: bool, tmp_path: Path) -> None:
+    """Values that a picture, a question or a score depends on; one without a record has those that can be told."""
+    path = write_suite(tmp_path)
+    if recorded:
+        suite = load_suite(path)
+        repacked(path, {**suite.provenance, **recorded_values(suite.spec)})
+    text = path.read_text()
+    changes = {
+        "resolution": (
+            "64",
+            r"resolution is 64, the truth's 32\. Put that back, or make the truth anew with `unirender",
+        ),
+        "edits": ("[[1.0, 0.5], [0.5, 0.1], [0.5, 0.9], [0.05, 0.5]]", r"edits is .*, the truth's \[\["),
+        "per_scene": ("1", "per_scene is 1, the truth's 2"),
+        "objects": ("[0]", r"objects is \[0\], the truth's \[0, 1\]"),
+    }
+    if recorded:
+        changes |= {
+            "specular_roughness": ("[0.5]", r"specular_roughness is \[0\.5\], the truth's \["),
+            "fov_deg": ("40.0", "fov_deg is 40.0, the truth's 36.0"),
+            "assignment_seed": ("4", "assignment_seed is 4, the truth's 3"),
+        }
+    for name, (value, message) in changes.items():
+        path.write_text(re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE))
+        with pytest.raises(UnirenderError, match=message):
+            load_suite(path)
+    free = {"title": '"words"', "file": '"moved.tar"'}
+    for name, value in free.items():
+        text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
+    path.write_text(text)
+    path.with_name("ball.tar").rename(path.with_name("moved.tar"))
+    assert load_suite(path).spec.title == "words"
+
+
+def test_the_truth_of_a_bundled_suite_keeps_its_bits(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """By name its file is compared with the package's: whoever renders it gets the hash that was published."""
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path))
+    assert recorded_values(read_spec("tiny")) == {}
+    assert recorded_values(target("standard")[0]) == {}
+    made = recorded_values(target("standard", out=tmp_path)[0])[DEFINITION]
+    assert made["edits"] == [list(edit) for edit in read_spec("standard").edits]
+    assert made["meshes"][0]["holdout"] == read_spec("standard").meshes[0].holdout
+
+
+def test_the_camera_of_a_truth_without_a_record_is_that_of_its_renders(tmp_path: Path) -> None:
+    spec = replace(read_spec("tiny"), fov_deg=40.0)
+    with pytest.raises(UnirenderError, match=r"fov_deg is 40\.0, the truth's 36\.0"):
+        check_definition(Suite(spec))
 
 
 def test_a_suite_without_its_truth_says_how_to_make_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -355,6 +421,27 @@ def test_a_suite_without_its_truth_says_how_to_make_it(tmp_path: Path, monkeypat
     with pytest.raises(UnirenderError, match=r"of another version of suite 'standard'.*bench truth standard"):
         load_suite("standard")
     assert results_check.installed_suite_hash("standard") is None
+
+
+def test_a_folder_beside_the_suites_file_moves_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Named from wherever the command runs; one elsewhere is written as an absolute path."""
+    mine, elsewhere = tmp_path / "mine", tmp_path / "elsewhere"
+    write_meshes(mine / "models", ["a.obj"])
+    write_meshes(elsewhere, ["a.obj"])
+    source = mine / "mine.toml"
+    source.write_text(suite_path("tiny").read_text() + "\n[[meshes]]\n")
+    monkeypatch.chdir(tmp_path)
+    for out, given, written in (
+        (None, Path("mine/models"), "models"),
+        (mine, mine / "models" / ".." / "models", "models"),
+        (None, Path("elsewhere"), str(elsewhere)),
+        (tmp_path / "other", mine / "models", str(mine / "models")),
+    ):
+        spec, text = target(source, out, given)
+        assert tomllib.loads(text)["folders"] == {"objects": written}
+        folder = spec.folder("objects")
+        assert folder is not None
+        assert (folder / "a.obj").is_file()
 
 
 def test_folders_are_refused_where_they_are_not_used_or_not_there(tmp_path: Path) -> None:

@@ -136,6 +136,18 @@ def test_an_unquantised_picture_would_be_caught(tmp_path: Path) -> None:
     assert np.abs(srgb_decode(seen) * task.mask - truth).max() < 0.01
 
 
+def test_what_a_suite_keeps_cannot_be_written_into(tmp_path: Path) -> None:
+    suite = make_suite(tmp_path)
+    scene = suite.scenes[0]
+    with pytest.raises(ValueError, match="read-only"):
+        suite.mask(scene)[...] = 0
+    for array in (suite.image(scene, suite.spec.base), suite.environment(scene)):
+        array[...] = 0
+    again = make_suite(tmp_path)
+    assert np.array_equal(suite.image(scene, suite.spec.base), again.image(scene, suite.spec.base))
+    assert np.array_equal(suite.environment(scene), again.environment(scene))
+
+
 def test_limited_runs_take_scenes_evenly(tmp_path: Path) -> None:
     suite = make_suite(tmp_path)
     assert len(scene_ids(suite, None)) == 4

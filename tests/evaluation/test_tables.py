@@ -180,12 +180,18 @@ def test_the_n_behind_a_label_is_that_of_no_other_cell() -> None:
     assert fewer(mixed) == "b (Albedo n = 5)."
 
 
-def test_the_same_share_of_every_column_is_said_once() -> None:
-    """As where a row ran on half of the scenes, and metallic is asked half as often."""
+def test_a_cell_on_the_same_share_of_its_column_has_its_own_n() -> None:
+    """As where a row ran on half of the scenes, and metallic is asked half as often; a full row has none."""
     found = counted({"a": 8, "b": 4}, {"a": 4, "b": 2})
     assert labels(found) == ["a", "b (n = 4)"]
-    assert fewer(found) == "b (n = 4)."
-    assert "(n = 2)" not in to_markdown(found)
+    assert fewer(found) == "b (n = 4, Metallic n = 2)."
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=200), found)
+    for text in (to_markdown(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+        (full,) = (line for line in text.splitlines() if re.match(r"(\| )? ?a ", line))
+        (half,) = (line for line in text.splitlines() if re.match(r"(\| )? ?b ", line))
+        assert "n =" not in full
+        assert (half.count("(n = 4)"), half.count("(n = 2)")) == (1, 1)
 
 
 def test_a_published_value_worse_than_a_constant_has_a_dagger() -> None:

@@ -16,6 +16,7 @@ from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
 from unirender.files import file_sha256
 from unirender_evaluation.ceiling import similarity_ceiling
 from unirender_evaluation.scoring import score_image
+from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import scene_object, suite_sources
@@ -141,12 +142,12 @@ def test_nothing_is_rendered_for_a_suite_whose_hash_cannot_be_written(tmp_path: 
 
 @pytest.mark.long
 def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) -> None:
-    """One object at 16 px: what the suite file asks for is there; finished parts are kept; another work folder gives
+    """One object at 32 px: what the suite file asks for is there; finished parts are kept; another work folder gives
     the same bytes; another suite file does not reuse parts."""
     text = suite_path("tiny").read_text()
     changes = {
         "name": '"mini"',
-        "resolution": "16",
+        "resolution": "32",
         "objects": "[1]",
         "per_scene": "1",
         "light_rows": "8",
@@ -166,6 +167,7 @@ def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) 
     path.write_text(text)
     assert list(make_truth(path, tmp_path / "work", workers=1)) == [(1, 1)]
     suite, first = load_suite(path), (tmp_path / "mini.tar").read_bytes()
+    assert recorded(suite.spec).items() <= suite.provenance.items()
     kinds = quality_summary(suite)
     assert {kind: row["n"] for kind, row in kinds.items()} == {"image": 10, "specular": 6, "diffuse": 2}
     assert kinds["image"]["min_db"] >= 33
@@ -194,7 +196,7 @@ MESHES_ALONE = {
     "ceiling_scenes": "[]",
     "bundled_lights": "2",
     "procedural_lights": "[0]",
-    "resolution": "16",
+    "resolution": "32",
     "light_rows": "8",
     "per_scene": "1",
     "spp": "8",
@@ -272,7 +274,7 @@ def test_a_truth_follows_the_files_that_are_in_the_folder(tmp_path: Path) -> Non
 
 @pytest.mark.long
 def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: Path) -> None:
-    """Two GLB files and two PNG at 16 px: the truth names what it was made of, its hash follows the files' content, and
+    """Two GLB files and two PNG at 32 px: the truth names what it was made of, its hash follows the files' content, and
     rows that are told the shape read it again."""
     models, lights = tmp_path / "models", tmp_path / "lights"
     models.mkdir()
@@ -284,7 +286,7 @@ def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: P
         Image.fromarray(rng.integers(0, 256, (16, 24, 3), np.uint8)).save(lights / f"{name}.png")
     text = suite_path("paper").read_text()
     changes = {
-        "resolution": "16",
+        "resolution": "32",
         "light_rows": "8",
         "per_scene": "1",
         "spp": "32",

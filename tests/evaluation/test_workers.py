@@ -1,6 +1,7 @@
-"""Worker processes end with their parent, even if that is killed: each holds torch and Mitsuba. They may write the same
-picture at the same time."""
+"""Worker processes end with their parent, even if that is killed: each holds torch and Mitsuba. Ctrl-C ends both. They
+may write the same picture at the same time."""
 
+import contextlib
 import fcntl
 import os
 import signal
@@ -53,6 +54,22 @@ if __name__ == "__main__":
     next(truth.make_truth(sys.argv[1], Path(sys.argv[2]) / "work"))
 """
 
+POOL = """
+import os, signal
+from hold import hold
+from unirender_evaluation.worker_pool import WorkerPool
+
+def start(handled):
+    "As Mitsuba does while it renders."
+    signal.signal(signal.SIGINT, lambda *_: open(handled, "w").close())
+
+if __name__ == "__main__":
+    signal.siginterrupt(signal.SIGINT, False)  # as it is once Mitsuba has rendered
+    with WorkerPool(1, start, sys.argv[1]) as pool:
+        waiting = [pool.submit(hold) for _ in range(3)]
+        waiting[0].result()
+"""
+
 
 def locked(path: Path) -> bool:
     """Whether a process holds the lock; one that is dead but not yet reaped does not."""
@@ -85,6 +102,28 @@ def test_a_worker_ends_with_a_killed_parent(script: str, tmp_path: Path) -> None
     except TimeoutError:
         os.kill(int(held.read_text()), signal.SIGKILL)
         raise
+
+
+def test_an_interrupt_ends_parent_and_worker_at_once(tmp_path: Path) -> None:
+    """A terminal sends it to both: the worker notices nothing, and the parent ends it."""
+    held, handled = tmp_path / "held", tmp_path / "handled"
+    held.touch()
+    (tmp_path / "hold.py").write_text(HOLD)
+    (tmp_path / "parent.py").write_text("import sys\n" + POOL)
+    command = [sys.executable, str(tmp_path / "parent.py"), str(handled)]
+    settings = os.environ | {"HELD": str(held)}
+    parent = subprocess.Popen(command, env=settings, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    try:
+        wait_until(lambda: parent.poll() is not None or held.read_text().endswith("\n"))
+        assert locked(held)
+        os.killpg(parent.pid, signal.SIGINT)
+        said = parent.communicate(timeout=SECONDS)[1]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+    assert not locked(held)
+    assert not handled.exists()
+    assert said.count("Traceback") == said.count("KeyboardInterrupt\n") == 1
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
