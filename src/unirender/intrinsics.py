@@ -152,8 +152,15 @@ def as_numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
         UnirenderError: it is no array of numbers.
     """
     try:
-        return np.asarray(value, dtype=np.float32)
+        given = np.asarray(value)
+        if given.dtype.kind == "c":
+            raise TypeError("complex")
+        return np.asarray(given, dtype=np.float32)
     except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's
+        if type(value).__module__ == "torch":
+            raise UnirenderError(
+                f"{name}: got a tensor that is no array ({error}), expected value.detach().float().cpu().numpy()"
+            ) from error
         raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tiny_models import make_pipeline
 
 from unirender.camera import Camera
 from unirender.pipelines.framing import FAINT, Frame
@@ -59,6 +60,21 @@ def test_haze_is_left_out_only_where_it_hardly_counts() -> None:
     faint = np.maximum(mask, np.float32(1e-4))
     assert Frame.around(faint, SIZE).cut == Frame.around(mask, SIZE).cut
     assert Frame.around(np.maximum(mask, np.float32(FAINT)), SIZE).cut is None
+
+
+def test_haze_that_is_left_out_is_no_part_of_the_object() -> None:
+    """It has coverage, and neither a surface nor a say in the material of the whole."""
+    mask = disc(128, 128, 64, 64, 14)
+    haze = np.zeros_like(mask)
+    haze[::13, ::13] = 0.04
+    picture = np.full((128, 128, 3), 0.5, np.float32)
+    pipeline = make_pipeline()
+    for settings in ({}, {"tile": True, "size": 32}):
+        clean = pipeline.decompose(picture, mask, **settings)
+        hazy = pipeline.decompose(picture, np.maximum(mask, haze), **settings)
+        assert hazy.roughness == pytest.approx(clean.roughness, rel=1e-3)
+        for name in ("albedo", "normal"):
+            assert not getattr(hazy.intrinsics, name)[0].any()
 
 
 def test_one_pixel_in_a_corner_is_seen() -> None:

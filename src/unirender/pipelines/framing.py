@@ -47,7 +47,8 @@ class Frame:
         """The whole picture, or the square around its object where the object is small.
 
         A network sees objects that fill most of the frame; of one that does not, most pixels would be lost on the
-        background. What is left out of the square has hardly any coverage, and its maps are 0.
+        background. What is left out of the square has hardly any coverage, and no
+        surface.
 
         Args:
             mask: coverage.
@@ -73,6 +74,15 @@ class Frame:
         """The same with a square of at most `most` pixels a side: what is smaller is not enlarged."""
         frame = cls.around(mask, most)
         return replace(frame, size=min(most, frame.side))
+
+    def seen(self, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:
+        """The coverage, and 0 outside the square."""
+        if self.cut is None:
+            return mask
+        inside = self._slices()[0]
+        seen = np.zeros_like(mask)
+        seen[inside] = mask[inside]
+        return seen
 
     @property
     def identity(self) -> bool:

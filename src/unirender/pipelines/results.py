@@ -82,7 +82,7 @@ def predicted_intrinsics(
     sized["normal"] = unit_normal(sized["normal"])
     for name in ("roughness", "metallic"):
         value = np.clip(sized[name], 0, 1)
-        sized[name] = constant_map(masked_mean(value, mask), mask) if material == "scalar" else value
+        sized[name] = constant_map(masked_mean(value, frame.seen(mask)), mask) if material == "scalar" else value
     return Intrinsics(**sized, environment=maps["environment"], mask=mask, camera=camera)
 
 

@@ -129,7 +129,7 @@ def add_detail(whole: Intrinsics, blended: dict[str, np.ndarray], frame: Frame) 
     mask = whole.require("mask")["mask"]
     changed = {}
     for name, value in whole.require(*TILED).items():
-        fine = np.where(mask > 0, unit_normal(blended[name]) if name == "normal" else blended[name], 0)
+        fine = np.where(frame.seen(mask) > 0, unit_normal(blended[name]) if name == "normal" else blended[name], 0)
         changed[name] = np.where(mask > 0, value + fine - frame.leave_map(frame.enter_map(fine, mask), mask), 0)
     changed["normal"] = unit_normal(changed["normal"])
     changed["albedo"] = np.clip(changed["albedo"], 0, 1)

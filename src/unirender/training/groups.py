@@ -32,7 +32,7 @@ from unirender.files import file_sha256
 from unirender.paths import cache_dir, cached_folder
 from unirender.training.packing import SCALAR_CHANNELS, Group, Packer, Pair
 
-PACK_VERSION = 1  # part of the cache's path: raise it when the packed layout changes
+PACK_VERSION = 2  # part of the cache's path: raise it when what is packed, or refused, changes
 END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends
 
 

@@ -73,7 +73,8 @@ def moved(maps: Maps, moves: Sequence[Move | None]) -> Maps:
 
 
 def rolled_environment(environment: Float[Tensor, "b 3 eh ew"], rolls: Sequence[float]) -> Float[Tensor, "b 3 eh ew"]:
-    """Lights turned about +z, towards the viewer, to a quarter of a degree; their energy is kept."""
+    """Lights turned about +z, towards the viewer, in steps of a quarter of a degree, the first few of which
+    hardly turn them; their energy is kept."""
     size = (environment.shape[-2], environment.shape[-1])
     operators = [small_turn_operator(size, round(roll / ANGLE_STEP)) for roll in rolls]
     matrix = block_diag(operators, format="coo")

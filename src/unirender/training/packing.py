@@ -17,7 +17,7 @@ from jaxtyping import Float, Float16
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exposure import MASK_THRESHOLD
-from unirender.exr import HALF_MAX, Channels, channels_rgb, read_exr_bytes
+from unirender.exr import CAMERA_ATTRIBUTE, HALF_MAX, Channels, channels_rgb, read_exr_bytes
 from unirender.intrinsics import NORMAL_TOLERANCE, RANGE_TOLERANCE, Intrinsics
 from unirender.training.environments import turned_environments
 
@@ -30,7 +30,7 @@ _LIGHT = re.compile(
     r"l(?P<light>\d+)\.(?:(?P<environment>environment)|(?P<diffuse>diffuse)|(?:r(?P<level>\d+)|maps)\.(?P<specular>specular)"
     r"|m(?P<metallic>\d+)_r(?P<roughness>\d+)|maps)\.exr"
 )
-_CAMERA_ATTRIBUTE, _CAMERA_START = "camera", "fov_deg="
+_CAMERA_START = "fov_deg="
 _CAMERA_JSON = '{"fov_deg": 36, "principal": [0.5, 0.5]}'
 _INTERPOLATED = "interpolated"  # attribute of pictures whose noise may be below 0
 
@@ -217,7 +217,7 @@ def _decoded(data: bytes, file: str) -> tuple[Channels, dict[str, str]]:
         UnirenderError: it is none, or was taken by another camera than the contract's.
     """
     channels, attributes = read_exr_bytes(data, name=file)
-    text = attributes.get(_CAMERA_ATTRIBUTE, "")
+    text = attributes.get(CAMERA_ATTRIBUTE, "")
     if text.startswith(_CAMERA_START):  # other programs have attributes of that name, too
         _check_camera(Camera.parse(text), file)
     return channels, attributes
@@ -271,9 +271,9 @@ def _surface(channels: Channels, own_maps: bool, file: str) -> Float[np.ndarray,
 def _light(channels: Channels, file: str) -> Float[np.ndarray, "h w 3"]:
     environment = _stack(channels, file, "")
     height, width = environment.shape[:2]
-    if width != 2 * height:
+    if not 2 * (height - 1) <= width <= 2 * height:  # rows from pole to pole, or as many as a picture has
         raise UnirenderError(
-            f"{file}: is {width} x {height} texels, expected a lat-long map twice as wide as high; resample it first"
+            f"{file}: is {width} x {height} texels, expected a lat-long map, twice as wide as high; resample it first"
         )
     return _in_contract(file, environment=environment).require("environment")["environment"]
 
