@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.suite_home import home, truth_command
-from unirender_evaluation.suite_spec import SuiteSpec, is_bundled
-from unirender_evaluation.truth_file import image_member, specular_member
+from unirender_evaluation.suite_spec import SuiteSpec, is_bundled, suite_folder
+from unirender_evaluation.truth_file import image_member, member_kind, specular_member
 
 if TYPE_CHECKING:
     from unirender_evaluation.suites import Suite
@@ -28,7 +28,7 @@ SHOWN = 60  # letters of a value in a message
 
 def recorded(spec: SuiteSpec) -> dict[str, Any]:
     """What `suite.json` says of a suite's file: nothing where `found_spec` compares it with the package's."""
-    if is_bundled(spec.path) or spec.path == home(spec.name):
+    if is_bundled(spec.path) or (spec.path == home(spec.name) and (suite_folder() / spec.path.name).is_file()):
         return {}
     return {DEFINITION: definition_values(spec)}
 
@@ -63,6 +63,11 @@ def _told(suite: "Suite") -> dict[str, Any]:
     """The values that can be told from a truth."""
     spec, made, scene, members = suite.spec, suite.provenance, suite.scenes[0], set(suite.members)
     materials = [m for m in (spec.base, *spec.edits) if image_member(scene.key, m) in members]
+    roughness = [r for r in spec.specular_roughness if specular_member(scene.key, r) in members]
+    named = {image_member(scene.key, m) for m in (*materials, *scene.materials)}
+    named |= {specular_member(scene.key, r) for r in (*roughness, *(r for _, r in (*materials, *scene.materials)))}
+    others = sorted(name for name in members - named if name.startswith(f"{scene.key}."))
+    more = {kind: [name for name in others if member_kind(name) == kind] for kind in ("image", "specular")}
     told = {
         "name": made["suite"],
         "resolution": suite.mask(scene).shape[0],
@@ -71,8 +76,8 @@ def _told(suite: "Suite") -> dict[str, Any]:
         "per_scene": len(scene.materials),
         "batches": made["batches"],
         "base": list(spec.base) if spec.base in materials else "another",
-        "edits": [list(m) for m in spec.edits if m in materials],
-        "specular_roughness": [r for r in spec.specular_roughness if specular_member(scene.key, r) in members],
+        "edits": [*(list(m) for m in spec.edits if m in materials), *more["image"]],
+        "specular_roughness": [*roughness, *more["specular"]],
     }
     camera = {"fov_deg": Camera.parse(made["camera"]).fov_deg} if "camera" in made else {}
     return told | camera

@@ -8,11 +8,14 @@ rendered in it, which leaves a handler that does not end a wait.
 
 import contextlib
 import signal
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import active_children, get_context
 from types import TracebackType
 from typing import Any
+
+GRACE_SECONDS = 2  # for a worker to end by itself once it is told to
 
 
 class WorkerPool(ProcessPoolExecutor):
@@ -43,8 +46,13 @@ class WorkerPool(ProcessPoolExecutor):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> bool | None:
         if kind is not None:
-            for process in set(active_children()) - self._strangers:
+            workers = set(active_children()) - self._strangers
+            for process in workers:
                 process.terminate()
+            deadline = time.monotonic() + GRACE_SECONDS
+            for process in workers:
+                process.join(max(deadline - time.monotonic(), 0))
+                process.kill()  # one that has a handler of its own, or is deep in C
             self.shutdown(cancel_futures=True)
         return super().__exit__(kind, error, traceback)
 

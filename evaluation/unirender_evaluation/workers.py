@@ -9,6 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -113,7 +114,11 @@ def _scene(key: str) -> list[Record]:
 def run_in_workers(
     run: Run, build: Callable[[], Sequence[Row]], scenes: list[Scene], known: frozenset[str], jobs: int
 ) -> Generator[list[Record], None, None]:
-    """Records of `scenes`, a scene at a time as they come, from `jobs` processes; `build` makes the rows in each."""
+    """Records of `scenes`, a scene at a time as they come, from `jobs` processes; `build` makes the rows in each.
+
+    Raises:
+        UnirenderError: a worker process died, or could not make the rows; what a row raises comes as it is.
+    """
     arguments = (
         build,
         run.suite.spec.path,
@@ -126,8 +131,14 @@ def run_in_workers(
     )
     with WorkerPool(jobs, _start, *arguments) as pool:
         futures = [pool.submit(_scene, scene.key) for scene in scenes]
-        for future in as_completed(futures):
-            yield future.result()
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BrokenProcessPool as error:
+            raise UnirenderError(
+                "a worker process died: above is why, if it could not start; else perhaps for want of memory. Run the "
+                "same command again, with fewer --jobs"
+            ) from error
 
 
 @dataclass(frozen=True)

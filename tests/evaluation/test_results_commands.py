@@ -112,7 +112,7 @@ def test_compare_prints_both_means_the_difference_and_the_ranks_in_80_columns(be
         (a, b) for a, b in zip(out.splitlines(), out.splitlines()[1:], strict=False) if "Albedo PSNR" in a
     )
     assert [word for word in line.split() if "." in word] == ["20.75", "23.25", "-2.50"]
-    assert "[-3.50, -1.50]" in below
+    assert "[-15.21, +10.21]" in below
     assert "by B" in " ".join(out.split())
     assert "…" not in out
     assert max(map(len, out.splitlines()[3:])) <= 80

@@ -361,6 +361,10 @@ def test_a_file_that_is_not_what_its_truth_was_made_from_is_refused(recorded: bo
         path.write_text(re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE))
         with pytest.raises(UnirenderError, match=message):
             load_suite(path)
+    fewer = re.sub(r"^edits = .*$", "edits = [[1.0, 0.5], [0.5, 0.1]]", text, flags=re.MULTILINE)
+    path.write_text(re.sub(r"^specular_roughness = .*$", "specular_roughness = [0.1, 0.5]", fewer, flags=re.MULTILINE))
+    with pytest.raises(UnirenderError, match=r"edits is \[\[1\.0, 0\.5\], \[0\.5, 0\.1\]\], the truth's \["):
+        load_suite(path)
     free = {"title": '"words"', "file": '"moved.tar"'}
     for name, value in free.items():
         text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)

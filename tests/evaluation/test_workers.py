@@ -60,10 +60,12 @@ from hold import hold
 from unirender_evaluation.worker_pool import WorkerPool
 
 def start(handled):
-    "As Mitsuba does while it renders."
+    "As Mitsuba does while it renders, and as libraries do that want to end in order."
     signal.signal(signal.SIGINT, lambda *_: open(handled, "w").close())
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs do not have
     signal.siginterrupt(signal.SIGINT, False)  # as it is once Mitsuba has rendered
     with WorkerPool(1, start, sys.argv[1]) as pool:
         waiting = [pool.submit(hold) for _ in range(3)]
