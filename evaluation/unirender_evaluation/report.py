@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 
 TEMPLATES = Path(__file__).parent / "templates"
 VERDICT = "verdict.txt"  # in a run's folder
-STATES = ("HOLDS", "FAILS", "stated")  # how a line of it may begin
+STATES = ("HOLDS", "FAILS", "open", "stated")  # how a line of it may begin
 DENSE = 8  # columns: from here on the interval stands below its mean
 KIND_NAMES = {
     "ours": "ours",

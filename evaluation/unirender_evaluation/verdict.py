@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import paired_difference
+from unirender_evaluation.statistics import FEW, paired_difference
 from unirender_evaluation.tasks import LIGHT
 
 
@@ -21,13 +21,19 @@ class Finding:
     holds: bool | None
     why: str = "not run "
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it does not hold, nor its opposite, on fewer than `FEW` objects: more of them may decide it."""
+        found = self.comparison
+        return self.holds is False and found is not None and not found.b_beats_a and found.difference.clusters < FEW
+
     def __str__(self) -> str:
         c = self.claim
         if self.comparison is None:
             what = f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}"
             return f"{self.why}{what}: {c.a} against {c.b}"
         d = self.comparison.difference
-        sign = {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
+        sign = "open" if self.is_open else {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
         interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""  # one object has none

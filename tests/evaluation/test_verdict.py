@@ -48,6 +48,9 @@ def test_verdict_states_claims_and_failures() -> None:
     assert [f.holds for f in found] == [True, False, None]
     assert "HOLDS" in str(found[0])
     assert "FAILS" in str(found[1])
+    same = [record("b", i, x + (-1) ** i) for i, x in enumerate(level)]
+    assert str(findings(same + records[:12], claims[:1])[0]).startswith("HOLDS")
+    assert str(findings(same + [record("a", i, x) for i, x in enumerate(level)], claims[:1])[0]).startswith("open")
     check = CHECK | {"passed": False, "failed": ["x: z-test FAILED"], "other_objects": ["x"]}
     text = verdict_text(records, RunInfo("t", "h", 64, (), limit=2), check)
     assert "FAILS  truth" in text
