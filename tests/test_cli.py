@@ -235,6 +235,22 @@ def test_sampler_size_and_tiles_are_recorded(ball: Path, tmp_path: Path) -> None
     assert np.abs(albedos[0] - albedos[1]).max() > 0.01
 
 
+def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("decompose", ball, "--looks", "3", "--output", tmp_path / "three") == 0
+    assert run("decompose", ball, "--output", tmp_path / "one") == 0
+    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("three", "one")]
+    assert [meta["looks"] for meta in metas] == [3, 1]
+    albedos = [read_result(tmp_path / name).require("albedo")["albedo"] for name in ("three", "one")]
+    assert np.abs(albedos[0] - albedos[1]).max() > 0.001
+    assert run("edit", ball, "--looks", "2", "--metallic", "1", "--output", tmp_path / "edited") == 0
+    assert json.loads((tmp_path / "edited" / "meta.json").read_text())["looks"] == 2
+    capsys.readouterr()
+    for arguments, message in ((("--looks", "13"), "looks: got 13"), (("--looks", "2", "--samples", "2"), "mode sample")):
+        assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
+        assert message in capsys.readouterr().err
+        assert not (tmp_path / "none").exists()
+
+
 def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "film").mkdir()
     picture = Image.open(ball)

@@ -25,6 +25,7 @@ class PipelineMethod:
         decompositions: shared with another row of the same pipeline and mode.
         closed: albedo, s and d are changed so that their rendering is the picture.
         device: where the pipeline runs: another one rounds otherwise.
+        looks: at each picture that is taken apart.
     """
 
     def __init__(
@@ -40,9 +41,10 @@ class PipelineMethod:
         decompositions: Decompositions[Any] | None = None,
         closed: bool = True,
         device: str = "cpu",
+        looks: int = 1,
     ) -> None:
         self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
-        self.closed, self.device = closed, device
+        self.closed, self.device, self.looks = closed, device, looks
         self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
         self._decompositions = Decompositions[Any]() if decompositions is None else decompositions
 
@@ -58,6 +60,7 @@ class PipelineMethod:
             "samples": self.samples,
             "seed": self.seed,
             "device": self.device,
+            **({"looks": self.looks} if self.looks > 1 else {}),
         }
 
     def _options(self) -> dict[str, Any]:
@@ -75,7 +78,7 @@ class PipelineMethod:
 
     def _decomposition(self, image_srgb: Image, mask: Mask, camera: Camera) -> Any:
         """Of a picture, computed once: the rows that share it differ in what they do with it."""
-        options = {**self._options(), "closed": self.closed}
+        options = {**self._options(), "closed": self.closed, "looks": self.looks}
         make = partial(self.pipeline.decompose, image_srgb, mask=mask, camera=camera, **options)
         return self._decompositions.of(image_srgb, mask, camera, make)[0]
 

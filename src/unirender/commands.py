@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import MANY_CLIPPED, InputOptions, ModelOptions, OutputOptions, notice, read_input
+from unirender.options import MANY_CLIPPED, InputOptions, ModelOptions, OutputOptions, notice, read_input, usage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -39,6 +39,9 @@ class Decompose:
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    looks: int = 1
+    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
+    longer; 6 give most of it."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     frames: bool = False
@@ -55,6 +58,7 @@ class Decompose:
         from unirender.scene_export import write_scene
 
         self.model.check()
+        check_looks(self.looks, self.model.mode)
         if self.input.picture.is_dir():
             return self._run_folder()
         if self.frames:
@@ -67,7 +71,7 @@ class Decompose:
                 beside = folder_beside(self.export, self.out.output, folder, overwrite=self.out.overwrite)
                 scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            options = {"closed": self.closed, "tile": self.tile}
+            options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
             result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
             meta = {"command": "decompose", "input": self.input.picture, "clipped": picture.clipped}
             meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
@@ -87,7 +91,7 @@ class Decompose:
             raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
         pictures = list_pictures(source)
         pipeline, sampling = self.model.load(), self.model.sampling()
-        options = {"closed": self.closed, "tile": self.tile}
+        options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
         settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov": self.model.fov}
         remarks: dict[str, list[str]] = {}
 
@@ -196,6 +200,9 @@ class Edit:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    looks: int = 1
+    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
+    longer; 6 give most of it."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
@@ -205,6 +212,7 @@ class Edit:
         from unirender.files import new_folder, write_result
 
         self.model.check()
+        check_looks(self.looks, self.model.mode)
         change = {"roughness": self.roughness, "metallic": self.metallic}
         if set(change.values()) == {None}:
             raise UsageError("edit: nothing to change, expected --roughness or --metallic (or both)")
@@ -212,7 +220,7 @@ class Edit:
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile}
+        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
@@ -243,6 +251,9 @@ class Relight:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    looks: int = 1
+    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
+    longer; 6 give most of it."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     shadows: bool = False
@@ -254,9 +265,11 @@ class Relight:
         from unirender.files import new_folder, write_result
 
         self.model.check()
+        check_looks(self.looks, self.model.mode)
         check_exposure(self.exposure)
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "closed": self.closed, "tile": self.tile, "shadows": self.shadows}
+        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
+        options |= {"shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
             pipeline, sampling = self.model.load(), self.model.sampling()
@@ -291,6 +304,19 @@ def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[st
     """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
     found = pipeline.overflow(intrinsics)
     return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
+
+
+def check_looks(looks: int, mode: str) -> None:
+    """Looks at `--looks`.
+
+    Raises:
+        UsageError: it is no such number, or several samples are asked for.
+    """
+    if looks != 1:
+        from unirender.pipelines import looks as of_pictures
+
+        with usage():
+            of_pictures.check_looks(looks, mode)
 
 
 def at_white(image_linear: "np.ndarray", mask: "np.ndarray | None") -> dict[str, Any]:

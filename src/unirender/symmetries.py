@@ -1,4 +1,5 @@
-"""What light does whatever the scene: factors of the light, mirror images and turns about the view axis.
+"""What light does whatever the scene: factors of the light, exchanged colour channels, mirror images and turns about
+the view axis.
 
 `Maps` is a dict of arrays `[..., H, W, C]` by name: those of `Intrinsics` (its `maps`) and `image`, the premultiplied
 linear picture. Each function gives the maps of another scene that could be rendered, exactly (a turned environment is
@@ -17,12 +18,26 @@ from unirender.lighting import mirror_environment, rotate_environment
 Maps = dict[str, np.ndarray]
 
 LIGHT_MAPS = ("image", "specular", "diffuse", "environment")  # linear in the light
+COLOUR_MAPS = (*LIGHT_MAPS, "albedo")
 _COSINE = tuple(np.float32(c) for c in (1, 0, -1, 0))  # of 0, 90, 180, 270 degrees; sin(a) = cos(a - 90)
 
 
 def scale_light(maps: Mapping[str, np.ndarray], factor: float) -> Maps:
     """Multiplies the light, and all that is linear in it, by `factor`: how the gauge is applied."""
     return {name: value * np.float32(factor) if name in LIGHT_MAPS else value for name, value in maps.items()}
+
+
+def permute_channels(maps: Mapping[str, np.ndarray], order: tuple[int, int, int]) -> Maps:
+    """Channel c of the result is channel `order[c]` of every colour map.
+
+    Raises:
+        UnirenderError: the order is no permutation.
+    """
+    if sorted(order) != [0, 1, 2]:
+        raise UnirenderError(f"channel order: got {order}, expected a permutation of (0, 1, 2)")
+    if tuple(order) == (0, 1, 2):
+        return dict(maps)
+    return {name: value[..., list(order)] if name in COLOUR_MAPS else value for name, value in maps.items()}
 
 
 def mirror(maps: Mapping[str, np.ndarray]) -> Maps:

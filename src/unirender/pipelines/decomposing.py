@@ -89,9 +89,11 @@ def _one(how: Sampling, picture: int) -> Sampling:
 
 
 def _tiled(network: Network, view: View, how: Sampling, seed: int) -> list[dict[str, np.ndarray]]:
-    """The picture's maps from tiles of the network's size; every tile sees the same noise, so that none differs."""
+    """The picture's maps from tiles of the network's size, one look at each; all see the same noise, so that none
+    differs."""
 
     def predict(images: Sequence[np.ndarray], masks: Sequence[np.ndarray], cameras: Sequence[Camera]) -> list:
-        return network.attributes(images, masks, cameras, replace(how, generator=same_noise(seed, len(images))))
+        noise = same_noise(seed, len(images))
+        return network.attributes(images, masks, cameras, replace(how, generator=noise, looks=1))
 
     return blend_tiles(view.image_linear, view.mask, view.camera, network.size, predict)

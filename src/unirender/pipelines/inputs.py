@@ -21,7 +21,7 @@ DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
-TAKING_APART = {"tile": False, "material": None, "closed": True}  # settings of `decompose` alone, and their defaults
+TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True}  # of `decompose` alone, and their defaults
 
 
 def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:

@@ -13,6 +13,7 @@ from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.models.conditioning import TRIPLETS, Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.pipelines.looks import LOOKS, mean_of_looks
 from unirender.pipelines.settings import Sampling
 
 
@@ -64,23 +65,28 @@ class Network:
         """Inverse rendering of premultiplied linear images, all in one batch.
 
         Returns:
-            For each image the maps of each sample, in physical units.
+            For each image the maps of each sample, or the mean of its looks, in physical units.
         """
         device = self.model.device  # asked once: diffusers searches all modules for it, milliseconds
+        looks = LOOKS[: how.looks]
+        pictures = [{"image": image, "mask": mask} for image, mask in zip(images, masks, strict=True)]
+        seen = [look.of(picture) for picture in pictures for look in looks]
         maps = infer_attributes(
             self.model,
             self.conditioning,
             self.scheduler,
-            _batch(images, how.count, device),
-            _batch(masks, how.count, device),
+            _batch([own["image"] for own in seen], how.count, device),
+            _batch([own["mask"] for own in seen], how.count, device),
             steps=how.steps,
             generator=how.generators(len(images)),
-            camera=_repeat(cameras, how.count),
+            camera=_repeat([look.camera(camera) for camera in cameras for look in looks], how.count),
             progress=self.progress,
         )
         arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
-        rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(images) * how.count)]
-        return [rows[i * how.count : (i + 1) * how.count] for i in range(len(images))]
+        rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(seen) * how.count)]
+        each = how.looks * how.count  # one of them is 1
+        found = [rows[i * each : (i + 1) * each] for i in range(len(images))]
+        return found if how.looks == 1 else [[mean_of_looks(own, self.conditioning.packing)] for own in found]
 
     def images(
         self, scenes: Sequence[Intrinsics], how: Sampling, derived: Sequence[Collection[str]] | None = None

@@ -10,10 +10,11 @@ import torch
 from unirender.camera import Camera
 from unirender.diffusion.sampling import NUM_SAMPLES, Generators, steps_of
 from unirender.errors import UnirenderError
+from unirender.pipelines.looks import check_looks
 
 SETTINGS = (  # of `decompose`
     *("camera", "mode", "num_inference_steps", "num_samples", "generator"),
-    *("sampler", "size", "tile", "material", "closed"),
+    *("sampler", "size", "looks", "tile", "material", "closed"),
 )
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
@@ -28,12 +29,14 @@ class Sampling:
         count: samples.
         generator: of the noise, on the CPU: one, or one for each picture of a batch. None: a fixed noise in mode
             `mean`, torch's global state in mode `sample`.
+        looks: at each picture that is taken apart (`unirender.pipelines.looks`); 1 in mode `sample`.
     """
 
     mode: str
     steps: int
     count: int
     generator: Generators
+    looks: int = 1
 
     @classmethod
     def of(
@@ -42,6 +45,7 @@ class Sampling:
         num_inference_steps: int | None = None,
         num_samples: int | None = None,
         generator: Generators = None,
+        looks: int = 1,
     ) -> "Sampling":
         """Resolves the arguments of a call.
 
@@ -52,7 +56,8 @@ class Sampling:
             raise UnirenderError(
                 f"generator: got {generator!r}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
             )
-        return cls(mode, steps_of(mode, num_inference_steps), _sample_count(mode, num_samples), generator)
+        steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
+        return cls(mode, steps, count, generator, check_looks(looks, mode))
 
     def generators(self, pictures: int) -> Generators:
         """The noise of a batch: a picture with a generator of its own, or in mode `mean` without any, gets in it what

@@ -130,6 +130,7 @@ class UniRenderPipeline(DiffusionPipeline):
         generator: torch.Generator | None = None,
         sampler: str | None = None,
         size: int | None = None,
+        looks: int = 1,
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
@@ -148,6 +149,8 @@ class UniRenderPipeline(DiffusionPipeline):
                 on it: roughness and metallic by some 0.01), torch's global state in mode `sample`.
             sampler: of `sample`: `ddim` or `unipc`; None: the pipeline's scheduler.
             size: side of the square at which the network runs, a multiple of `size_multiple`; None: the model's own.
+            looks: at the picture, of mode `mean`, 1 to 12: mirrored, and with its colour channels exchanged. Their mean
+                is better and takes longer (`unirender.pipelines.looks`); 6 give most of it.
             tile: add the detail of tiles to albedo and normal where the picture is larger than that square.
             material: one number per object or maps; None: as the checkpoint was trained.
             closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`), and
@@ -167,6 +170,7 @@ class UniRenderPipeline(DiffusionPipeline):
             generator=generator,
             sampler=sampler,
             size=size,
+            looks=looks,
             tile=tile,
             material=material,
             closed=closed,
@@ -185,6 +189,7 @@ class UniRenderPipeline(DiffusionPipeline):
         generator: Generators = None,
         sampler: str | None = None,
         size: int | None = None,
+        looks: int = 1,
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
@@ -202,6 +207,7 @@ class UniRenderPipeline(DiffusionPipeline):
                 turn; None: as for `decompose`.
             sampler: of `sample`.
             size: side of the network's square.
+            looks: at each picture.
             tile: add the detail of tiles.
             material: one number per object or maps.
             closed: change albedo, s, d and the light, as for `decompose`.
@@ -220,7 +226,7 @@ class UniRenderPipeline(DiffusionPipeline):
         material = self.config["material"] if material is None else material
         if material not in ("scalar", "map"):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
-        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator, looks)
         network = self._network(mode, sampler, size)
         views = []
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
@@ -308,8 +314,8 @@ class UniRenderPipeline(DiffusionPipeline):
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, tile,
                 material and closed are its own.
-            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, tile, material and
-                closed, as for `decompose`.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
+                and closed, as for `decompose`.
 
         Raises:
             UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does

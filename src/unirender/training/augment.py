@@ -1,8 +1,8 @@
 """Exact augmentations: each turns one scene's buffers into those of another scene that could be rendered.
 
 Light is additive (`mix_lights`), radiance is a quadratic in metallic at depth 4 (`interpolate_metallic`), and the
-renderer treats the colour channels alike (`permute_channels`), mirror images and turns about the view axis (`mirror`
-and `quarter_turn` of `unirender.symmetries`, where `Maps` is explained). tests/physics/test_augmentation.py holds each
+renderer treats the colour channels, mirror images and turns about the view axis alike (`permute_channels`, `mirror` and
+`quarter_turn` of `unirender.symmetries`, where `Maps` is explained). tests/physics/test_augmentation.py holds each
 against a Mitsuba render of the augmented scene.
 """
 
@@ -15,14 +15,15 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exposure import draw_target
 from unirender.intrinsics import Intrinsics
+from unirender.symmetries import COLOUR_MAPS as COLOUR_MAPS
 from unirender.symmetries import LIGHT_MAPS, Maps
 from unirender.symmetries import mirror as mirror
+from unirender.symmetries import permute_channels as permute_channels
 from unirender.symmetries import quarter_turn as quarter_turn
 from unirender.symmetries import turn_rotation as turn_rotation
 from unirender.training.moving import ROLL_DEG, SHIFT, ZOOM, Move
 from unirender.training.presets import Augmentation
 
-COLOUR_MAPS = ("image", "albedo", "specular", "diffuse", "environment")
 METALLIC_NODES = (0.0, 0.5, 1.0)
 
 
@@ -81,15 +82,6 @@ def metallic_weights(metallic: float) -> Float[np.ndarray, " 3"]:
     """Lagrange's weights of the pictures at `METALLIC_NODES`."""
     m = metallic
     return np.array([(2 * m - 1) * (m - 1), 4 * m * (1 - m), m * (2 * m - 1)])
-
-
-def permute_channels(maps: Maps, order: tuple[int, int, int]) -> Maps:
-    """Channel c of the result is channel `order[c]` of every colour map."""
-    if sorted(order) != [0, 1, 2]:
-        raise UnirenderError(f"channel order: got {order}, expected a permutation of (0, 1, 2)")
-    if tuple(order) == (0, 1, 2):
-        return dict(maps)
-    return {name: value[..., list(order)] if name in COLOUR_MAPS else value for name, value in maps.items()}
 
 
 DEFAULT_AUGMENTATION = Augmentation()
