@@ -184,9 +184,7 @@ def our_rows(
 
     mean = ours("Ours (mean)", decompositions=shared)
     anchored = ours("Ours (mean, anchored)", anchored=True, decompositions=shared)
-    several: dict[str, Any] = {"looks": LOOKS, "decompositions": Decompositions[Any]()}
-    looked = ours(f"Ours (mean, {LOOKS} looks)", **several)
-    looked_anchored = ours(f"Ours (mean, {LOOKS} looks, anchored)", anchored=True, **several)
+    looked = ours(f"Ours (mean, {LOOKS} looks)", looks=LOOKS)
     open_mean = ours("Ours (mean, not closed)", closed=False)
     composites = [CompositeOf(mean, anchored=carried, edited=edited) for carried in (False, True)]
     decomposes = from_image | {("inverse", "single-image"), LIGHT}
@@ -196,7 +194,6 @@ def our_rows(
         make_row(mean, "ours", published="Ours", **one),
         make_row(anchored, "ours", protocols=from_image, **one),
         make_row(looked, "ours", protocols=decomposes, note=MEAN_OF_LOOKS, **one),
-        make_row(looked_anchored, "ours", protocols=from_image, note=MEAN_OF_LOOKS, **one),
         make_row(open_mean, "ours", protocols=decomposes, note="maps as the network predicts them", **one),
         *(make_row(composite, "baseline", protocols=from_image, **one) for composite in composites),
     ]
