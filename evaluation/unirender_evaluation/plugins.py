@@ -16,7 +16,6 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -26,6 +25,7 @@ from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.methods import CAPABILITIES, capabilities
+from unirender_evaluation.plugin_source import source_sha256
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -39,7 +39,7 @@ class Plugin:
 
     Attributes:
         method: answers.
-        source: sha256 of the file that defines its class, and of the callable's that made it where that is another.
+        source: sha256 of the files that it is made of (`plugin_source`).
         made_by: its class, by which name it was asked for, and the arguments: a file may have several of one `config`.
     """
 
@@ -196,15 +196,4 @@ def _plugin(found: Any, what: str, name: str, arguments: Mapping[str, Any] = Map
         raise UnirenderError(f"{what}: {error}") from None
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
-    return Plugin(method, _source(type(method), found), made_by)
-
-
-def _source(*defined: Any) -> str:
-    """The sha256 of the files that define these; what is compiled, or made in a session, has none: its config has to
-    tell versions apart."""
-    files: dict[str, bytes] = {}
-    for what in defined:
-        with suppress(OSError, TypeError):
-            file = inspect.getfile(what)
-            files[file] = Path(file).read_bytes()
-    return hashlib.sha256(b"".join(files.values())).hexdigest() if files else "unknown"
+    return Plugin(method, source_sha256(type(method), found), made_by)
