@@ -204,8 +204,8 @@ def record_of(
 class Store:
     """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end.
 
-    `records.jsonl` holds what the last run measured; records of the same code that it did not ask for (it was a part of
-    a larger run) wait in `unused.jsonl` beside it.
+    `records.jsonl` holds what the last run measured; what it did not ask for waits in `unused.jsonl` beside it: it was
+    a part of a larger run, or of other code, to which one may return.
     """
 
     path: Path
@@ -218,14 +218,19 @@ class Store:
         return self.path.with_name("unused.jsonl")
 
     @classmethod
-    def open(cls, path: Path) -> "Store":
-        """Reads what earlier runs left, in both files."""
+    def open(cls, path: Path, mend: bool = True) -> "Store":
+        """Reads what earlier runs left, in both files.
+
+        Args:
+            path: of `records.jsonl`.
+            mend: cuts off half a line that a killed run left; without, nothing is written.
+        """
         store = cls(path)
         for file in (store.unused_path, path):
             text = file.read_text(encoding="utf-8") if file.exists() else ""
             complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
             store.known |= {record.key: record for record in map(Record.from_json, complete.splitlines())}
-            if complete != text:
+            if mend and complete != text:
                 file.write_text(complete, encoding="utf-8")
         return store
 
@@ -245,12 +250,15 @@ class Store:
         """Stores a record for later runs that this one did not ask for."""
         self.known[record.key] = record
 
-    def close(self) -> list[Record]:
-        """Sorts this run's records, writes and returns them; keeps unused ones of the same code, drops the others."""
-        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+    def of_other_code(self) -> int:
+        """How many records are there that other code of the core has made than this run's."""
         code = {key[:KEY_PREFIX] for key in self.used}
-        unused = [r for key, r in self.known.items() if key not in self.used and key[:KEY_PREFIX] in code]
-        write_records(self.unused_path, unused)
+        return sum(key[:KEY_PREFIX] not in code for key in self.known)
+
+    def close(self) -> list[Record]:
+        """Sorts this run's records, writes and returns them, and lays the others by."""
+        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+        write_records(self.unused_path, [r for key, r in self.known.items() if key not in self.used])
         write_records(self.path, records)
         return records
 
