@@ -1,9 +1,9 @@
 """The files that a stranger's method is made of, by which its records are told from those of an edited one.
 
-They are those that define its class and the classes below it, and the callable that made it; and what these import, by
-the import statements anywhere in them, from their own folder and below. The statements are read, not run: what counts
-depends neither on what else has been imported nor on what a method imports later. Of a file among the installed
-packages its own package counts, no other. What is found in other ways belongs into a method's `config`.
+They are the module that was named, and those that define the method's class and the classes below it; and what these
+import, by the import statements anywhere in them, from their own folder and below. The statements are read, not run:
+what counts depends neither on what else has been imported nor on what a method imports later. Of a file among the
+installed packages its own package counts, no other. What is found in other ways belongs into a method's `config`.
 """
 
 import ast
@@ -18,15 +18,15 @@ INSTALLED = ("site-packages", "dist-packages")
 OURS = ("unirender", "unirender_evaluation", "unirender_reference")  # which have versions of their own
 
 
-def source_sha256(kind: type, maker: Any) -> str:
+def source_sha256(kind: type, *makers: Any) -> str:
     """The sha256 of the contents of a method's files; "unknown" where there are none: what is compiled, or made in a
     session.
 
     Args:
         kind: the method's class.
-        maker: what was called to make it.
+        *makers: what was called to make it, and the module that has it.
     """
-    own = {file for file in map(_file, (kind, maker)) if file is not None}
+    own = {file for file in map(_file, (kind, *makers)) if file is not None}
     files = own | {file for file in map(_file, kind.__mro__) if file is not None}
     roots = {_root(file)[0] for file in own if not _is_installed(file)}
     waiting = [file for file in files if file in own or not _is_installed(file)]

@@ -126,12 +126,13 @@ def test_a_row_of_another_name_shares_no_record(folder: Path) -> None:
     assert rows[0].config != rows[1].config
 
 
-def test_an_edited_factory_is_another_configuration(folder: Path) -> None:
+@pytest.mark.parametrize("made", ["def make():\n    return Level({level})\n", "make = Level({level})\n"])
+def test_an_edited_factory_is_another_configuration(folder: Path, made: str) -> None:
     """Its class may stand in another file, which is the same."""
     sources = []
     for level in (0.1, 0.9):
         file = folder / f"factory_{level}.py"
-        file.write_text(f"from my_method import Level\n\n\ndef make():\n    return Level({level})\n")
+        file.write_text(f"from my_method import Level\n\n\n{made.format(level=level)}")
         sources.append(named_plugin(f"{file}:make").source)
     assert sources[0] != sources[1]
 
