@@ -5,8 +5,10 @@
     truth_check.json              what was rendered again on the spot, and how it compares (see `run_check`)
     tables.md tables.tex tables.json     in the variants that are asked for
     verdict.txt                   who beats whom
+    missing.txt                   what a folder of predictions has no answer to, a line each (`missing_answers`)
     report.html                   one self-contained page
     results.json                  run.json and records.jsonl as one validated file, for others (see `results_file`)
+    unused.jsonl pictures/        records that the run did not ask for; the report's pictures
 
 Running the same command again reuses what is done.
 """
@@ -39,13 +41,14 @@ from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.prediction_check import check_predictions
-from unirender_evaluation.protocol import mask_source
-from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
+from unirender_evaluation.protocol import doubts, mask_source
+from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_csv, write_run
 from unirender_evaluation.report import report_run
 from unirender_evaluation.results_data import NAME as RESULTS
 from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
+from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import load_suite
@@ -172,23 +175,28 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
 
     Raises:
         UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions, or another run is writing to the
-            folder; nothing has run then. A failed truth check or claim is no error: the verdict says so.
+            folder; nothing has run then. Or the folder cannot be written any more, or a method fails: a second run
+            continues from there. A failed truth check or claim is no error: the verdict says so.
     """
     here = prepare(config)
-    with made_folder(config.out), locked(config.out):
+    with made_folder(config.out), locked(config.out), writing_run(config.out):
         return _run(config, here, console or Console())
 
 
 def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     suite, request = here.suite, check_request(config)
     store = Store.open(config.out / "records.jsonl")
+    say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
+    write_missing(config.out, missing_answers(suite, here.rows, here.scenes), say)
     before = set(store.known)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
-        check = run_check(request, here, store, progress, partial(console.print, highlight=False))
+        check = run_check(request, here, store, progress, say)
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
+    if others := store.of_other_code():
+        say(f"{others} records of other code are not used; {store.unused_path} keeps them")
     info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
     write_csv(config.out / "records.csv", records)
@@ -312,7 +320,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         suite=suite.spec.name,
         suite_hash=suite.sha256,
         resolution=suite.spec.resolution,
-        methods=tuple(replace(info, mask=mask_source(info.key, records)) for info in infos if info.key in used),
+        methods=tuple(_described(info, records) for info in infos if info.key in used),
         coverage=float(np.mean([suite.mask(scene).mean() for scene in scenes])),
         lpips=here.backbones,
         mitsuba=str(suite.provenance["mitsuba"]),
@@ -323,6 +331,12 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         seeds=(config.seed,),
         environment=environment,
     )
+
+
+def _described(info: MethodInfo, records: list[Record]) -> MethodInfo:
+    """A row with what its records say of it."""
+    note = "; ".join([*filter(None, [info.note]), *doubts(info.key, records)])
+    return replace(info, mask=mask_source(info.key, records), note=note)
 
 
 def write_outputs(out: Path, result: BenchResult) -> None:

@@ -68,7 +68,7 @@ def read_conventions(folder: Path) -> Conventions:
     if not path.is_file():
         return Conventions()
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UnirenderError(f"{path}: not a readable TOML file ({error})") from None
     known = [field.name for field in fields(Conventions)]

@@ -17,7 +17,7 @@ from rich.table import Table as RichTable
 
 from unirender_evaluation.benchmark import BenchConfig, check_request, prepare, views_jobs
 from unirender_evaluation.engine import Store
-from unirender_evaluation.records import Record, read_records
+from unirender_evaluation.records import Record
 from unirender_evaluation.run_check import stored_check
 
 
@@ -57,7 +57,7 @@ def planned(config: BenchConfig) -> Plan:
     Raises:
         UnirenderError: what would stop the run before it begins: unusable suite, checkpoint, plug-in or predictions.
     """
-    here, known = prepare(config), _stored(config.out)
+    here, known = prepare(config), Store.open(config.out / "records.jsonl", mend=False).known
     every = itertools.chain(*(here.jobs(scene) for scene in here.scenes), views_jobs(here, config))
     # Without the jobs themselves, which hold the pictures of their scene.
     facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in every]
@@ -82,13 +82,6 @@ def _planned_row(label: str, facts: Sequence[tuple[bool, Record | None]]) -> Pla
     measured = [seconds for seconds in times if seconds is not None]
     mean = sum(measured) / len(measured) if measured else None
     return PlannedRow(label, stored, len(facts) - stored, mean)
-
-
-def _stored(folder: Path) -> dict[str, Record]:
-    """The records in a run's folder by content key; half a line of a killed run, or of one at work, is left alone."""
-    path = folder / "records.jsonl"
-    files = [file for file in (Store(path).unused_path, path) if file.exists()]
-    return {record.key: record for file in files for record in read_records(file, torn_tail="drop")}
 
 
 def print_plan(plan: Plan, console: Console) -> None:

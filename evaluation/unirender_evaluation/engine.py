@@ -20,6 +20,8 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
+from unirender_evaluation.metrics import FACING_AWAY
+from unirender_evaluation.plausible import NEARLY_ALL, facing_away, picture_doubt
 from unirender_evaluation.predictions import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record, append_record, write_records
 from unirender_evaluation.rows import Row
@@ -81,9 +83,24 @@ def answer(row: Row, task: Task) -> Prediction:
         else:
             maps = asked()
     seconds = time.perf_counter() - start + earlier
-    if task.asks_light and row.info.kind == "external":
+    if row.info.kind == "external":
         check_light(row, task, maps)
+        check_picture(row, task, image)
     return Prediction(image, maps, seconds)
+
+
+def check_picture(row: Row, task: Task, image: Image | None) -> None:
+    """Refuses a stranger's picture in other units or conventions, whose score would say nothing of it.
+
+    Raises:
+        UnirenderError: see `plausible.picture_doubt`.
+    """
+    if image is None or (doubt := picture_doubt(image, task.mask)) is None:
+        return
+    raise UnirenderError(
+        f"method {row.info.label!r}, {task.answer} ({task.identity}): its picture is no linear, premultiplied "
+        f"radiance: {doubt}; return linear values, straight colour times the mask"
+    )
 
 
 def check_light(row: Row, task: Task, maps: Intrinsics | None) -> None:
@@ -93,7 +110,7 @@ def check_light(row: Row, task: Task, maps: Intrinsics | None) -> None:
         UnirenderError: it is no lat-long map twice as wide as high, is black, or brighter than `BRIGHTEST`.
     """
     light = None if maps is None else maps.environment
-    if light is None:
+    if light is None or not task.asks_light:
         return
     shape, largest = light.shape, float(light.max())
     if len(shape) == 3 and shape[0] >= 2 and shape[1] == 2 * shape[0] and 0 < largest <= BRIGHTEST:
@@ -121,7 +138,7 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
         result = function(**{argument: _own(value) for argument, value in inputs.items()})
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # neither ends a run without a word
         raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
     if capability != "decompose":
         return _picture(result, size, name)
@@ -204,8 +221,8 @@ def record_of(
 class Store:
     """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end.
 
-    `records.jsonl` holds what the last run measured; records of the same code that it did not ask for (it was a part of
-    a larger run) wait in `unused.jsonl` beside it.
+    `records.jsonl` holds what the last run measured; what it did not ask for waits in `unused.jsonl` beside it: it was
+    a part of a larger run, or of other code, to which one may return.
     """
 
     path: Path
@@ -218,14 +235,19 @@ class Store:
         return self.path.with_name("unused.jsonl")
 
     @classmethod
-    def open(cls, path: Path) -> "Store":
-        """Reads what earlier runs left, in both files."""
+    def open(cls, path: Path, mend: bool = True) -> "Store":
+        """Reads what earlier runs left, in both files.
+
+        Args:
+            path: of `records.jsonl`.
+            mend: cuts off half a line that a killed run left; without, nothing is written.
+        """
         store = cls(path)
         for file in (store.unused_path, path):
             text = file.read_text(encoding="utf-8") if file.exists() else ""
             complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
             store.known |= {record.key: record for record in map(Record.from_json, complete.splitlines())}
-            if complete != text:
+            if mend and complete != text:
                 file.write_text(complete, encoding="utf-8")
         return store
 
@@ -245,12 +267,15 @@ class Store:
         """Stores a record for later runs that this one did not ask for."""
         self.known[record.key] = record
 
-    def close(self) -> list[Record]:
-        """Sorts this run's records, writes and returns them; keeps unused ones of the same code, drops the others."""
-        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+    def of_other_code(self) -> int:
+        """How many records are there that other code of the core has made than this run's."""
         code = {key[:KEY_PREFIX] for key in self.used}
-        unused = [r for key, r in self.known.items() if key not in self.used and key[:KEY_PREFIX] in code]
-        write_records(self.unused_path, unused)
+        return sum(key[:KEY_PREFIX] not in code for key in self.known)
+
+    def close(self) -> list[Record]:
+        """Sorts this run's records, writes and returns them, and lays the others by."""
+        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+        write_records(self.unused_path, [r for key, r in self.known.items() if key not in self.used])
         write_records(self.path, records)
         return records
 
@@ -308,4 +333,16 @@ def method_jobs(
 def _ask(row: Row, task: Task, key: str, backbones: Sequence[str], pictures: Keeper) -> Record:
     prediction = answer(row, task)
     pictures.keep(task, row.info.key, key, prediction)
-    return record_of(task, row.info, score(task, prediction, backbones), key, prediction.seconds)
+    values = score(task, prediction, backbones)
+    if row.info.kind == "external":
+        values |= _facing_away(task, prediction)
+    return record_of(task, row.info, values, key, prediction.seconds)
+
+
+def _facing_away(task: Task, prediction: Prediction) -> dict[str, float]:
+    """The share of a stranger's normals that face away, where it is nearly all of those that are scored."""
+    found, true = (None if maps is None else maps.normal for maps in (prediction.maps, task.truth_maps))
+    if found is None or true is None:
+        return {}
+    share = facing_away(found, task.mask)
+    return {FACING_AWAY: share} if share > NEARLY_ALL else {}

@@ -134,6 +134,7 @@ METRICS: dict[str, Metric] = {
         Metric("mse_object", "MSE (object)", "", False, 0.0, (), 4, "squared difference of the in-mask means"),
         Metric("cosine", "cos", "", True, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
         Metric("angle_deg", "angle", "deg", False, 0.0, (), 1, "coverage-weighted mean angle between normals"),
+        Metric("away", "facing away", "", False, 0.0, (), 2, "share of the normals in the mask that face away"),
         Metric("ciede2000", "CIEDE2000", "", False, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
         Metric("log_rmse", "log-RMSE", "", False, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
         Metric("rmse_relative", "error", "", False, 0.0, ("scale",), 3, "RMSE over the truth's mean, in mask, HDR"),
@@ -149,6 +150,7 @@ def metric_key(quantity: str, metric: Metric | str, variant: Variant = DEFAULT_V
 
 
 OWN_MASK = metric_key("mask", "iou")  # recorded where maps were scored with a mask of the method's own
+FACING_AWAY = metric_key("normal", "away")  # recorded of a stranger's normals where nearly all do
 
 
 def mse(

@@ -16,7 +16,6 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -26,6 +25,7 @@ from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.methods import CAPABILITIES, capabilities
+from unirender_evaluation.plugin_source import source_sha256
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -39,7 +39,7 @@ class Plugin:
 
     Attributes:
         method: answers.
-        source: sha256 of the file that defines its class, and of the callable's that made it where that is another.
+        source: sha256 of the files that it is made of (`plugin_source`).
         made_by: its class, by which name it was asked for, and the arguments: a file may have several of one `config`.
     """
 
@@ -64,7 +64,8 @@ def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
                 f"--predictions {name}=FOLDER"
             )
         what = f"plug-in {name!r} ({found[name].value})"
-        plugins.append(_plugin(_attempt(what, "load it", found[name].load), what, name))
+        loaded = _attempt(what, "load it", found[name].load)
+        plugins.append(_plugin(loaded, what, name, sys.modules[found[name].module]))
     return plugins
 
 
@@ -90,7 +91,7 @@ def named_plugin(spec: str) -> Plugin:
         )
     found = getattr(module, name)
     arguments = _arguments(found, query, what) if has_arguments else {}
-    return _plugin(found, what, name, arguments)
+    return _plugin(found, what, name, module, arguments)
 
 
 def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
@@ -185,8 +186,10 @@ def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
         raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
 
 
-def _plugin(found: Any, what: str, name: str, arguments: Mapping[str, Any] = MappingProxyType({})) -> Plugin:
-    """The method that `found` is, or that it returns when it is called."""
+def _plugin(
+    found: Any, what: str, name: str, module: ModuleType, arguments: Mapping[str, Any] = MappingProxyType({})
+) -> Plugin:
+    """The method that `found` of a module is, or that it returns when it is called."""
     is_method = not inspect.isclass(found) and any(callable(getattr(found, can, None)) for can in CAPABILITIES)
     as_it_is = not arguments and (is_method or not callable(found))
     method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
@@ -196,15 +199,4 @@ def _plugin(found: Any, what: str, name: str, arguments: Mapping[str, Any] = Map
         raise UnirenderError(f"{what}: {error}") from None
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
-    return Plugin(method, _source(type(method), found), made_by)
-
-
-def _source(*defined: Any) -> str:
-    """The sha256 of the files that define these; what is compiled, or made in a session, has none: its config has to
-    tell versions apart."""
-    files: dict[str, bytes] = {}
-    for what in defined:
-        with suppress(OSError, TypeError):
-            file = inspect.getfile(what)
-            files[file] = Path(file).read_bytes()
-    return hashlib.sha256(b"".join(files.values())).hexdigest() if files else "unknown"
+    return Plugin(method, source_sha256(type(method), found, module), made_by)

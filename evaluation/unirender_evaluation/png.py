@@ -14,14 +14,14 @@ from unirender.errors import UnirenderError
 # How Pillow names the pixels it cuts -> names under which it keeps the high, and the low bytes.
 SIXTEEN = {"RGB;16B": ("RGB;16B", "RGB;16L"), "RGBA;16B": ("RGBA;16B", "RGBA;16L")}
 GREY_AND_ALPHA = "LA;16B"  # four bytes a pixel: the grey's, then the alpha's
-LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # of Pillow's own conversion to grey
+COLOURED = 2.5 / 255  # largest difference of the channels of a grey picture that was a JPEG's
 
 
 def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
-    """Values in [0, 1] of a PNG; alpha is dropped, grey and colour are converted to `channels`.
+    """Values in [0, 1] of a PNG; alpha is dropped. Grey is as good as three equal channels, and the reverse.
 
     Raises:
-        UnirenderError: not a readable PNG.
+        UnirenderError: not a readable PNG, or one in colour where `channels` is 1.
     """
     from PIL import Image as Pil
 
@@ -30,15 +30,21 @@ def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
             stored = picture.tile[0].args if picture.tile else None
             if stored in SIXTEEN or stored == GREY_AND_ALPHA:
                 value = _sixteen_bits(path, str(stored))
-                value = value @ LUMA if channels == 1 and value.ndim == 3 else value
             elif picture.mode.startswith("I"):
                 value = np.asarray(picture, np.float32) / 65535.0
             else:
-                value = np.asarray(picture.convert("RGB" if channels == 3 else "L"), np.float32) / 255.0
+                value = np.asarray(picture.convert("RGB"), np.float32) / 255.0
     except (OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"predictions: {path} is not a readable PNG ({error})") from None
     value = value if value.ndim == 3 else value[..., None]
-    return np.repeat(value, 3, axis=-1) if channels == 3 and value.shape[-1] == 1 else value.astype(np.float32)
+    if channels == 3:
+        return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value.astype(np.float32)
+    if (difference := float(np.ptp(value, axis=-1).max())) > COLOURED:
+        raise UnirenderError(
+            f"predictions: {path} is in colour: its channels differ by up to {difference:.2g}, expected one value a "
+            "pixel; write it as grey (of glTF's metallicRoughness: roughness is its green channel, metallic its blue)"
+        )
+    return value[..., :1].astype(np.float32)
 
 
 def _sixteen_bits(path: Path, stored: str) -> np.ndarray:

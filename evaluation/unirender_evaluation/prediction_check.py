@@ -17,6 +17,7 @@ from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
 
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
+SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
 GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
@@ -91,6 +92,7 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
             found.append(_broken_link(path))
         elif path.is_dir() and path.name in asked:
             files = list(_visible(path))
+            found += [_unread_settings(file, predictions.folder) for file in files if _is_settings(file)]
             found += _layout_problems(path, files, asked[path.name])
             readable = [file for file in files if _is_answer(file, asked[path.name])]
             answered += len(readable)
@@ -98,7 +100,9 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
         elif path.is_dir():
             close = difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
             found.append(f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}")
-        elif path.name != FILE and path.suffix.lower() in PICTURE_LIKE:
+        elif path.name != FILE and _is_settings(path):
+            found.append(_unread_settings(path, predictions.folder))
+        elif path.suffix.lower() in PICTURE_LIKE:
             found.append(f"{path}: lies outside the pictures' folders, expected <picture>/<answer>")
     if not answered and not found:
         found.append(f"{predictions.folder}: no file answers any question of the suite {suite!r}")
@@ -145,8 +149,18 @@ def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
     for path in _visible(folder):
         if _is_broken_link(path):
             yield _broken_link(path)
+        elif _is_settings(path):
+            yield _unread_settings(path, folder.parents[1])
         elif path.is_dir() or (path.suffix.lower() in PICTURE_LIKE and path.name not in GIVEN):
             yield f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png"
+
+
+def _is_settings(path: Path) -> bool:
+    return path.name.lower().endswith(SETTINGS_LIKE) and path.is_file()
+
+
+def _unread_settings(path: Path, folder: Path) -> str:
+    return f"{path}: is not read, expected {folder / FILE} for all pictures, or none; rename, move or remove it"
 
 
 def _is_broken_link(path: Path) -> bool:

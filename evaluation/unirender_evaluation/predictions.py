@@ -35,6 +35,7 @@ from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, 
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
+from unirender_evaluation.plausible import picture_doubt
 from unirender_evaluation.png import read_png
 from unirender_evaluation.tasks import LIGHT_ANSWER, Task
 
@@ -134,8 +135,8 @@ class PredictionFolder:
         """A rendered picture, linear and premultiplied.
 
         Raises:
-            UnirenderError: the file is broken, has another size than the mask, or values that are not finite or beyond
-                `BRIGHTEST`.
+            UnirenderError: the file is broken, has another size than the mask, values that are not finite or beyond
+                `BRIGHTEST`, or is no linear, premultiplied radiance (`plausible.picture_doubt`).
         """
         with _named(path):
             stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else read_png(path, 3)
@@ -145,7 +146,13 @@ class PredictionFolder:
             with np.errstate(over="ignore"):  # an overflow is brighter than the bound
                 image = self.conventions.linear(stored, path.suffix)
             _check_brightness("the picture", image)
-        return image if self.conventions.premultiplied else (image * mask).astype(np.float32)
+            image = image if self.conventions.premultiplied else (image * mask).astype(np.float32)
+            if (doubt := picture_doubt(image, mask)) is not None:
+                raise UnirenderError(
+                    f"the picture is no linear, premultiplied radiance: {doubt}; make it so, or say in {FILE} what it "
+                    "is (premultiplied = false: straight colour)"
+                )
+        return image
 
     def read_light(self, path: Path) -> Float[np.ndarray, "eh ew 3"]:
         """A light on the contract's grid: a map that unirender wrote as it is, another one's pixels taken as areas.

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from unirender_evaluation.metrics import LPIPS_SCALES, OWN_MASK, Variant
+from unirender_evaluation.metrics import FACING_AWAY, LPIPS_SCALES, OWN_MASK, Variant, metric_key
 from unirender_evaluation.published import not_stated
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import Protocol
@@ -15,6 +15,7 @@ SCALE_TEXT = {
     "aligned": "one least-squares factor per image, fitted in linear light in the true mask",
     "aligned_rgb": "one least-squares factor per image and channel, fitted in linear light in the true mask",
 }
+NORMALS = metric_key("normal", "cosine")
 MASKED_QUANTITIES = ("albedo", "specular", "diffuse", "roughness", "metallic")  # maps, which a method's mask belongs to
 
 
@@ -22,6 +23,20 @@ def mask_source(method: str, records: Iterable[Record]) -> Literal["own", "paste
     """Which mask the whole-frame figures of a method's maps were taken with, by a run's records."""
     own = any(record.method == method and OWN_MASK in record.values for record in records)
     return "own" if own else "pasted"
+
+
+def doubts(method: str, records: Iterable[Record]) -> list[str]:
+    """What a run's records say of a stranger's maps that is probably a mistake, a sentence each, for its note."""
+    own = [record.values for record in records if record.method == method]
+    empty = sum(values.get(OWN_MASK) == 0 for values in own)
+    away, normals = sum(FACING_AWAY in values for values in own), sum(NORMALS in values for values in own)
+    found = [f"its own mask meets the object on none of {empty} pictures (is it 0?)"] if empty else []
+    if away:
+        found.append(
+            f"its normals face away from the viewer on {away} of {normals} pictures (OpenCV axes? normal_axes in "
+            "conventions.toml turns those of a folder)"
+        )
+    return found
 
 
 def protocol_line(

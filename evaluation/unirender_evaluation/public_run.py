@@ -29,6 +29,7 @@ from unirender_evaluation.public_sets import PublicSet, Sample
 from unirender_evaluation.public_tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
+from unirender_evaluation.run_folder import writing_run
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.tables import Table
@@ -103,7 +104,7 @@ def run(what: PublicRun, console: Console) -> PublicResult:
     """
     every = what.public.samples()
     check_folders(what)
-    with made_folder(what.out), locked(what.out):
+    with made_folder(what.out), locked(what.out), writing_run(what.out):
         return _run(what, evenly(every, what.limit), console)
 
 

@@ -126,7 +126,7 @@ def make_row(method: Any, kind: MethodKind, label: str | None = None, **options:
     if not isinstance(method.name, str) or not slug(method.name):
         raise UnirenderError(f"{method!r}: got the name {method.name!r}, expected a string with {KEY_LETTERS}")
     try:
-        config = json.loads(json.dumps(dict(method.config)))
+        config = json.loads(json.dumps(dict(method.config), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise UnirenderError(
             f"method {method.name!r}: its config is not JSON ({error}), expected a dict of strings, numbers and lists"

@@ -47,9 +47,11 @@ def score(
 
     Raises:
         UnirenderError: the two are of different kinds or sizes, a picture is not finite linear floats with the channels
-            last, a mask is missing or empty, a variant or backbone is unknown, or nothing is left to score; a picture
+            last, or clearly in other units than the truth (0 to 255, -1 to 1), a mask is missing or empty, a variant or
+            backbone is unknown, or nothing is left to score; a picture
             or colour map is smaller than SSIM's window (11 pixels a side), or than what LPIPS takes (31).
     """
+    from unirender_evaluation.plausible import range_doubt
     from unirender_evaluation.scoring import score_image, score_maps
 
     variant = Variant.parse(protocol) if isinstance(protocol, str) else protocol
@@ -74,7 +76,11 @@ def score(
             raise UnirenderError(
                 f"score: got pictures of {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
             )
-        values = score_image(p, t, _mask(mask, t), quantity=quantity, **options)
+        found = _mask(mask, t)
+        doubt = range_doubt(p, found)
+        if doubt is not None and range_doubt(t, found) is None:  # a truth of such values is of another exposure
+            raise UnirenderError(f"score: the prediction is in other units than the truth: {doubt}; convert it")
+        values = score_image(p, t, found, quantity=quantity, **options)
     chosen = values if variant is None else {key: value for key, value in values.items() if _is_of(key, variant)}
     if not chosen:
         what = "no map that both sides have" if not values else f"no value under {variant and variant.label}"

@@ -24,13 +24,16 @@ from unirender_evaluation.table_counts import cell_counts, label_n
 from unirender_evaluation.table_text import markdown_row, plain_markdown, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table
 
+LARGE = 1e6
 MISSING, NOT_AVAILABLE = "-", "n/a"
 NO_CELL = Cell()
 
 
 def format_number(value: float, decimals: int) -> str:
-    """Fixed decimals; infinity as a symbol."""
-    return f"{value:.{decimals}f}" if math.isfinite(value) else ("∞" if value > 0 else "-∞")
+    """Fixed decimals; scientific where a value is absurdly large, infinity as a symbol."""
+    if not math.isfinite(value):
+        return "∞" if value > 0 else "-∞"
+    return f"{value:.2e}" if abs(value) >= LARGE else f"{value:.{decimals}f}"
 
 
 def format_estimate(estimate: Estimate, decimals: int) -> tuple[str, str]:

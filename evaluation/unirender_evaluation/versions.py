@@ -65,6 +65,7 @@ COMMANDS = (
     "physics_tracer",
     "physics_twins",
     "prediction_check",
+    "run_folder",
     "score_api",
     "shard_scores",
     "subsets",

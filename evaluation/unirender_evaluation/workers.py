@@ -4,12 +4,14 @@ The processes are this machine's, or a cluster's (`unirender_reference.cluster`)
 records and pictures travel back, and the process that was started is the only writer.
 """
 
+import os
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -76,7 +78,7 @@ class Run:
         return key_of
 
 
-_here: tuple[Run, frozenset[str]] | None = None
+_here: tuple[Run, frozenset[str], Path] | None = None  # with the file that says what is under way
 
 
 def _start(
@@ -88,6 +90,7 @@ def _start(
     pictures: Path,
     subsets: Subsets,
     known: frozenset[str],
+    notes: Path,
 ) -> None:
     from unirender_reference.backend import set_threads
     from unirender_reference.processes import exit_with_parent
@@ -102,13 +105,20 @@ def _start(
     loaded = load_suite(suite)
     run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     threadpoolctl.threadpool_limits(1)  # nor do numpy's products, and those of what a row has imported
-    _here = run, known
+    _here = run, known, notes / str(os.getpid())
 
 
 def _scene(key: str) -> list[Record]:
     assert _here is not None, "the pool's initializer sets it"
-    run, known = _here
-    return [job.make() for job in run.jobs(run.suite.scene(key)) if not job.is_done(known.__contains__)]
+    run, known, note = _here
+    records = []
+    for job in run.jobs(run.suite.scene(key)):
+        if not job.is_done(known.__contains__):
+            with suppress(OSError):  # it is a help, and no more
+                note.write_text(f"{job.label} on {key}", encoding="utf-8")
+            records.append(job.make())
+    note.unlink(missing_ok=True)
+    return records
 
 
 def run_in_workers(
@@ -119,26 +129,31 @@ def run_in_workers(
     Raises:
         UnirenderError: a worker process died, or could not make the rows; what a row raises comes as it is.
     """
-    arguments = (
-        build,
-        run.suite.spec.path,
-        [scene.key for scene in run.scenes],
-        run.versions,
-        run.backbones,
-        run.pictures,
-        run.subsets,
-        known,
-    )
-    with WorkerPool(jobs, _start, *arguments) as pool:
-        futures = [pool.submit(_scene, scene.key) for scene in scenes]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool as error:
-            raise UnirenderError(
-                "a worker process died: above is why, if it could not start; else perhaps for want of memory. Run the "
-                "same command again, with fewer --jobs"
-            ) from error
+    with tempfile.TemporaryDirectory() as folder:
+        notes = Path(folder)
+        arguments = (
+            build,
+            run.suite.spec.path,
+            [scene.key for scene in run.scenes],
+            run.versions,
+            run.backbones,
+            run.pictures,
+            run.subsets,
+            known,
+            notes,
+        )
+        with WorkerPool(jobs, _start, *arguments) as pool:
+            futures = [pool.submit(_scene, scene.key) for scene in scenes]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            except BrokenProcessPool as error:
+                said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
+                raise UnirenderError(
+                    "a worker process died: above is why, if it could not start; else perhaps for want of memory"
+                    f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, "
+                    "with fewer --jobs"
+                ) from error
 
 
 @dataclass(frozen=True)

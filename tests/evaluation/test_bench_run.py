@@ -60,6 +60,7 @@ def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:
     ("body", "message"),
     [
         ("raise RuntimeError('out of memory')", r"method 'wild', render \(x\): RuntimeError: out of memory"),
+        ("import sys; sys.exit(3)", r"method 'wild', render \(x\): SystemExit: 3"),
         ("return intrinsics", r"got object of shape \(\), expected finite linear radiance"),
         ("return intrinsics.albedo[..., 0]", r"expected finite linear radiance, floats of shape"),
         ("return intrinsics.albedo[:1]", r"of shape \(1, 2, 3\), expected finite linear radiance"),

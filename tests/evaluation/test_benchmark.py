@@ -2,6 +2,8 @@
 verdict."""
 
 import json
+import os
+import re
 import weakref
 from collections.abc import Iterator
 from copy import deepcopy
@@ -17,16 +19,18 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
+from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, _work
 from unirender_evaluation.dry_run import planned
-from unirender_evaluation.engine import KEY_PREFIX, Job, Prediction, Store, content_key, score
+from unirender_evaluation.engine import KEY_PREFIX, Job, Prediction, Store, content_key, method_jobs, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
-from unirender_evaluation.protocol import mask_source
+from unirender_evaluation.pictures import Pictures
+from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
 from unirender_evaluation.subsets import Subsets
@@ -324,15 +328,62 @@ def test_a_partial_run_keeps_the_records_of_the_whole_one(suite: Suite, tmp_path
     assert {record.key for record in read_records(path)} == {record.key for record in whole}
 
 
-def test_records_of_other_code_are_dropped(suite: Suite, tmp_path: Path) -> None:
+def test_records_of_other_code_are_kept(suite: Suite, tmp_path: Path) -> None:
+    """One may return to it: they wait where those wait that a smaller run does not ask for."""
     path = tmp_path / "records.jsonl"
-    whole = evaluate(suite, trivial_rows(), path)
-    other = content_key(suite, suite.scenes[0], "what", {}, "other code")
-    assert other[:KEY_PREFIX] != whole[0].key[:KEY_PREFIX]
-    store = Store.open(path)
-    store.add(Record("inverse", "single-image", "new", "s", "o", {}, other))
-    store.close()
-    assert not any(Store.open(path).has(record.key) for record in whole)
+    mine, other = (content_key(suite, suite.scenes[0], "what", {}, code) for code in ("code", "other code"))
+    assert other[:KEY_PREFIX] != mine[:KEY_PREFIX]
+    for key, others in ((mine, 0), (other, 1), (mine, 1)):
+        store = Store.open(path)
+        if not store.has(key):
+            store.add(Record("inverse", "single-image", "m", "s", "o", {}, key))
+        assert store.of_other_code() == others
+        assert [record.key for record in store.close()] == [key]
+    assert Store.open(path).known.keys() == {mine, other}
+
+
+class Killer:
+    """Ends its process."""
+
+    name = "killer"
+    config: ClassVar[dict[str, Any]] = {}
+
+    def edit(self, **_: Any) -> np.ndarray:
+        os._exit(9)
+
+
+def killer_rows() -> list[Row]:
+    return [make_row(Killer(), "external")]
+
+
+@pytest.mark.long
+def test_what_was_under_way_in_a_worker_that_died_is_named(suite: Suite, tmp_path: Path) -> None:
+    scene = suite.scenes[1]
+    run = Run(suite, killer_rows(), [scene], TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
+    with pytest.raises(UnirenderError, match=rf"a worker process died: .* \(under way: killer on {scene.key}\)"):
+        list(run_in_workers(run, killer_rows, [scene], frozenset(), 1))
+
+
+class Turned(Guess):
+    """The same in OpenCV's axes, with no mask."""
+
+    name = "turned"
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        found = super().decompose(image_srgb, mask, camera)
+        return found.replace(normal=-found.require("normal")["normal"], mask=np.zeros_like(mask))
+
+
+def test_what_is_probably_a_mistake_is_noted(suite: Suite, tmp_path: Path) -> None:
+    """From the records, so that a run which is continued says it, too."""
+    rows = [make_row(method, "external") for method in (Turned(), Guess())]
+    pictures = Pictures(tmp_path, suite, [])
+    records = [job.make() for job in method_jobs(suite, rows, [], suite.scenes[0], TEST_VERSIONS, (), pictures)]
+    n = len(suite.scenes[0].materials)
+    assert doubts("guess", records) == []
+    mask, normals = doubts("turned", records)
+    assert re.search(r"meets the object on none of \d+ pictures", mask)
+    assert f"normals face away from the viewer on {n} of {n} pictures (OpenCV axes? normal_axes" in normals
 
 
 def test_maps_are_scored_with_the_mask_that_they_bring_and_pictures_with_the_true_one(

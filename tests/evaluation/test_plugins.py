@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
 
@@ -38,6 +39,10 @@ class Sampler(Grey):
 
 class Unwritable(Grey):
     config = {"weights": object()}
+
+
+class NotANumber(Grey):
+    config = {"threshold": float("nan")}
 
 
 class White(Grey):
@@ -121,14 +126,64 @@ def test_a_row_of_another_name_shares_no_record(folder: Path) -> None:
     assert rows[0].config != rows[1].config
 
 
-def test_an_edited_factory_is_another_configuration(folder: Path) -> None:
+@pytest.mark.parametrize("made", ["def make():\n    return Level({level})\n", "make = Level({level})\n"])
+def test_an_edited_factory_is_another_configuration(folder: Path, made: str) -> None:
     """Its class may stand in another file, which is the same."""
     sources = []
     for level in (0.1, 0.9):
         file = folder / f"factory_{level}.py"
-        file.write_text(f"from my_method import Level\n\n\ndef make():\n    return Level({level})\n")
+        file.write_text(f"from my_method import Level\n\n\n{made.format(level=level)}")
         sources.append(named_plugin(f"{file}:make").source)
     assert sources[0] != sources[1]
+
+
+@pytest.mark.parametrize("edited", ["base.py", "parts/late.py", "parts/__init__.py", "constants.py", "deep.py"])
+def test_an_edited_neighbour_is_another_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edited: str
+) -> None:
+    """Of a base class, imported late, or below a package: whatever else is imported, and whether it has run or not."""
+    files = {
+        "main.py": "from base import Base\nclass Mine(Base):\n    def render(self, intrinsics): import parts.late",
+        "base.py": "from constants import ONE\nclass Base:\n    name, config = 'mine', {}",
+        "constants.py": "import deep\nONE = 1",
+        "deep.py": "",
+        "parts/__init__.py": "",
+        "parts/late.py": "from .absent import nothing",
+        "other.py": "ONE = 1",
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("base", "constants", "deep", "parts", "parts.late"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    kind = type(named_plugin(f"{tmp_path / 'main.py'}:Mine").method)
+    before = source_sha256(kind, kind)
+    assert named_plugin(f"{tmp_path / 'main.py'}:Mine").source == before
+    (tmp_path / "other.py").write_text("ONE = 2")
+    assert source_sha256(kind, kind) == before
+    with (tmp_path / edited).open("a") as file:
+        file.write("\n# edited\n")
+    assert source_sha256(kind, kind) != before
+
+
+def test_an_installed_method_is_its_own_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not all that lies beside it, whose number has no end."""
+    packages = tmp_path / "site-packages"
+    (packages / "mine_installed").mkdir(parents=True)
+    (packages / "mine_installed" / "__init__.py").write_text(
+        "import foreign_installed\nfrom .net import Net\nclass Mine(Net):\n    name, config = 'mine', {}"
+    )
+    (packages / "mine_installed" / "net.py").write_text("class Net:\n    def render(self, intrinsics): ...")
+    (packages / "foreign_installed.py").write_text("")
+    monkeypatch.syspath_prepend(str(packages))
+    kind = type(named_plugin("mine_installed:Mine").method)
+    before = source_sha256(kind, kind)
+    (packages / "foreign_installed.py").write_text("# edited")
+    assert source_sha256(kind, kind) == before
+    (packages / "mine_installed" / "net.py").write_text("# edited")
+    assert source_sha256(kind, kind) != before
 
 
 def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
@@ -167,9 +222,10 @@ def test_another_form_is_wrong_usage(spec: str) -> None:
         named_plugin(spec)
 
 
-def test_a_config_that_is_not_json(folder: Path) -> None:
+@pytest.mark.parametrize("name", ["Unwritable", "NotANumber"])
+def test_a_config_that_is_not_json(folder: Path, name: str) -> None:
     with pytest.raises(UnirenderError, match="method 'grey': its config is not JSON"):
-        plugin_rows([named_plugin(f"{folder / 'my_method.py'}:Unwritable")])
+        plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{name}")])
 
 
 def test_an_unknown_entry_point() -> None:

@@ -1,9 +1,12 @@
 """Folders of predictions: how their files are read, and that all that is wrong with one is found at once."""
 
 import json
+import re
 import struct
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +22,7 @@ from unirender_evaluation.conventions import Conventions, read_conventions
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.png import read_png
 from unirender_evaluation.prediction_check import PredictionError, check_predictions
-from unirender_evaluation.rows import prediction_rows
+from unirender_evaluation.rows import make_row, prediction_rows
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.tasks import Task, tasks
 
@@ -80,9 +83,13 @@ def test_sixteen_bits_are_read_in_full(tmp_path: Path, colour_type: int, channel
     write_png16(tmp_path / "a.png", values, colour_type, filter_type)
     expected = values[..., :3] / 65535 if channels > 2 else values[..., [0, 0, 0]] / 65535
     np.testing.assert_allclose(read_png(tmp_path / "a.png", 3), expected, rtol=0, atol=1e-6)
+    if channels > 2:
+        with pytest.raises(UnirenderError, match=r"a.png is in colour: .* metallic its blue"):
+            read_png(tmp_path / "a.png", 1)
+        write_png16(tmp_path / "a.png", np.broadcast_to(values[..., :1], values.shape), colour_type, filter_type)
     grey = read_png(tmp_path / "a.png", 1)
     assert grey.dtype == np.float32
-    np.testing.assert_allclose(grey[..., 0], expected @ [0.299, 0.587, 0.114], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(grey, expected[..., :1], rtol=0, atol=1e-6)
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:70])
     with pytest.raises(UnirenderError, match=r"a.png is not a readable PNG"):
         read_png(tmp_path / "a.png", 3)
@@ -233,7 +240,9 @@ def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, co
     path.parent.mkdir()
 
     def write(value: float) -> None:
-        write_exr(path, image_channels(np.full((*task.mask.shape[:2], 3), value, np.float32)), half=False)
+        picture = np.zeros((*task.mask.shape[:2], 3), np.float32)
+        picture[16, 16] = value
+        write_exr(path, image_channels(picture), half=False)
 
     write(9e29 if colour == "linear" else 1e12)
     assert problems_of(suite, tmp_path) == ()
@@ -251,6 +260,54 @@ def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, co
     write_exr(maps, intrinsics_channels(Intrinsics(specular=specular)), half=False)
     (problem,) = problems_of(suite, tmp_path)
     assert f"{maps}: specular has values up to 3e+38" in problem
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda picture, mask: 255 * picture, r"its median in the mask is .* \(0 to 255\?\)"),
+        (lambda picture, mask: 2 * picture - mask, r"a tenth of its values in the mask is below .* \(-1 to 1\?\)"),
+        (lambda picture, mask: picture + (1 - mask), r"in the mean where no object is, .*premultiplied = false"),
+    ],
+)
+def test_pictures_in_other_units_are_refused(suite: Suite, tmp_path: Path, change: Any, said: str) -> None:
+    """In a folder before anything runs, of a method as it answers; declared, straight colour is right."""
+    task = first(suite, "rendering", "given")
+    assert task.truth_image is not None
+    made = change(task.truth_image, task.mask).astype(np.float32)
+    path = tmp_path / "mine" / task.folder / "render_given.exr"
+    path.parent.mkdir(parents=True)
+    write_exr(path, image_channels(task.truth_image), half=False)
+    assert problems_of(suite, tmp_path / "mine") == ()
+    write_exr(path, image_channels(made), half=False)
+    (problem,) = problems_of(suite, tmp_path / "mine")
+    assert re.search(f"{path}: .*{said}", problem), problem
+    method = SimpleNamespace(name="mine", config={}, render=lambda intrinsics: made)
+    with pytest.raises(UnirenderError, match=r"method 'mine', render_given .* straight colour times the mask"):
+        engine.answer(make_row(method, "external"), task)
+    if "premultiplied" in said:
+        (tmp_path / "mine" / "conventions.toml").write_text("premultiplied = false\n")
+        assert problems_of(suite, tmp_path / "mine") == ()
+
+
+def test_conventions_under_another_name_or_elsewhere_are_problems(suite: Suite, tmp_path: Path) -> None:
+    """They would be ignored, and the numbers wrong."""
+    answer_all(suite, tmp_path)
+    task = first(suite, "relighting", "from-image-sd")
+    (tmp_path / task.folder / task.answer).mkdir()
+    (tmp_path / "conventions.toml").write_text("")
+    paths = [
+        tmp_path / "convention.toml",
+        tmp_path / "conventions.toml.txt",
+        tmp_path / task.folder / "conventions.toml",
+        tmp_path / task.folder / task.answer / "conventions.toml",
+    ]
+    for path in paths:
+        path.write_text("premultiplied = false\n")
+    problems = problems_of(suite, tmp_path)
+    assert len(problems) == len(paths), problems
+    for path in paths:
+        assert sum(f"{path}: is not read, expected {tmp_path / 'conventions.toml'} for" in p for p in problems) == 1
 
 
 def test_conventions_are_undone(suite: Suite, tmp_path: Path) -> None:
@@ -298,6 +355,8 @@ def test_conventions_are_part_of_the_key(suite: Suite, tmp_path: Path) -> None:
 
 def test_conventions_are_the_contract_by_default(tmp_path: Path) -> None:
     assert read_conventions(tmp_path) == Conventions()
+    (tmp_path / "conventions.toml").write_bytes(b"\xef\xbb\xbfpremultiplied = false\r\n")  # as Windows editors do
+    assert read_conventions(tmp_path) == Conventions(premultiplied=False)
     (tmp_path / "conventions.toml").write_text("premultiplied = 1")
     with pytest.raises(UnirenderError, match="premultiplied is 1, expected True or False"):
         read_conventions(tmp_path)

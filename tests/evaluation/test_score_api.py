@@ -95,6 +95,8 @@ def bytes_of(picture: np.ndarray) -> np.ndarray:
         (PICTURES, {"mask": MASK[:8]}, "got a mask of .8, 16. and a truth of .16, 16. pixels"),
         (PICTURES, {"mask": 255 * MASK}, r"mask is in \[0, 255\], expected coverage in \[0, 1\]"),
         (PICTURES, {"mask": 0 * MASK}, "the truth has an empty mask"),
+        ((255 * PICTURES[0], PICTURES[1]), {"mask": MASK}, r"other units than the truth: its median .* \(0 to 255\?\)"),
+        ((2 * PICTURES[0] - 1, PICTURES[1]), {"mask": MASK}, r"a tenth of its values .* \(-1 to 1\?\)"),
         (PICTURES, {"mask": MASK, "lpips": "alex"}, r"got lpips='alex', expected a list of names: lpips=\['alex'\]"),
         (PICTURES, {"mask": MASK, "lpips": ["squeeze"]}, "got backbone 'squeeze', expected one of"),
         ((FOUND, TRUE), {"protocol": "mask"}, "got 'mask', expected one word per axis"),
@@ -109,6 +111,12 @@ def bytes_of(picture: np.ndarray) -> np.ndarray:
 def test_what_it_refuses(arguments: tuple[Any, Any], options: dict[str, Any], said: str) -> None:
     with pytest.raises(UnirenderError, match=said):
         score(*arguments, **options)
+
+
+def test_bright_pictures_are_scored_where_the_truth_is_bright() -> None:
+    """Light and its maps are HDR, and may be of any exposure."""
+    values = score(60 * PICTURES[0], 50 * PICTURES[1], mask=MASK, quantity="specular")
+    assert values["specular.psnr@masked-linear-aligned"] > 0
 
 
 def test_the_package_is_light_and_knows_its_names() -> None:

@@ -19,7 +19,7 @@ from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
-from unirender_evaluation.table_formats import print_table, to_json, to_markdown
+from unirender_evaluation.table_formats import format_number, print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.table_text import TextTable, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
@@ -210,6 +210,11 @@ def test_an_absent_backbone_is_not_available_and_an_absent_value_is_a_dash() -> 
     assert "n/a" in ours
     assert "n/a" not in constant
     assert "are not on this machine" in text
+
+
+def test_absurd_numbers_take_no_more_room_than_others() -> None:
+    shown = [format_number(value, 2) for value in (999999.0, 1.5e6, -3e45, math.inf)]
+    assert shown == ["999999.00", "1.50e+06", "-3.00e+45", "∞"]
 
 
 def test_a_limited_run_is_watermarked_in_every_format() -> None:

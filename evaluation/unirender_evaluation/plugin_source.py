@@ -1,0 +1,92 @@
+"""The files that a stranger's method is made of, by which its records are told from those of an edited one.
+
+They are the module that was named, and those that define the method's class and the classes below it; and what these
+import, by the import statements anywhere in them, from their own folder and below. The statements are read, not run:
+what counts depends neither on what else has been imported nor on what a method imports later. Of a file among the
+installed packages its own package counts, no other. What is found in other ways belongs into a method's `config`.
+"""
+
+import ast
+import hashlib
+import inspect
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+INSTALLED = ("site-packages", "dist-packages")
+OURS = ("unirender", "unirender_evaluation", "unirender_reference")  # which have versions of their own
+
+
+def source_sha256(kind: type, *makers: Any) -> str:
+    """The sha256 of the contents of a method's files; "unknown" where there are none: what is compiled, or made in a
+    session.
+
+    Args:
+        kind: the method's class.
+        *makers: what was called to make it, and the module that has it.
+    """
+    own = {file for file in map(_file, (kind, *makers)) if file is not None}
+    files = own | {file for file in map(_file, kind.__mro__) if file is not None}
+    roots = {_root(file)[0] for file in own if not _is_installed(file)}
+    waiting = [file for file in files if file in own or not _is_installed(file)]
+    while waiting:
+        new = set(_imported(waiting.pop(), roots)) - files
+        files |= new
+        waiting += new
+    contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(contents)).hexdigest() if contents else "unknown"
+
+
+def _file(defined: Any) -> Path | None:
+    with suppress(OSError, TypeError):
+        file = Path(inspect.getfile(defined)).resolve()
+        return file if file.is_file() else None
+    return None
+
+
+def _is_installed(file: Path) -> bool:
+    return any(part in INSTALLED for part in file.parts)
+
+
+def _imported(file: Path, roots: set[Path]) -> Iterator[Path]:
+    """The files that the import statements of one name, below its own package's folder or one of the `roots`."""
+    root, package = _root(file)
+    for name in _names(file, package):
+        parts = name.split(".")
+        if parts[0] in OURS or (_is_installed(file) and parts[:1] != package[:1]):
+            continue
+        for folder in {root} if _is_installed(file) else {root, *roots}:
+            yield from _files_of(folder, parts)
+
+
+def _names(file: Path, package: list[str]) -> Iterator[str]:
+    """Absolute names of all that a file may import: `from a import b` may name a module or what it has."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):  # compiled, or for another Python
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) + 1 - node.level] if node.level else []
+            base = [*above, *filter(None, [node.module])]
+            yield from (".".join([*base, alias.name]) for alias in node.names)
+
+
+def _root(file: Path) -> tuple[Path, list[str]]:
+    """The folder where the file's package lies, and the package's name."""
+    root, package = file.parent, []
+    while (root / "__init__.py").is_file():
+        root, package = root.parent, [root.name, *package]
+    return root, package
+
+
+def _files_of(root: Path, parts: list[str]) -> Iterator[Path]:
+    """Those of a module below a folder and of the packages around it, as far as they are there."""
+    for depth in range(1, len(parts) + 1):
+        place = root.joinpath(*parts[:depth])
+        for file in (place.with_name(f"{place.name}.py"), place / "__init__.py"):
+            if file.is_file():
+                yield file.resolve()

@@ -1,0 +1,61 @@
+"""What a run's folder says beside its results: which answers a folder of predictions lacks, and why a file cannot be
+written."""
+
+import contextlib
+import errno
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from unirender.errors import UnirenderError
+from unirender.files import replace_file
+from unirender_evaluation.rows import Row
+from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.tasks import PROTOCOLS, tasks
+
+MISSING = "missing.txt"
+TO_DO = {
+    errno.ENOSPC: "free space",
+    errno.EDQUOT: "free space",
+    errno.EROFS: "make it writable",
+    errno.EACCES: "make it writable",
+}
+
+
+@contextlib.contextmanager
+def writing_run(folder: Path) -> Iterator[None]:
+    """For a block that writes a run's folder.
+
+    Raises:
+        UnirenderError: the folder is full or not writable any more; other errors come as they are.
+    """
+    try:
+        yield
+    except OSError as error:
+        path = Path(error.filename) if isinstance(error.filename, str) else folder
+        if error.errno not in TO_DO or not path.absolute().is_relative_to(folder.absolute()):
+            raise
+        raise UnirenderError(
+            f"cannot write {path}: {error.strerror}; {TO_DO[error.errno]}, the same command continues"
+        ) from error
+
+
+def missing_answers(suite: Suite, rows: Sequence[Row], scenes: list[Scene]) -> dict[str, tuple[list[str], int]]:
+    """Of each row that is a folder, by its label: the questions without an answer, and how many the run has."""
+    folders = [(row.info.label, row.predictions) for row in rows if row.predictions is not None]
+    every = [task for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if folders else []
+    return {
+        label: ([task.identity for task in every if not predictions.has(task)], len(every))
+        for label, predictions in folders
+    }
+
+
+def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None]) -> None:
+    """Writes the questions without an answer as `missing.txt`, a line each, and says how many have one."""
+    if not missing:
+        (folder / MISSING).unlink(missing_ok=True)
+        return
+    lines = [f"{label}: {question}\n" for label, (questions, _) in missing.items() for question in questions]
+    replace_file(folder / MISSING, "".join(lines))
+    for label, (questions, asked) in missing.items():
+        listed = f"; the others: {folder / MISSING}" if questions else ""
+        say(f"{label}: answers {asked - len(questions)} of {asked} questions{listed}")

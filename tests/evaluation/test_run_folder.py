@@ -1,0 +1,51 @@
+"""What a run's folder says beside its results: which answers are missing, and why a file cannot be written."""
+
+import errno
+from pathlib import Path
+
+import pytest
+from tiny_suites import make_suite
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.methods import UneditedInput
+from unirender_evaluation.rows import make_row, prediction_rows
+from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
+
+
+def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
+    suite = make_suite(tmp_path / "suite", objects=1)
+    scene = suite.scenes[0]
+    folder = tmp_path / "mine" / f"{scene.key}_m050_r050"
+    folder.mkdir(parents=True)
+    for name in ("edit_m100_r050.png", "environment.exr"):
+        (folder / name).write_bytes(b"")  # whether one is there, not what is in it
+    rows = [make_row(UneditedInput(), "trivial"), *prediction_rows({"mine": tmp_path / "mine"})]
+    missing = missing_answers(suite, rows, [scene])
+    questions, asked = missing["mine"]
+    assert missing.keys() == {"mine"}
+    assert len(questions) == asked - 2
+    said: list[str] = []
+    write_missing(tmp_path, missing, said.append)
+    assert said == [f"mine: answers 2 of {asked} questions; the others: {tmp_path / 'missing.txt'}"]
+    lines = (tmp_path / "missing.txt").read_text().splitlines()
+    assert lines == [f"mine: {question}" for question in questions]
+    assert not any("m100_r050" in line for line in lines if line.startswith("mine: rendering/from-image/"))
+    write_missing(tmp_path, {}, said.append)
+    assert not (tmp_path / "missing.txt").exists(), "that of an earlier run says nothing of this one"
+
+
+@pytest.mark.parametrize(
+    ("number", "to_do"),
+    [(errno.ENOSPC, "free space"), (errno.EDQUOT, "free space"), (errno.EROFS, "make it writable")],
+)
+def test_a_full_disk_is_said(tmp_path: Path, number: int, to_do: str) -> None:
+    for named, shown in ((None, tmp_path), (str(tmp_path / "run.json"), tmp_path / "run.json")):
+        said = f"cannot write {shown}: reason; {to_do}, the same command continues"
+        with pytest.raises(UnirenderError, match=said), writing_run(tmp_path):
+            raise OSError(number, "reason", named)
+
+
+def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
+    for error in (OSError(errno.EIO, "reason"), PermissionError(errno.EACCES, "reason", "/elsewhere"), ValueError()):
+        with pytest.raises(type(error)), writing_run(tmp_path):
+            raise error
