@@ -162,8 +162,8 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
         raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
-    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    return np.asarray(image.convert(mode), dtype=np.float32) / 255
 
 
 def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:

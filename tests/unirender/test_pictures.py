@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
@@ -34,6 +34,17 @@ def test_alpha_becomes_the_mask_and_palettes_are_understood(tmp_path: Path) -> N
     np.testing.assert_array_equal(np.round(mask[..., 0] * 255), rgba[..., 3])
     Image.fromarray(rgba[..., :3]).convert("P").save(tmp_path / "p.png")
     assert read_picture(tmp_path / "p.png").image_srgb.shape == (4, 4, 3)
+
+
+def test_a_palette_of_rgba_keeps_its_alpha() -> None:
+    rgba = Image.new("RGBA", (12, 10), (200, 100, 9, 0))
+    rgba.paste((200, 100, 9, 255), (3, 2, 9, 8))
+    palette = rgba.quantize(8, method=Image.Quantize.FASTOCTREE)
+    assert palette.mode == "P"
+    assert "transparency" not in palette.info
+    np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
+    palette.info["icc_profile"] = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
 
 
 def test_sixteen_bit_grey(tmp_path: Path) -> None:
