@@ -15,6 +15,7 @@ from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light
+from unirender.commands import missing_maps
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
@@ -130,7 +131,9 @@ def test_a_picture_that_was_written_here_brings_its_camera(
 def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path: Path) -> None:
     assert run("decompose", ball, "--output", tmp_path / "maps") == 0
     maps = read_result(tmp_path / "maps")
-    bare = intrinsics_channels(maps.replace(mask=None, environment=None, specular=None, diffuse=None))
+    assert maps.normal is not None
+    everywhere = maps.replace(normal=np.where(maps.normal.any(axis=-1, keepdims=True), maps.normal, [0, 0, 1]))
+    bare = intrinsics_channels(everywhere.replace(mask=None, environment=None, specular=None, diffuse=None))
     write_exr(tmp_path / "bare.exr", bare)
     lights = {"dim": 0.2, "bright": 0.9}
     for name, value in lights.items():
@@ -142,6 +145,60 @@ def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path
     means = [np.array(Image.open(tmp_path / name / "image.png"))[inside, :3].mean() for name in lights]
     assert means[0] < 0.7 * means[1]
     assert (read_result(tmp_path / "dim").require("mask")["mask"] == 1).all()  # the whole frame
+
+
+def test_render_says_which_maps_it_was_not_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    normal, mask, _ = gutter()
+    inside = (np.arange(normal.shape[1]) > 5)[:, None]
+    normal, mask = normal * inside, mask * inside
+    light = np.ones((16, 32, 3), np.float32)
+    maps = as_maps(normal, mask).replace(albedo=np.full(normal.shape, 0.5, np.float32), metallic=0 * mask)
+    ready = under_light(maps, light, "keep")
+    imagined = "maps that are missing: the network imagines"
+    where = "the mask is where the normal is not 0"
+    for given, new_light, words, facts in [
+        (ready, False, "", ([], [], None)),
+        (
+            ready.replace(diffuse=None),
+            False,
+            "maps that are missing: diffuse follows from the",
+            ([], ["diffuse"], None),
+        ),
+        (
+            ready.replace(albedo=None, specular=None, environment=None, mask=None),
+            False,
+            f"{imagined} albedo, specular, environment; {where}\n",
+            (["albedo", "specular", "environment"], [], "normal"),
+        ),
+        (maps, True, "", ([], ["specular", "diffuse"], None)),
+        (
+            maps.replace(albedo=None, normal=np.ones_like(normal) / 2, mask=None),
+            True,
+            f"{imagined} albedo; the mask is the whole frame\n",
+            (["albedo"], ["specular", "diffuse"], "frame"),
+        ),
+    ]:
+        found = missing_maps(given, new_light)
+        lines = capsys.readouterr().err
+        assert words in lines
+        assert bool(lines) == bool(words)
+        assert (found["imagined"], found["derived"], found.get("mask_from")) == facts
+    write_exr(tmp_path / "maps.exr", intrinsics_channels(maps.replace(mask=None)))
+    assert run("render", tmp_path / "maps.exr", "--output", tmp_path / "out") == 0
+    assert f"{imagined} specular, diffuse, environment; {where}\n" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "meta.json").read_text())["mask_from"] == "normal"
+    np.testing.assert_array_equal(read_result(tmp_path / "out").require("mask")["mask"], mask)
+
+
+def test_render_says_where_normals_face_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    normal, mask, _ = gutter()
+    maps = as_maps(normal, mask).replace(metallic=0 * mask)
+    for sign in (1, -1):
+        turned = maps.replace(normal=normal * np.array([1, 1, sign], np.float32))
+        write_exr(tmp_path / "maps.exr", intrinsics_channels(turned))
+        assert run("render", tmp_path / "maps.exr", "--output", tmp_path / "out", "--overwrite") == 0
+        assert ("normals face away from the camera" in capsys.readouterr().err) == (sign < 0)
+        assert (json.loads((tmp_path / "out" / "meta.json").read_text())["facing_away"] > 0.2) == (sign < 0)
 
 
 def test_render_draws_what_the_object_reflects_and_keeps_direct_light(tmp_path: Path) -> None:
@@ -245,7 +302,10 @@ def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, caps
     assert run("edit", ball, "--looks", "2", "--metallic", "1", "--output", tmp_path / "edited") == 0
     assert json.loads((tmp_path / "edited" / "meta.json").read_text())["looks"] == 2
     capsys.readouterr()
-    for arguments, message in ((("--looks", "13"), "looks: got 13"), (("--looks", "2", "--samples", "2"), "mode sample")):
+    for arguments, message in (
+        (("--looks", "13"), "looks: got 13"),
+        (("--looks", "2", "--samples", "2"), "mode sample"),
+    ):
         assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "none").exists()

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 MAX_STOPS = 32
 MUCH_COARSE = 0.05  # share of the object, from which a notice is due
+MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
+IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
 
 ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a light file
 
@@ -166,13 +168,14 @@ class Render:
         intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
+            meta |= missing_maps(intrinsics, self.environment is not None)
+            intrinsics = with_mask(intrinsics)
+            meta |= normals_away(intrinsics)
             if self.environment is not None:
                 light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
                 exposure = "auto" if self.exposure is None else "keep"
-                intrinsics = under_light(with_mask(intrinsics), light, exposure, shadows=self.shadows)
+                intrinsics = under_light(intrinsics, light, exposure, shadows=self.shadows)
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
-            if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
-                notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
             of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
@@ -304,6 +307,50 @@ def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[st
     """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
     found = pipeline.overflow(intrinsics)
     return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
+
+
+def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
+    """For `meta.json`: which maps a rendering gets from elsewhere than what is given; a notice where nobody asked.
+
+    Args:
+        intrinsics: as they are given.
+        new_light: whether a light beside them takes the place of their specular, diffuse and environment.
+    """
+    from unirender.pipelines.inputs import DERIVABLE, to_derive, with_mask
+
+    derived = DERIVABLE if new_light else tuple(name for name in DERIVABLE if name in to_derive(intrinsics))
+    lit = (*DERIVABLE, "environment") if new_light else derived
+    imagined = [name for name in IMAGINED if name not in (*intrinsics.present, *lit)]
+    facts: dict[str, Any] = {"imagined": imagined, "derived": list(derived)}
+    said = [f"the network imagines {', '.join(imagined)}"] if imagined else []
+    if derived and not new_light:
+        said.append(f"{', '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
+    if intrinsics.mask is None:
+        whole = bool(with_mask(intrinsics).require("mask")["mask"].all())
+        facts["mask_from"] = "frame" if whole else "normal"
+        said.append("the mask is the whole frame" if whole else "the mask is where the normal is not 0")
+    if said:
+        notice(f"maps that are missing: {'; '.join(said)}")
+    return facts
+
+
+def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
+    """For `meta.json`: the share of the covered normals that face away from the camera; a notice where there are many.
+
+    Args:
+        intrinsics: with a mask.
+    """
+    from unirender.pipelines.inputs import facing_away
+
+    if intrinsics.normal is None:  # what needs it says so
+        return {}
+    share = facing_away(intrinsics)
+    if share > MANY_AWAY:
+        notice(
+            f"{share:.0%} of the object's normals face away from the camera: expected camera axes, +z towards the "
+            "viewer; maps of other axes have to be turned"
+        )
+    return {"facing_away": share}
 
 
 def check_looks(looks: int, mode: str) -> None:

@@ -185,10 +185,20 @@ def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: 
 
 
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:
-    """The intrinsics with a mask: the whole frame where none is known."""
+    """The intrinsics with a mask: where none is known, the surface that has a normal, else the whole frame."""
     if intrinsics.mask is not None:
         return intrinsics
-    return intrinsics.replace(mask=np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32))
+    surface = np.zeros(0) if intrinsics.normal is None else intrinsics.normal.any(axis=-1, keepdims=True)
+    if not surface.any():
+        surface = np.ones((intrinsics.height, intrinsics.width, 1))
+    return intrinsics.replace(mask=surface.astype(np.float32))
+
+
+def facing_away(intrinsics: Intrinsics) -> float:
+    """Share of the coverage whose normals face away from the camera; normal and mask have to be known."""
+    maps = intrinsics.require("normal", "mask")
+    towards = (maps["normal"] * intrinsics.camera.rays(intrinsics.height, intrinsics.width)).sum(axis=-1)
+    return float((maps["mask"][..., 0] * (towards > 0)).sum() / max(float(maps["mask"].sum()), 1.0))
 
 
 def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:

@@ -252,8 +252,8 @@ class UniRenderPipeline(DiffusionPipeline):
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
-                missing, and a missing mask is the whole frame. Missing s and d are derived from the environment where
-                it is given.
+                missing. A missing mask is where the normal is not 0 (the whole frame where it is 0 nowhere); missing s
+                and d are derived from the environment where it is given.
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
