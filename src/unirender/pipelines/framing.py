@@ -22,6 +22,7 @@ SMALL = 2 / 3  # an object whose square has at most this share of the picture's 
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage that is not looked for when an object is cut out
+THUMBNAIL_SIDE = 32  # pixels
 MOST_LEFT_OUT = 0.01  # of all coverage: haze of a matte, whose maps nobody needs
 
 
@@ -174,6 +175,12 @@ def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[
     """Bilinear, with an antialiasing support where it shrinks."""
     tensor = torch.from_numpy(np.ascontiguousarray(picture, dtype=np.float32)).permute(2, 0, 1)[None]
     return F.interpolate(tensor, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0).numpy()
+
+
+def thumbnail(picture: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "th tw 3"]:
+    """The display values of what is covered, at most `THUMBNAIL_SIDE` pixels a side."""
+    height, width = (min(length, THUMBNAIL_SIDE) for length in mask.shape[:2])
+    return resize(picture * mask, (height, width))
 
 
 def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:

@@ -14,6 +14,7 @@ from unirender.pictures import coverage, display_colors, display_values
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import constant_map
+from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.results import Decomposition
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
@@ -21,6 +22,7 @@ DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
+PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
 TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True}  # of `decompose` alone, and their defaults
 
 
@@ -144,16 +146,19 @@ def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
         raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
 
 
-def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: Mapping[str, Any]) -> None:
+def check_decomposition(
+    found: Any, picture: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], settings: Mapping[str, Any]
+) -> None:
     """Looks at a decomposition that is handed in beside a picture, instead of one being made of it.
 
     Args:
         found: that decomposition.
+        picture: display values.
         mask: of the picture.
         settings: of the call; those of how a picture is taken apart have no effect here, and are refused.
 
     Raises:
-        UnirenderError: it is no `Decomposition`, of another size or mask, or a setting would have no effect.
+        UnirenderError: it is no `Decomposition`, of another size, mask or picture, or a setting would have no effect.
     """
     if not isinstance(found, Decomposition):
         raise UnirenderError(
@@ -171,6 +176,13 @@ def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: 
             f"decomposition: its mask differs from this one by up to {furthest:.2g}, expected the same; leave it out, "
             "or decompose the picture with this mask"
         )
+    if found.thumbnail is not None:
+        apart = float(np.abs(thumbnail(picture, mask) - found.thumbnail).max())
+        if apart > PICTURE_TOLERANCE:
+            raise UnirenderError(
+                f"decomposition: is of another picture, whose display values differ from this one's by {apart:.2g} and "
+                "more, expected the same picture; leave it out, or decompose this picture"
+            )
     if (camera := settings.get("camera")) not in (None, found.intrinsics.camera):
         raise UnirenderError(
             f"camera: got {camera}, expected {found.intrinsics.camera}, with which the decomposition was made; leave "

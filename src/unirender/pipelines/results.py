@@ -30,6 +30,7 @@ class Decomposition:
             a mean in log radiance, and so darker than s and d say. None: it is the light of `intrinsics`.
         agreeing_light: the light that `intrinsics` got in its place. Where you have put another one there, that one
             counts (`with_network_light`).
+        thumbnail: of the picture (`unirender.pipelines.framing.thumbnail`), by which it is known again; None: not known.
     """
 
     intrinsics: Intrinsics
@@ -39,6 +40,7 @@ class Decomposition:
     samples: tuple[Intrinsics, ...] = ()
     network_light: Float[np.ndarray, "eh ew 3"] | None = None
     agreeing_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
+    thumbnail: Float[np.ndarray, "th tw 3"] | None = field(default=None, repr=False)
 
     @property
     def with_network_light(self) -> Intrinsics:
