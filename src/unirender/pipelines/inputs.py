@@ -66,7 +66,9 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
         raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
     mask = _checked("mask", mask, "divide an 8-bit mask by 255")
     if not (mask > 0.5).any():  # as `unirender.exposure` asks
-        raise UnirenderError("mask: no pixel is covered by more than one half, expected an object in view")
+        raise UnirenderError(
+            f"mask: no pixel is covered by more than one half, the most by {mask.max():.3g}, expected an object in view"
+        )
     return mask
 
 
