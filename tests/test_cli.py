@@ -65,6 +65,7 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
     meta = json.loads((tmp_path / "out" / "meta.json").read_text())
     assert (meta["fov_deg"], meta["mode"], meta["steps"], meta["seed"]) == (36, "mean", 1, 0)
     assert 0 < meta["clipped"] < 0.05  # the highlight
+    assert meta["remarks"] == {"camera": "field of view not given: 36 degrees assumed (--fov)"}
     for name in ("intrinsics.exr", "environment.exr"):
         _, header = read_exr(tmp_path / "out" / name)
         expected = {"input": "ball.png", "mode": "mean", "seed": "0", "camera": "fov_deg=36 principal=0.5,0.5"}
@@ -131,9 +132,7 @@ def test_a_picture_that_was_written_here_brings_its_camera(
 def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path: Path) -> None:
     assert run("decompose", ball, "--output", tmp_path / "maps") == 0
     maps = read_result(tmp_path / "maps")
-    assert maps.normal is not None
-    everywhere = maps.replace(normal=np.where(maps.normal.any(axis=-1, keepdims=True), maps.normal, [0, 0, 1]))
-    bare = intrinsics_channels(everywhere.replace(mask=None, environment=None, specular=None, diffuse=None))
+    bare = intrinsics_channels(maps.replace(mask=None, environment=None, specular=None, diffuse=None))
     write_exr(tmp_path / "bare.exr", bare)
     lights = {"dim": 0.2, "bright": 0.9}
     for name, value in lights.items():
@@ -141,10 +140,10 @@ def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path
         arguments = ("--environment", tmp_path / f"{name}.exr", "--exposure", "0", "--output", tmp_path / name)
         assert run("render", tmp_path / "bare.exr", *arguments) == 0
     assert run("render", tmp_path / "bare.exr", "--output", tmp_path / "none") == 0
-    inside = maps.require("mask")["mask"][..., 0] == 1
-    means = [np.array(Image.open(tmp_path / name / "image.png"))[inside, :3].mean() for name in lights]
+    inside = maps.require("mask")["mask"] == 1
+    means = [np.array(Image.open(tmp_path / name / "image.png"))[inside[..., 0], :3].mean() for name in lights]
     assert means[0] < 0.7 * means[1]
-    assert (read_result(tmp_path / "dim").require("mask")["mask"] == 1).all()  # the whole frame
+    np.testing.assert_array_equal(read_result(tmp_path / "dim").require("mask")["mask"], inside)  # by the normals
 
 
 def test_render_says_which_maps_it_was_not_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -351,6 +350,25 @@ def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert run(*arguments, "--steps", "3") == 1
     assert "0 pictures (0 of them from before), 5 failed" in capsys.readouterr().out
     assert (tmp_path / "out" / "summary.json").read_bytes() == before
+
+
+def test_a_folder_says_which_picture_and_which_option(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    Image.open(ball).resize((75, 50)).save(tmp_path / "in" / "a.png")
+    Image.new("RGB", (4, 4)).save(tmp_path / "in" / "b.png")
+    assert run("decompose", tmp_path / "in", "--output", tmp_path / "out") == 1
+    assert "in/b.png: image: got (4, 4) pixels" in capsys.readouterr().err
+    assert run("decompose", tmp_path / "in", "--mask", tmp_path / "nowhere", "--output", tmp_path / "other") == 1
+    lines = capsys.readouterr().err
+    assert lines.count("error") == 1
+    assert f"--mask {tmp_path / 'nowhere'}: no such file or folder" in lines
+    assert not (tmp_path / "other").exists()
+    assert run("render", tmp_path / "out", "--output", tmp_path / "other") == 1
+    assert "name one of the folders inside, like" in capsys.readouterr().err
+    assert run("decompose", tmp_path / "out" / "a.png", "--output", tmp_path / "other") == 1
+    assert "`unirender render`" in capsys.readouterr().err
 
 
 def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], str]]:

@@ -56,7 +56,7 @@ class Decompose:
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import folder_beside, new_folder
-        from unirender.folders import write_decomposition
+        from unirender.folders import of_picture, write_decomposition
         from unirender.scene_export import write_scene
 
         self.model.check()
@@ -75,7 +75,7 @@ class Decompose:
             pipeline, sampling = self.model.load(), self.model.sampling()
             options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
             result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
-            meta = {"command": "decompose", "input": self.input.picture, "clipped": picture.clipped}
+            meta = {"command": "decompose", "input": self.input.picture, **of_picture(picture)}
             meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
             if scene is not None:
                 write_scene(scene, result.intrinsics, meta)
@@ -84,13 +84,18 @@ class Decompose:
 
     def _run_folder(self) -> int:
         """Returns the exit status: 1 where a picture failed."""
-        from unirender.folders import SUMMARY_FILE, decompose_folder, list_pictures, write_summary
+        from unirender.files import SUMMARY_FILE
+        from unirender.folders import decompose_folder, list_pictures, write_summary
         from unirender.frames import temporal_difference
         from unirender.pipelines.inputs import as_picture
 
         source, output = self.input.picture, self.out.output
         if self.export is not None:
             raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
+        if self.input.mask is not None and not self.input.mask.exists():
+            raise UnirenderError(
+                f"--mask {self.input.mask}: no such file or folder, expected a picture or a folder of them"
+            )
         pictures = list_pictures(source)
         pipeline, sampling = self.model.load(), self.model.sampling()
         options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
@@ -99,10 +104,14 @@ class Decompose:
 
         def read(path: Path, mask: Path | None) -> "Picture":
             picture, said = read_input(path, mask)
-            as_picture(picture.image_srgb, picture.mask)  # what the network would refuse is refused here, by itself
-            for kind, remark in (said | self.model.camera_remarks(picture)).items():
+            try:  # what the network would refuse is refused here, by itself
+                as_picture(picture.image_srgb, picture.mask)
+            except UnirenderError as error:
+                raise UnirenderError(f"{path}: {error}") from error
+            said |= self.model.camera_remarks(picture)
+            for kind, remark in said.items():
                 remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
-            return picture
+            return dataclasses.replace(picture, remarks=said)
 
         def decompose(batch: list["Picture"]) -> list["Decomposition"]:
             images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
@@ -213,6 +222,7 @@ class Edit:
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, write_result
+        from unirender.folders import of_picture
 
         self.model.check()
         check_looks(self.looks, self.model.mode)
@@ -227,7 +237,7 @@ class Edit:
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
-            meta = {"command": "edit", "input": self.input.picture, "clipped": picture.clipped, **change, **options}
+            meta = {"command": "edit", "input": self.input.picture, **of_picture(picture), **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
             meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
@@ -266,6 +276,7 @@ class Relight:
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, write_result
+        from unirender.folders import of_picture
 
         self.model.check()
         check_looks(self.looks, self.model.mode)
@@ -285,7 +296,7 @@ class Relight:
                 **options,
                 **sampling,
             )
-            meta = {"command": "relight", "input": self.input.picture, "clipped": picture.clipped, **options}
+            meta = {"command": "relight", "input": self.input.picture, **of_picture(picture), **options}
             meta |= {"light": self.environment, "exposure_stops": self.exposure, **self.model.provenance(pipeline)}
             meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)

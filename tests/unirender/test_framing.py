@@ -1,6 +1,7 @@
 """How a picture of any size comes into the network's square: small objects are cut out."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,8 @@ def test_what_is_left_out_is_no_part_of_the_object() -> None:
     stray[0, 0] = 1
     picture = np.full((128, 128, 3), 0.5, np.float32)
     pipeline = make_pipeline()
-    for settings in ({}, {"tile": True, "size": 32}, {"material": "map"}):
+    ways: list[dict[str, Any]] = [{}, {"tile": True, "size": 32}, {"material": "map"}]
+    for settings in ways:
         clean = pipeline.decompose(picture, mask, **settings)
         for given, tolerance in ((stray, 1e-6), (haze, 0.1)):  # haze in the square adds some background to what is seen
             found = pipeline.decompose(picture, given, **settings)
