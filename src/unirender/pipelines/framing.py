@@ -24,8 +24,8 @@ FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
 STRAY = 0.005  # of what counts: parts of the mask that together hold less are not looked for
-THUMBNAIL_SIDE = 32  # pixels
 MOST_LEFT_OUT = 0.01  # of what counts, whose maps nobody needs
+THUMBNAIL_SIDE = 32  # pixels
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,9 @@ def visible_parts(visible: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w"
     Args:
         visible: coverage, 0 where it does not count. Pixels that touch, also at a corner, are one part.
     """
-    parts, count = label(visible[..., 0] > 0, structure=np.ones((3, 3)))
+    parts = np.zeros(visible.shape[:2], np.int32)
+    label(visible[..., 0] > 0, structure=np.ones((3, 3)), output=parts)
+    count = int(parts.max())
     coverage = np.bincount(parts.ravel(), weights=visible.ravel(), minlength=count + 1)
     order = np.argsort(coverage[1:]) + 1
     kept = np.arange(count + 1) > 0  # 0 is what is not covered
