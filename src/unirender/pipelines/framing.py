@@ -62,10 +62,11 @@ class Frame:
         if whole.identity:
             return whole
         visible = np.where(mask > FAINT, mask, 0)
-        rows, columns = (np.flatnonzero(visible_parts(visible).any(axis=axis)) for axis in (1, 0))
-        if not len(rows):
+        if not visible.any() or least_extent(visible) > FILL * SMALL * whole.side:  # saves large pictures time
             return whole
-        (top, bottom), (left, right) = ((int(seen[0]), int(seen[-1]) + 1) for seen in (rows, columns))
+        first_row, end_row, first_column, end_column = _box(visible[..., 0] > 0)
+        seen = visible_parts(visible[first_row:end_row, first_column:end_column])
+        top, bottom, left, right = np.add(_box(seen), (first_row, first_row, first_column, first_column)).tolist()
         side = max(math.ceil(max(bottom - top, right - left) / FILL), LEAST_CUT)
         if side > SMALL * whole.side:
             return whole
@@ -178,6 +179,22 @@ def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[
     """Bilinear, with an antialiasing support where it shrinks."""
     tensor = torch.from_numpy(np.ascontiguousarray(picture, dtype=np.float32)).permute(2, 0, 1)[None]
     return F.interpolate(tensor, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0).numpy()
+
+
+def _box(seen: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
+    """First row, end row, first column and end column of what is seen, which is something."""
+    rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+def least_extent(visible: Float[np.ndarray, "h w 1"]) -> int:
+    """Longer side of a box, pixels, that no box is smaller than that leaves out less than `STRAY` of the coverage."""
+    sides = []
+    for axis in (1, 0):
+        sums = np.cumsum(visible[..., 0].sum(axis=axis, dtype=np.float64))
+        first, last = np.searchsorted(sums, (STRAY * sums[-1], (1 - STRAY) * sums[-1]))
+        sides.append(int(last - first) + 1)
+    return max(sides)
 
 
 def visible_parts(visible: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w"]:
