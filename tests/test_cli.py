@@ -15,6 +15,7 @@ from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light
+from unirender.commands import missing_maps
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import checkpoint_sha256, read_result
 from unirender.intrinsics import Intrinsics
@@ -64,6 +65,7 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
     meta = json.loads((tmp_path / "out" / "meta.json").read_text())
     assert (meta["fov_deg"], meta["mode"], meta["steps"], meta["seed"]) == (36, "mean", 1, 0)
     assert 0 < meta["clipped"] < 0.05  # the highlight
+    assert meta["remarks"] == {"camera": "field of view not given: 36 degrees assumed (--fov)"}
     for name in ("intrinsics.exr", "environment.exr"):
         _, header = read_exr(tmp_path / "out" / name)
         expected = {"input": "ball.png", "mode": "mean", "seed": "0", "camera": "fov_deg=36 principal=0.5,0.5"}
@@ -138,10 +140,64 @@ def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path
         arguments = ("--environment", tmp_path / f"{name}.exr", "--exposure", "0", "--output", tmp_path / name)
         assert run("render", tmp_path / "bare.exr", *arguments) == 0
     assert run("render", tmp_path / "bare.exr", "--output", tmp_path / "none") == 0
-    inside = maps.require("mask")["mask"][..., 0] == 1
-    means = [np.array(Image.open(tmp_path / name / "image.png"))[inside, :3].mean() for name in lights]
+    inside = maps.require("mask")["mask"] == 1
+    means = [np.array(Image.open(tmp_path / name / "image.png"))[inside[..., 0], :3].mean() for name in lights]
     assert means[0] < 0.7 * means[1]
-    assert (read_result(tmp_path / "dim").require("mask")["mask"] == 1).all()  # the whole frame
+    np.testing.assert_array_equal(read_result(tmp_path / "dim").require("mask")["mask"], inside)  # by the normals
+
+
+def test_render_says_which_maps_it_was_not_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    normal, mask, _ = gutter()
+    inside = (np.arange(normal.shape[1]) > 5)[:, None]
+    normal, mask = normal * inside, mask * inside
+    light = np.ones((16, 32, 3), np.float32)
+    maps = as_maps(normal, mask).replace(albedo=np.full(normal.shape, 0.5, np.float32), metallic=0 * mask)
+    ready = under_light(maps, light, "keep")
+    imagined = "maps that are missing: the network imagines"
+    where = "the mask is where the normal is not 0"
+    for given, new_light, words, facts in [
+        (ready, False, "", ([], [], None)),
+        (
+            ready.replace(diffuse=None),
+            False,
+            "maps that are missing: diffuse follows from the",
+            ([], ["diffuse"], None),
+        ),
+        (
+            ready.replace(albedo=None, specular=None, environment=None, mask=None),
+            False,
+            f"{imagined} albedo, specular, environment; {where}\n",
+            (["albedo", "specular", "environment"], [], "normal"),
+        ),
+        (maps, True, "", ([], ["specular", "diffuse"], None)),
+        (
+            maps.replace(albedo=None, normal=np.ones_like(normal) / 2, mask=None),
+            True,
+            f"{imagined} albedo; the mask is the whole frame\n",
+            (["albedo"], ["specular", "diffuse"], "frame"),
+        ),
+    ]:
+        found = missing_maps(given, new_light)
+        lines = capsys.readouterr().err
+        assert words in lines
+        assert bool(lines) == bool(words)
+        assert (found["imagined"], found["derived"], found.get("mask_from")) == facts
+    write_exr(tmp_path / "maps.exr", intrinsics_channels(maps.replace(mask=None)))
+    assert run("render", tmp_path / "maps.exr", "--output", tmp_path / "out") == 0
+    assert f"{imagined} specular, diffuse, environment; {where}\n" in capsys.readouterr().err
+    assert json.loads((tmp_path / "out" / "meta.json").read_text())["mask_from"] == "normal"
+    np.testing.assert_array_equal(read_result(tmp_path / "out").require("mask")["mask"], mask)
+
+
+def test_render_says_where_normals_face_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    normal, mask, _ = gutter()
+    maps = as_maps(normal, mask).replace(metallic=0 * mask)
+    for sign in (1, -1):
+        turned = maps.replace(normal=normal * np.array([1, 1, sign], np.float32))
+        write_exr(tmp_path / "maps.exr", intrinsics_channels(turned))
+        assert run("render", tmp_path / "maps.exr", "--output", tmp_path / "out", "--overwrite") == 0
+        assert ("normals face away from the camera" in capsys.readouterr().err) == (sign < 0)
+        assert (json.loads((tmp_path / "out" / "meta.json").read_text())["facing_away"] > 0.2) == (sign < 0)
 
 
 def test_render_draws_what_the_object_reflects_and_keeps_direct_light(tmp_path: Path) -> None:
@@ -245,7 +301,10 @@ def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, caps
     assert run("edit", ball, "--looks", "2", "--metallic", "1", "--output", tmp_path / "edited") == 0
     assert json.loads((tmp_path / "edited" / "meta.json").read_text())["looks"] == 2
     capsys.readouterr()
-    for arguments, message in ((("--looks", "13"), "looks: got 13"), (("--looks", "2", "--samples", "2"), "mode sample")):
+    for arguments, message in (
+        (("--looks", "13"), "looks: got 13"),
+        (("--looks", "2", "--samples", "2"), "mode sample"),
+    ):
         assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "none").exists()
@@ -291,6 +350,25 @@ def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert run(*arguments, "--steps", "3") == 1
     assert "0 pictures (0 of them from before), 5 failed" in capsys.readouterr().out
     assert (tmp_path / "out" / "summary.json").read_bytes() == before
+
+
+def test_a_folder_says_which_picture_and_which_option(
+    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "in").mkdir()
+    Image.open(ball).resize((75, 50)).save(tmp_path / "in" / "a.png")
+    Image.new("RGB", (4, 4)).save(tmp_path / "in" / "b.png")
+    assert run("decompose", tmp_path / "in", "--output", tmp_path / "out") == 1
+    assert "in/b.png: image: got (4, 4) pixels" in capsys.readouterr().err
+    assert run("decompose", tmp_path / "in", "--mask", tmp_path / "nowhere", "--output", tmp_path / "other") == 1
+    lines = capsys.readouterr().err
+    assert lines.count("error") == 1
+    assert f"--mask {tmp_path / 'nowhere'}: no such file or folder" in lines
+    assert not (tmp_path / "other").exists()
+    assert run("render", tmp_path / "out", "--output", tmp_path / "other") == 1
+    assert "name one of the folders inside, like" in capsys.readouterr().err
+    assert run("decompose", tmp_path / "out" / "a.png", "--output", tmp_path / "other") == 1
+    assert "`unirender render`" in capsys.readouterr().err
 
 
 def bad_pictures(folder: Path, ball: Path) -> dict[str, tuple[list[str | Path], str]]:

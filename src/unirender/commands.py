@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 MAX_STOPS = 32
 MUCH_COARSE = 0.05  # share of the object, from which a notice is due
+MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
+IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
 
 ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a light file
 
@@ -54,7 +56,7 @@ class Decompose:
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import folder_beside, new_folder
-        from unirender.folders import write_decomposition
+        from unirender.folders import of_picture, write_decomposition
         from unirender.scene_export import write_scene
 
         self.model.check()
@@ -73,7 +75,7 @@ class Decompose:
             pipeline, sampling = self.model.load(), self.model.sampling()
             options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
             result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
-            meta = {"command": "decompose", "input": self.input.picture, "clipped": picture.clipped}
+            meta = {"command": "decompose", "input": self.input.picture, **of_picture(picture)}
             meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
             if scene is not None:
                 write_scene(scene, result.intrinsics, meta)
@@ -82,13 +84,18 @@ class Decompose:
 
     def _run_folder(self) -> int:
         """Returns the exit status: 1 where a picture failed."""
-        from unirender.folders import SUMMARY_FILE, decompose_folder, list_pictures, write_summary
+        from unirender.files import SUMMARY_FILE
+        from unirender.folders import decompose_folder, list_pictures, write_summary
         from unirender.frames import temporal_difference
         from unirender.pipelines.inputs import as_picture
 
         source, output = self.input.picture, self.out.output
         if self.export is not None:
             raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
+        if self.input.mask is not None and not self.input.mask.exists():
+            raise UnirenderError(
+                f"--mask {self.input.mask}: no such file or folder, expected a picture or a folder of them"
+            )
         pictures = list_pictures(source)
         pipeline, sampling = self.model.load(), self.model.sampling()
         options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
@@ -97,10 +104,14 @@ class Decompose:
 
         def read(path: Path, mask: Path | None) -> "Picture":
             picture, said = read_input(path, mask)
-            as_picture(picture.image_srgb, picture.mask)  # what the network would refuse is refused here, by itself
-            for kind, remark in (said | self.model.camera_remarks(picture)).items():
+            try:  # what the network would refuse is refused here, by itself
+                as_picture(picture.image_srgb, picture.mask)
+            except UnirenderError as error:
+                raise UnirenderError(f"{path}: {error}") from error
+            said |= self.model.camera_remarks(picture)
+            for kind, remark in said.items():
                 remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
-            return picture
+            return dataclasses.replace(picture, remarks=said)
 
         def decompose(batch: list["Picture"]) -> list["Decomposition"]:
             images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
@@ -166,13 +177,14 @@ class Render:
         intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
+            meta |= missing_maps(intrinsics, self.environment is not None)
+            intrinsics = with_mask(intrinsics)
+            meta |= normals_away(intrinsics)
             if self.environment is not None:
                 light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
                 exposure = "auto" if self.exposure is None else "keep"
-                intrinsics = under_light(with_mask(intrinsics), light, exposure, shadows=self.shadows)
+                intrinsics = under_light(intrinsics, light, exposure, shadows=self.shadows)
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
-            if not {"specular", "diffuse", "environment"} & set(intrinsics.present):
-                notice("the maps have no light (no specular, diffuse or environment): the network imagines one")
             of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
@@ -210,6 +222,7 @@ class Edit:
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, write_result
+        from unirender.folders import of_picture
 
         self.model.check()
         check_looks(self.looks, self.model.mode)
@@ -224,7 +237,7 @@ class Edit:
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
-            meta = {"command": "edit", "input": self.input.picture, "clipped": picture.clipped, **change, **options}
+            meta = {"command": "edit", "input": self.input.picture, **of_picture(picture), **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
             meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
@@ -263,6 +276,7 @@ class Relight:
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, write_result
+        from unirender.folders import of_picture
 
         self.model.check()
         check_looks(self.looks, self.model.mode)
@@ -282,7 +296,7 @@ class Relight:
                 **options,
                 **sampling,
             )
-            meta = {"command": "relight", "input": self.input.picture, "clipped": picture.clipped, **options}
+            meta = {"command": "relight", "input": self.input.picture, **of_picture(picture), **options}
             meta |= {"light": self.environment, "exposure_stops": self.exposure, **self.model.provenance(pipeline)}
             meta |= at_white(result.image_linear, result.intrinsics.mask)
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
@@ -304,6 +318,50 @@ def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[st
     """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
     found = pipeline.overflow(intrinsics)
     return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
+
+
+def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
+    """For `meta.json`: which maps a rendering gets from elsewhere than what is given; a notice where nobody asked.
+
+    Args:
+        intrinsics: as they are given.
+        new_light: whether a light beside them takes the place of their specular, diffuse and environment.
+    """
+    from unirender.pipelines.inputs import DERIVABLE, to_derive, with_mask
+
+    derived = DERIVABLE if new_light else tuple(name for name in DERIVABLE if name in to_derive(intrinsics))
+    lit = (*DERIVABLE, "environment") if new_light else derived
+    imagined = [name for name in IMAGINED if name not in (*intrinsics.present, *lit)]
+    facts: dict[str, Any] = {"imagined": imagined, "derived": list(derived)}
+    said = [f"the network imagines {', '.join(imagined)}"] if imagined else []
+    if derived and not new_light:
+        said.append(f"{', '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
+    if intrinsics.mask is None:
+        whole = bool(with_mask(intrinsics).require("mask")["mask"].all())
+        facts["mask_from"] = "frame" if whole else "normal"
+        said.append("the mask is the whole frame" if whole else "the mask is where the normal is not 0")
+    if said:
+        notice(f"maps that are missing: {'; '.join(said)}")
+    return facts
+
+
+def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
+    """For `meta.json`: the share of the covered normals that face away from the camera; a notice where there are many.
+
+    Args:
+        intrinsics: with a mask.
+    """
+    from unirender.pipelines.inputs import facing_away
+
+    if intrinsics.normal is None:  # what needs it says so
+        return {}
+    share = facing_away(intrinsics)
+    if share > MANY_AWAY:
+        notice(
+            f"{share:.0%} of the object's normals face away from the camera: expected camera axes, +z towards the "
+            "viewer; maps of other axes have to be turned"
+        )
+    return {"facing_away": share}
 
 
 def check_looks(looks: int, mode: str) -> None:

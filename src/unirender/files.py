@@ -39,6 +39,7 @@ from unirender.exr import (
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
+SUMMARY_FILE = "summary.json"  # of a folder of results
 
 FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
 ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
@@ -52,7 +53,7 @@ logger = logging.getLogger(__name__)
 def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
 
-    Only a result folder (one with `meta.json`) is ever replaced.
+    Only a result folder (one with `meta.json`) is ever replaced, and none that others were written into.
 
     Raises:
         UsageError: `path` is the working directory or lies around it.
@@ -67,6 +68,11 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
             raise UnirenderError(f"{shown}: exists and is not empty; choose another folder or pass --overwrite")
+        if (path / SUMMARY_FILE).is_file():
+            raise UnirenderError(
+                f"{shown}: has a {SUMMARY_FILE}, so that it holds the results of a folder of pictures, expected one "
+                "result to overwrite; choose another folder"
+            )
         if not (path / META_FILE).is_file():
             raise UnirenderError(
                 f"{shown}: has no {META_FILE}, expected an earlier result to overwrite; choose another folder"
@@ -273,7 +279,11 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
     path = Path(path)
     file = path / INTRINSICS_FILE if path.is_dir() else path
     if path.is_dir() and not file.is_file():
-        raise UnirenderError(f"{path}: has no {INTRINSICS_FILE}, expected the output folder of `unirender decompose`")
+        inside = sorted(found.parent.name for found in path.glob(f"*/{INTRINSICS_FILE}"))
+        several = f": name one of the folders inside, like {path / inside[0]}" if inside else ""
+        raise UnirenderError(
+            f"{path}: has no {INTRINSICS_FILE}, expected the output folder of `unirender decompose`{several}"
+        )
     if not file.is_file() or file.suffix.lower() != ".exr":
         raise UnirenderError(f"{path}: no folder and no EXR file, expected the output of `unirender decompose`")
     channels, attributes = read_exr(file)

@@ -15,15 +15,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import META_FILE, new_folder, replace_file, write_png, write_result
+from unirender.files import (
+    ENVIRONMENT_FILE,
+    INTRINSICS_FILE,
+    META_FILE,
+    SUMMARY_FILE,
+    new_folder,
+    replace_file,
+    write_png,
+    write_result,
+)
+from unirender.intrinsics import MAPS
 from unirender.pictures import Picture
 
 if TYPE_CHECKING:
     from unirender.pipelines.results import Decomposition
 
-SUMMARY_FILE = "summary.json"
 SUFFIXES = (".bmp", ".exr", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-FIGURES = ("roughness_mean", "metallic_mean", "clipped", "std_max")  # of `meta.json`, for the summary
+RARE_SUFFIXES = (".avif", ".gif", ".j2k", ".jfif", ".jp2", ".mpo", ".pbm", ".pgm", ".pnm", ".ppm", ".qoi", ".tga")
+FIGURES = ("roughness_mean", "metallic_mean", "clipped", "remarks", "std_max")  # of `meta.json`, for the summary
+INPUT_SHA256 = "input_sha256"
 ELSEWHERE = ("device", "input")  # of `meta.json`: another machine or another path to the picture is no other setting
 AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # pictures of one batch of the network, and their pixels
 
@@ -49,13 +60,24 @@ class FolderResult:
 def list_pictures(folder: Path) -> list[Path]:
     """The pictures that lie in a folder, not in folders inside it, in natural order: `f2.png` before `f10.png`.
 
+    Links that lead nowhere are among them, so that they are listed as failed.
+
     Raises:
-        UnirenderError: there is none.
+        UnirenderError: there is none, or the folder is a result.
     """
-    found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".") and p.is_file()]
+    if (folder / META_FILE).is_file() and (folder / INTRINSICS_FILE).is_file():
+        raise UnirenderError(
+            f"{folder}: is a result, whose pictures are maps, expected a folder of pictures; see `unirender render`"
+        )
+    found = [path for path in folder.iterdir() if _is_picture(path) and not path.is_dir()]
     if not found:
         raise UnirenderError(f"{folder}: has no pictures, expected files that end in {', '.join(SUFFIXES)}")
     return sorted(found, key=lambda path: (natural_order(path.name), path.name))
+
+
+def _is_picture(path: Path) -> bool:
+    """By its name."""
+    return path.suffix.lower() in SUFFIXES + RARE_SUFFIXES and not path.name.startswith(".")
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
@@ -102,42 +124,53 @@ def decompose_folder(
 
     Raises:
         UsageError: `output` is the folder of the pictures.
-        UnirenderError: `output` cannot be made.
+        UnirenderError: `output` cannot be made, or is a result itself.
     """
+    if (output / META_FILE).is_file():
+        raise UnirenderError(
+            f"{output}: has a {META_FILE}, so that it is one result, expected a folder for several; choose another"
+        )
     if any(output.resolve() == path.resolve().parent for path in pictures):
         raise UsageError(f"{output}: is the folder of the pictures, expected another one for the results")
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
-    done = FolderResult()
+    done, damaged = FolderResult(), set[Path]()
 
     def wanted() -> Iterator[tuple[Path, Picture, dict[str, Any]]]:
         for path in pictures:
             try:
                 mask = mask_of(path, masks)
-                meta = {**settings, "input": path, "input_sha256": input_sha256(path, mask)}
+                meta = {**settings, "input": path, INPUT_SHA256: input_sha256(path, mask)}
                 if not overwrite and (figures := figures_of(output / path.name, meta)) is not None:
-                    done.figures[path.name] = figures
-                    done.kept += 1
-                    continue
+                    if not missing_files(output / path.name, figures):
+                        done.figures[path.name] = figures
+                        done.kept += 1
+                        continue
+                    damaged.add(path)
                 picture = read(path, mask)
             except UnirenderError as error:
                 done.failed[path.name] = str(error)
                 continue
-            yield path, picture, meta | {"clipped": picture.clipped}
+            yield path, picture, meta | of_picture(picture)
 
     for batch in batches(wanted()):
         results = decompose([picture for _, picture, _ in batch])
         for (path, _, meta), result in zip(batch, results, strict=True):
             try:
-                with new_folder(output / path.name, overwrite=overwrite) as folder:
+                with new_folder(output / path.name, overwrite=overwrite or path in damaged) as folder:
                     written = write_decomposition(folder, result, meta)
             except UnirenderError as error:
                 done.failed[path.name] = str(error)
             else:
                 done.figures[path.name] = {name: written[name] for name in FIGURES if name in written}
     return done
+
+
+def of_picture(picture: Picture) -> dict[str, Any]:
+    """For `meta.json`: what a picture cannot show, and what was assumed of it."""
+    return {"clipped": picture.clipped, "remarks": dict(picture.remarks)}
 
 
 def batches(
@@ -165,7 +198,7 @@ def mask_of(path: Path, masks: Path | None) -> Path | None:
     """
     if masks is None or not masks.is_dir():
         return masks
-    found = [p for p in masks.iterdir() if p.stem == path.stem and p.suffix.lower() in SUFFIXES]
+    found = [mask for mask in masks.iterdir() if mask.stem == path.stem and _is_picture(mask)]
     if len(found) != 1:
         raise UnirenderError(f"{masks}: has {len(found)} masks for {path.name}, expected one picture {path.stem}.*")
     return found[0]
@@ -199,10 +232,23 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
     now = json.loads(json.dumps(dict(meta), default=str))
     differing = [name for name, value in now.items() if name not in ELSEWHERE and stored.get(name) != value]
     if differing:
+        said = ("picture or mask (a file changed since)" if name == INPUT_SHA256 else name for name in differing)
         raise UnirenderError(
-            f"{folder}: is a result with another {', '.join(differing)}; choose another folder or pass --overwrite"
+            f"{folder}: is a result with another {', '.join(said)}; choose another folder or pass --overwrite"
         )
     return {name: stored[name] for name in FIGURES if name in stored}
+
+
+def missing_files(folder: Path, figures: Mapping[str, Any]) -> list[str]:
+    """Names of the files of a decomposition that are not in its folder, or empty there.
+
+    Args:
+        folder: of the result.
+        figures: of it, as `figures_of` gives them.
+    """
+    pictures = [*MAPS, *(f"{name}.std" for name in figures.get("std_max", ()))]
+    names = [INTRINSICS_FILE, ENVIRONMENT_FILE, *(f"{name}.png" for name in pictures)]
+    return [name for name in names if not (folder / name).is_file() or not (folder / name).stat().st_size]
 
 
 def write_summary(output: Path, result: FolderResult, facts: Mapping[str, Any]) -> None:

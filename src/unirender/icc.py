@@ -29,8 +29,7 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
         return image
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
-    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-    alpha = image.convert("RGBA").getchannel("A") if has_alpha else None
+    alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     colors = image if image.mode in ("RGB", "L", "CMYK") else image.convert(_opaque_mode(image))
     space = ""
     try:

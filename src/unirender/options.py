@@ -24,6 +24,8 @@ DType = Literal["auto", "float32", "bfloat16", "float16"]
 Sampler = Literal["ddim", "unipc"]
 
 MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
+DARK = 0.35  # display value that an object reaches at the exposures of the training data, unless it is dark itself
+FULL_COVERAGE = 0.95  # that a mask reaches on an object
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
 
 
@@ -192,15 +194,17 @@ class InputOptions:
     None: the alpha channel, else the whole frame."""
 
     def read(self, model: ModelOptions) -> tuple["Picture", "Camera"]:
-        """The picture with a mask, and its camera; notices say what was assumed, and what the picture cannot show.
+        """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the
+        picture cannot show.
 
         Raises:
             UnirenderError: an unreadable file, or a mask that does not fit.
         """
         picture, remarks = read_input(self.picture, self.mask)
-        for remark in (remarks | model.camera_remarks(picture)).values():
+        remarks |= model.camera_remarks(picture)
+        for remark in remarks.values():
             notice(remark)
-        return picture, model.camera(picture)
+        return dataclasses.replace(picture, remarks=remarks), model.camera(picture)
 
 
 def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
@@ -218,16 +222,27 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
 
     from unirender.pictures import read_mask, read_picture
 
-    remarks = {}
     picture = read_picture(path)
+    remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
     if mask is not None:
-        picture = dataclasses.replace(picture, mask=read_mask(mask, (height, width)))
+        coverage = read_mask(mask, (height, width))
+        picture = dataclasses.replace(picture, mask=coverage)
+        if coverage.min() == 1:
+            remarks["mask"] = "the mask covers the whole frame, which is taken as the object"
     elif picture.mask is None:
         remarks["mask"] = f"no mask and no alpha channel: the whole frame is taken as the object{option}"
         picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
     elif picture.mask.min() == 1:
         remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
+    assert picture.mask is not None, "the whole frame at least"
+    if (most := picture.mask.max()) < FULL_COVERAGE:
+        remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
+    if (bright := float(np.percentile(picture.image_srgb[picture.mask[..., 0] > 0.5].max(axis=-1), 99))) < DARK:
+        remarks["dark"] = (
+            f"the object is dark, 99% of it below {bright:.2f} of display white: the network was taught exposures at "
+            "which white is bright, and a darker one goes into the albedo"
+        )
     if picture.negative:
         remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"
     if picture.clipped > MANY_CLIPPED:

@@ -2,7 +2,8 @@
 
 import contextlib
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,9 @@ DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
 
+SIXTEEN_BITS = "its channels have 16 bits, of which 8 are read: save linear radiance as EXR to keep them"
+ALPHA_TOLERANCE = 1e-3  # of an EXR: half precision and filters step over [0, 1]
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -32,6 +36,7 @@ class Picture:
         name: what to call it in messages.
         negative: share of the file's radiance that was negative, and is 0 here; display formats have none.
         camera: that took it, where the header of an EXR of ours says so.
+        remarks: by kind, what was assumed of it, what was lost in reading it, and what it cannot show.
     """
 
     image_srgb: Float[np.ndarray, "h w 3"]
@@ -39,6 +44,7 @@ class Picture:
     name: str
     negative: float = 0.0
     camera: Camera | None = None
+    remarks: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def clipped(self) -> float:
@@ -48,7 +54,8 @@ class Picture:
 
 
 def read_picture(path: str | Path) -> Picture:
-    """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied).
+    """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied; `mask.Y`
+    counts where there is no `A`).
 
     Colours come in sRGB's primaries, whatever the file's ICC profile or chromaticities say.
 
@@ -104,8 +111,8 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     """
     if not (mask > 0.5).any():
         raise UnirenderError(
-            f"{name}: the mask is empty: no pixel is covered by more than half, expected white (or opaque) pixels "
-            "on the object"
+            f"{name}: the mask is empty: no pixel is covered by more than half, and the most by {mask.max():.3g}, "
+            "expected white (or opaque) pixels on the object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
 
@@ -162,8 +169,8 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
         raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
-    has_alpha = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), dtype=np.float32) / 255
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    return np.asarray(image.convert(mode), dtype=np.float32) / 255
 
 
 def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
@@ -212,7 +219,14 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
 def _read_display_picture(path: Path) -> Picture:
     pixels = display_colors(open_picture(path), str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
-    return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name)
+    remarks = {"depth": SIXTEEN_BITS} if _has_sixteen_bit_colors(path) else {}
+    return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name, remarks=remarks)
+
+
+def _has_sixteen_bit_colors(path: Path) -> bool:
+    """Whether Pillow drops half of the bits of a picture's channels, by how it would decode them."""
+    with Image.open(path) as file:
+        return not file.mode.startswith("I") and any(";16" in str(tile.args) for tile in file.tile)
 
 
 def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:
@@ -238,14 +252,17 @@ def _read_exr_picture(path: Path) -> Picture:
             f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A)"
         )
     rgb = channels_rgb(channels)
-    alpha = channels.get("A")
+    name = "A" if "A" in channels else "mask.Y"
+    alpha = channels.get(name)
     check_finite(rgb if alpha is None else np.dstack([rgb, alpha]), str(path))
     negative = negative_share(rgb, str(path))
-    mask = None
+    mask, remarks = None, {}
     if alpha is not None:
-        mask = check_mask(alpha[..., None], f"{path} (A)")
+        mask = check_mask(alpha[..., None], f"{path} ({name})")
+        if np.abs(alpha - mask[..., 0]).max() > ALPHA_TOLERANCE:
+            remarks["alpha"] = f"{name} has values in [{alpha.min():.3g}, {alpha.max():.3g}], clipped to [0, 1]"
         rgb = unpremultiply(rgb, mask)
     camera = None
     with contextlib.suppress(UnirenderError):  # other programs may write what they call a camera
         camera = Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
-    return Picture(image_srgb(rgb), mask, path.name, negative, camera)
+    return Picture(image_srgb(rgb), mask, path.name, negative, camera, remarks)

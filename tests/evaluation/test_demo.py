@@ -121,7 +121,10 @@ def test_what_the_command_line_would_remark_of_a_picture_the_page_says() -> None
     rgb[2, 3, 1] = -1.0
     negative = Upload("filtered.exr", exr_bytes(image_channels(rgb), half=False))
     _, remarks = read_upload(negative, Upload("mask.png", png(np.ones((8, 16, 3)))), LIMITS)
-    assert remarks == ("0.5% of the picture's radiance is negative and was set to 0.",)
+    assert remarks == (
+        "The mask covers the whole frame, which is taken as the object.",
+        "0.5% of the picture's radiance is negative and was set to 0.",
+    )
 
 
 NAN = nan_exr()

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import map_picture, write_result
+from unirender.files import map_picture, new_folder, write_result
 from unirender.folders import (
     AT_ONCE,
     FolderResult,
@@ -36,7 +36,8 @@ def save(path: Path, value: int = 100, size: tuple[int, int] = (12, 10)) -> Path
 
 
 def read(path: Path, mask: Path | None) -> Picture:
-    return read_input(path, mask)[0]
+    picture, remarks = read_input(path, mask)
+    return dataclasses.replace(picture, remarks=remarks)
 
 
 def decompose(batch: list[Picture]) -> list[Decomposition]:
@@ -46,7 +47,9 @@ def decompose(batch: list[Picture]) -> list[Decomposition]:
         assert picture.mask is not None
         ones = np.ones_like(picture.mask)
         maps: dict[str, Any] = {"albedo": picture.image_srgb, "roughness": 0.5 * ones, "metallic": 0 * ones}
-        found.append(Decomposition(Intrinsics(**maps, mask=picture.mask), 0.5, 0.0))
+        maps |= {name: 0 * picture.image_srgb for name in ("normal", "specular", "diffuse")}
+        light = np.ones((2, 4, 3), np.float32)
+        found.append(Decomposition(Intrinsics(**maps, mask=picture.mask, environment=light), 0.5, 0.0))
     return found
 
 
@@ -62,6 +65,13 @@ def test_pictures_in_natural_order(tmp_path: Path) -> None:
     assert [path.name for path in list_pictures(tmp_path)] == ["b.jpg", "F1.PNG", "f9.png", "f10.png"]
     with pytest.raises(UnirenderError, match="no pictures"):
         list_pictures(tmp_path / "folder.png")
+    Image.new("RGB", (12, 10)).save(tmp_path / "folder.png" / "a.gif")
+    (tmp_path / "folder.png" / "b.png").symlink_to(tmp_path / "nowhere.png")
+    found = list_pictures(tmp_path / "folder.png")
+    assert [path.name for path in found] == ["a.gif", "b.png"]
+    assert "b.png: cannot be read" in run(found, tmp_path / "out").failed["b.png"]
+    with pytest.raises(UnirenderError, match=r"is a result, whose pictures are maps, .*`unirender render`"):
+        list_pictures(tmp_path / "out" / "a.gif")
 
 
 def test_one_bad_picture_is_listed_and_the_others_are_done(tmp_path: Path) -> None:
@@ -69,7 +79,10 @@ def test_one_bad_picture_is_listed_and_the_others_are_done(tmp_path: Path) -> No
     (tmp_path / "b.png").write_text("no picture")
     found = run([*good, tmp_path / "b.png"], tmp_path / "out")
     assert set(found.figures) == {"a.png", "a.jpg", "c.png"}  # one stem, two results
-    assert found.figures["a.png"] == {"roughness_mean": 0.5, "metallic_mean": 0.0, "clipped": 0.0}
+    frame = {"mask": "no mask and no alpha channel: the whole frame is taken as the object (--mask)"}
+    assert found.figures["a.png"] == {"roughness_mean": 0.5, "metallic_mean": 0.0, "clipped": 0.0, "remarks": frame}
+    assert json.loads((tmp_path / "out" / "a.png" / "meta.json").read_text())["remarks"] == frame
+    assert run(good, tmp_path / "out").figures == found.figures  # also of what is kept
     assert set(found.failed) == {"b.png"}
     assert "not a readable picture" in found.failed["b.png"]
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.jpg", "a.png", "c.png"]
@@ -96,12 +109,42 @@ def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path
     assert (again.kept, len(again.figures)) == (2, 2)
     save(pictures[0], 30)
     changed = run(pictures, tmp_path / "out")
-    assert "another input_sha256" in changed.failed["a.png"]
+    assert "another picture or mask (a file changed since)" in changed.failed["a.png"]
     other = run(pictures, tmp_path / "out", settings=SETTINGS | {"seed": 1})
     assert "another seed" in other.failed["b.png"]
     fresh = run(pictures, tmp_path / "out", settings=SETTINGS | {"seed": 1}, overwrite=True)
     assert (fresh.kept, len(fresh.figures), fresh.failed) == (0, 2, {})
     assert figures_of(tmp_path / "out" / "c.png", SETTINGS) is None
+
+
+@pytest.mark.parametrize("name", ["intrinsics.exr", "environment.exr", "normal.png"])
+def test_a_damaged_result_is_made_again(name: str, tmp_path: Path) -> None:
+    pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
+    run(pictures, tmp_path / "out")
+    for damage in (lambda file: file.unlink(), lambda file: file.write_bytes(b"")):
+        file = tmp_path / "out" / "a.png" / name
+        damage(file)
+        again = run(pictures, tmp_path / "out")
+        assert (again.kept, again.failed, set(again.figures)) == (1, {}, {"a.png", "b.png"})
+        assert file.stat().st_size > 0
+    assert run(pictures, tmp_path / "out").kept == 2
+
+
+def test_one_result_and_a_folder_of_them_do_not_replace_each_other(tmp_path: Path) -> None:
+    picture = save(tmp_path / "a.png")
+    with new_folder(tmp_path / "one") as folder:
+        write_result(folder, None, {})
+    with pytest.raises(UnirenderError, match=r"has a meta\.json, so that it is one result"):
+        run([picture], tmp_path / "one", overwrite=True)
+    found = run([picture], tmp_path / "out")
+    write_summary(tmp_path / "out", found, SETTINGS)
+    (tmp_path / "out" / "meta.json").write_text("{}")  # of a run of an earlier version
+    with (
+        pytest.raises(UnirenderError, match=r"has a summary\.json, so that it holds the results of a folder"),
+        new_folder(tmp_path / "out", overwrite=True),
+    ):
+        pass
+    assert (tmp_path / "out" / "a.png" / "meta.json").exists()
 
 
 def test_a_folder_that_is_in_the_way_is_kept(tmp_path: Path) -> None:

@@ -1,11 +1,13 @@
 """Pictures and masks from files: what the pixels become, and which files are refused."""
 
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
@@ -36,10 +38,37 @@ def test_alpha_becomes_the_mask_and_palettes_are_understood(tmp_path: Path) -> N
     assert read_picture(tmp_path / "p.png").image_srgb.shape == (4, 4, 3)
 
 
+def test_a_palette_of_rgba_keeps_its_alpha() -> None:
+    rgba = Image.new("RGBA", (12, 10), (200, 100, 9, 0))
+    rgba.paste((200, 100, 9, 255), (3, 2, 9, 8))
+    palette = rgba.quantize(8, method=Image.Quantize.FASTOCTREE)
+    assert palette.mode == "P"
+    assert "transparency" not in palette.info
+    np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
+    palette.info["icc_profile"] = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
+
+
 def test_sixteen_bit_grey(tmp_path: Path) -> None:
     values = np.array([[0, 32768, 65535]], dtype=np.uint16)
     Image.fromarray(values).save(tmp_path / "a.png")
     np.testing.assert_allclose(read_picture(tmp_path / "a.png").image_srgb[0, :, 1], [0, 0.5, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
+def test_sixteen_bit_colours_lose_half_of_them_which_is_told(kind: int, channels: int, tmp_path: Path) -> None:
+    rows = np.full((8, 1 + 9 * channels * 2), 156, np.uint8)
+    rows[:, 0] = 0  # each row begins with its filter
+    parts = {
+        b"IHDR": struct.pack(">IIBBBBB", 9, 8, 16, kind, 0, 0, 0),
+        b"IDAT": zlib.compress(rows.tobytes()),
+        b"IEND": b"",
+    }
+    chunks = [struct.pack(">I", len(v)) + k + v + struct.pack(">I", zlib.crc32(k + v)) for k, v in parts.items()]
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    picture, remarks = read_input(tmp_path / "a.png", None)
+    np.testing.assert_allclose(picture.image_srgb, 156 / 255, atol=2e-3)
+    assert ("depth" in remarks) == (channels > 1)
 
 
 def test_exif_orientation_is_applied(tmp_path: Path) -> None:
@@ -57,6 +86,37 @@ def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
     np.testing.assert_allclose(picture.image_srgb[0, :2, 0], srgb_encode(np.full(2, 0.2)), atol=1e-3)
     assert picture.image_srgb[0, 0, 2] == pytest.approx(1)
     assert picture.clipped == pytest.approx(1)
+
+
+def test_an_exr_mask_beside_the_colours_is_their_alpha(tmp_path: Path) -> None:
+    alpha = np.zeros((8, 9), np.float32)
+    alpha[2:6, 2:6] = 1
+    alpha[2, 2:6] = 0.5
+    channels = image_channels(np.repeat(0.2 * alpha[..., None], 3, axis=-1))
+    write_exr(tmp_path / "a.exr", channels | {"mask.Y": alpha})
+    picture, remarks = read_input(tmp_path / "a.exr", None)
+    np.testing.assert_array_equal(picture.mask, alpha[..., None])
+    np.testing.assert_allclose(picture.image_srgb[alpha > 0], srgb_encode(np.full(3, 0.2, np.float32))[0], atol=1e-3)
+    assert "alpha" not in remarks
+    write_exr(tmp_path / "b.exr", channels | {"A": 2 * alpha - 0.5, "mask.Y": alpha})
+    _, remarks = read_input(tmp_path / "b.exr", None)
+    assert remarks["alpha"] == "A has values in [-0.5, 1.5], clipped to [0, 1]"
+
+
+def test_what_a_picture_cannot_show_is_told(tmp_path: Path) -> None:
+    mask = np.zeros((10, 12), np.uint8)
+    mask[2:8, 3:9] = 255
+    for value, factor, kinds in [(200, 1.0, set()), (60, 1.0, {"dark"}), (0, 1.0, {"dark"}), (200, 0.7, {"coverage"})]:
+        colours = np.full((10, 12, 3), 250, np.uint8)
+        colours[mask > 0] = [value, 0, 0]  # what lies behind the object does not count
+        Image.fromarray(np.dstack([colours, (factor * mask).astype(np.uint8)])).save(tmp_path / "a.png")
+        assert set(read_input(tmp_path / "a.png", None)[1]) == kinds
+    Image.new("L", (12, 10), 255).save(tmp_path / "mask.png")
+    remarks = read_input(tmp_path / "a.png", tmp_path / "mask.png")[1]
+    assert remarks == {"mask": "the mask covers the whole frame, which is taken as the object"}
+    Image.new("L", (12, 10), 60).save(tmp_path / "mask.png")
+    with pytest.raises(UnirenderError, match=r"the mask is empty: no pixel .* more than half, and the most by 0\.235"):
+        read_input(tmp_path / "a.png", tmp_path / "mask.png")
 
 
 def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:

@@ -1,5 +1,8 @@
 """What the pipeline refuses besides a bad picture: lights, several pictures at once; and where an edit cannot say."""
 
+import copy
+import dataclasses
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -188,6 +191,17 @@ def test_a_decomposition_at_hand_must_be_of_this_picture(pipeline: UniRenderPipe
         UnirenderError, match=r"decomposition: is of a picture of \(.*\) pixels, expected \(.*\) like this"
     ):
         changed(image[:-2], mask[:-2], decomposition=found)
+    other = image.copy()
+    other[8:16, 8:16] += 0.2
+    with pytest.raises(UnirenderError, match="decomposition: is of another picture, whose display values differ"):
+        changed(other, mask, decomposition=found)
+    with pytest.raises(UnirenderError, match="is of another picture"):
+        changed(other, mask, decomposition=pickle.loads(pickle.dumps(copy.deepcopy(found))))
+    eight_bits = (np.round(255 * image + 0.2 * np.sin(np.arange(SIZE))[:, None, None]) / 255).astype(np.float32)
+    behind = np.where(mask > 0, eight_bits, 1.0).astype(np.float32)
+    by_hand = dataclasses.replace(found, thumbnail=None)
+    for taken, own_picture in ((found, behind), (dataclasses.replace(found, roughness=0.1), image), (by_hand, other)):
+        assert changed(own_picture, mask, decomposition=taken).shape == same.shape
     wrong: list[tuple[str, Any, str]] = [
         ("camera", Camera(80.0), r"camera: got Camera\(fov_deg=80.0.*, expected Camera\(fov_deg=36.0"),
         ("tile", True, "tile: got True beside a decomposition, which is taken as it is"),

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.ndimage import label
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
@@ -21,8 +22,10 @@ MIN_COVERAGE = 1e-3  # below it a resampled pixel carries no colour
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
-FAINT = 0.05  # coverage that is not looked for when an object is cut out
-MOST_LEFT_OUT = 0.01  # of all coverage: haze of a matte, whose maps nobody needs
+FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
+STRAY = 0.005  # of what counts: parts of the mask that together hold less are not looked for
+MOST_LEFT_OUT = 0.01  # of what counts, whose maps nobody needs
+THUMBNAIL_SIDE = 32  # pixels
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,8 @@ class Frame:
         """The whole picture, or the square around its object where the object is small.
 
         A network sees objects that fill most of the frame; of one that does not, most pixels would be lost on the
-        background. What is left out of the square has hardly any coverage, and no
-        surface.
+        background. What is left out of the square has no surface: haze of a matte, and stray pixels away from the
+        object that hold hardly any of the coverage (`visible_parts`).
 
         Args:
             mask: coverage.
@@ -58,16 +61,18 @@ class Frame:
         whole = cls(height, width, size)
         if whole.identity:
             return whole
-        rows, columns = (np.flatnonzero((mask[..., 0] > FAINT).any(axis=axis)) for axis in (1, 0))
-        if not len(rows):
+        visible = np.where(mask > FAINT, mask, 0)
+        if not visible.any() or least_extent(visible) > FILL * SMALL * whole.side:  # saves large pictures time
             return whole
-        (top, bottom), (left, right) = ((int(seen[0]), int(seen[-1]) + 1) for seen in (rows, columns))
+        first_row, end_row, first_column, end_column = _box(visible[..., 0] > 0)
+        seen = visible_parts(visible[first_row:end_row, first_column:end_column])
+        top, bottom, left, right = np.add(_box(seen), (first_row, first_row, first_column, first_column)).tolist()
         side = max(math.ceil(max(bottom - top, right - left) / FILL), LEAST_CUT)
         if side > SMALL * whole.side:
             return whole
         cut = cls(height, width, size, ((top + bottom - side) // 2, (left + right - side) // 2, side))
-        inside = mask[cut._slices()[0]].sum(dtype=np.float64)
-        return cut if inside >= (1 - MOST_LEFT_OUT) * mask.sum(dtype=np.float64) else whole
+        inside = visible[cut._slices()[0]].sum(dtype=np.float64)
+        return cut if inside >= (1 - MOST_LEFT_OUT) * visible.sum(dtype=np.float64) else whole
 
     @classmethod
     def reduced(cls, mask: Float[np.ndarray, "h w 1"], most: int) -> "Frame":
@@ -174,6 +179,44 @@ def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[
     """Bilinear, with an antialiasing support where it shrinks."""
     tensor = torch.from_numpy(np.ascontiguousarray(picture, dtype=np.float32)).permute(2, 0, 1)[None]
     return F.interpolate(tensor, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0).numpy()
+
+
+def _box(seen: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
+    """First row, end row, first column and end column of what is seen, which is something."""
+    rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+    return int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
+
+
+def least_extent(visible: Float[np.ndarray, "h w 1"]) -> int:
+    """Longer side of a box, pixels, that no box is smaller than that leaves out less than `STRAY` of the coverage."""
+    sides = []
+    for axis in (1, 0):
+        sums = np.cumsum(visible[..., 0].sum(axis=axis, dtype=np.float64))
+        first, last = np.searchsorted(sums, (STRAY * sums[-1], (1 - STRAY) * sums[-1]))
+        sides.append(int(last - first) + 1)
+    return max(sides)
+
+
+def visible_parts(visible: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w"]:
+    """Where the object is: all that is covered, but for the least parts that together hold less than `STRAY` of it.
+
+    Args:
+        visible: coverage, 0 where it does not count. Pixels that touch, also at a corner, are one part.
+    """
+    parts = np.zeros(visible.shape[:2], np.int32)
+    label(visible[..., 0] > 0, structure=np.ones((3, 3)), output=parts)
+    count = int(parts.max())
+    coverage = np.bincount(parts.ravel(), weights=visible.ravel(), minlength=count + 1)
+    order = np.argsort(coverage[1:]) + 1
+    kept = np.arange(count + 1) > 0  # 0 is what is not covered
+    kept[order[np.cumsum(coverage[order]) < STRAY * coverage.sum()]] = False
+    return kept[parts]
+
+
+def thumbnail(picture: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "th tw 3"]:
+    """The display values of what is covered, at most `THUMBNAIL_SIDE` pixels a side."""
+    height, width = (min(length, THUMBNAIL_SIDE) for length in mask.shape[:2])
+    return resize(picture * mask, (height, width))
 
 
 def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:

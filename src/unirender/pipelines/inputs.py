@@ -14,6 +14,7 @@ from unirender.pictures import coverage, display_colors, display_values
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import constant_map
+from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.results import Decomposition
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
@@ -21,6 +22,7 @@ DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
+PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
 TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True}  # of `decompose` alone, and their defaults
 
 
@@ -64,7 +66,9 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
         raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
     mask = _checked("mask", mask, "divide an 8-bit mask by 255")
     if not (mask > 0.5).any():  # as `unirender.exposure` asks
-        raise UnirenderError("mask: no pixel is covered by more than one half, expected an object in view")
+        raise UnirenderError(
+            f"mask: no pixel is covered by more than one half, the most by {mask.max():.3g}, expected an object in view"
+        )
     return mask
 
 
@@ -144,16 +148,19 @@ def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
         raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
 
 
-def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: Mapping[str, Any]) -> None:
+def check_decomposition(
+    found: Any, picture: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], settings: Mapping[str, Any]
+) -> None:
     """Looks at a decomposition that is handed in beside a picture, instead of one being made of it.
 
     Args:
         found: that decomposition.
+        picture: display values.
         mask: of the picture.
         settings: of the call; those of how a picture is taken apart have no effect here, and are refused.
 
     Raises:
-        UnirenderError: it is no `Decomposition`, of another size or mask, or a setting would have no effect.
+        UnirenderError: it is no `Decomposition`, of another size, mask or picture, or a setting would have no effect.
     """
     if not isinstance(found, Decomposition):
         raise UnirenderError(
@@ -171,6 +178,13 @@ def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: 
             f"decomposition: its mask differs from this one by up to {furthest:.2g}, expected the same; leave it out, "
             "or decompose the picture with this mask"
         )
+    if found.thumbnail is not None:
+        apart = float(np.abs(thumbnail(picture, mask) - found.thumbnail).max())
+        if apart > PICTURE_TOLERANCE:
+            raise UnirenderError(
+                f"decomposition: is of another picture, whose display values differ from this one's by {apart:.2g} and "
+                "more, expected the same picture; leave it out, or decompose this picture"
+            )
     if (camera := settings.get("camera")) not in (None, found.intrinsics.camera):
         raise UnirenderError(
             f"camera: got {camera}, expected {found.intrinsics.camera}, with which the decomposition was made; leave "
@@ -185,10 +199,20 @@ def check_decomposition(found: Any, mask: Float[np.ndarray, "h w 1"], settings: 
 
 
 def with_mask(intrinsics: Intrinsics) -> Intrinsics:
-    """The intrinsics with a mask: the whole frame where none is known."""
+    """The intrinsics with a mask: where none is known, the surface that has a normal, else the whole frame."""
     if intrinsics.mask is not None:
         return intrinsics
-    return intrinsics.replace(mask=np.ones((intrinsics.height, intrinsics.width, 1), dtype=np.float32))
+    surface = np.zeros(0) if intrinsics.normal is None else intrinsics.normal.any(axis=-1, keepdims=True)
+    if not surface.any():
+        surface = np.ones((intrinsics.height, intrinsics.width, 1))
+    return intrinsics.replace(mask=surface.astype(np.float32))
+
+
+def facing_away(intrinsics: Intrinsics) -> float:
+    """Share of the coverage whose normals face away from the camera; normal and mask have to be known."""
+    maps = intrinsics.require("normal", "mask")
+    towards = (maps["normal"] * intrinsics.camera.rays(intrinsics.height, intrinsics.width)).sum(axis=-1)
+    return float((maps["mask"][..., 0] * (towards > 0)).sum() / max(float(maps["mask"].sum()), 1.0))
 
 
 def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:

@@ -30,6 +30,7 @@ class Decomposition:
             a mean in log radiance, and so darker than s and d say. None: it is the light of `intrinsics`.
         agreeing_light: the light that `intrinsics` got in its place. Where you have put another one there, that one
             counts (`with_network_light`).
+        thumbnail: of the picture (`unirender.pipelines.framing.thumbnail`), by which it is known again; or None.
     """
 
     intrinsics: Intrinsics
@@ -39,6 +40,7 @@ class Decomposition:
     samples: tuple[Intrinsics, ...] = ()
     network_light: Float[np.ndarray, "eh ew 3"] | None = None
     agreeing_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
+    thumbnail: Float[np.ndarray, "th tw 3"] | None = field(default=None, repr=False)
 
     @property
     def with_network_light(self) -> Intrinsics:
@@ -77,12 +79,18 @@ class EditResult:
 def predicted_intrinsics(
     maps: dict[str, np.ndarray], frame: Frame, mask: Float[np.ndarray, "h w 1"], camera: Camera, material: str
 ) -> Intrinsics:
-    """One prediction `[s s c]` at the picture's size: unit normals, 0 outside the mask, scalar materials if asked."""
+    """One prediction `[s s c]` at the picture's size: unit normals, 0 outside the mask, scalar materials if asked.
+
+    What is covered and outside the frame's square gets the mean of the materials, and 0 of the other maps.
+    """
     sized = {name: frame.leave_map(maps[name], mask) for name in PREDICTED if name != "environment"}
     sized["normal"] = unit_normal(sized["normal"])
+    seen = frame.seen(mask)
+    unseen = (mask > 0) & (seen == 0)
     for name in ("roughness", "metallic"):
         value = np.clip(sized[name], 0, 1)
-        sized[name] = constant_map(masked_mean(value, frame.seen(mask)), mask) if material == "scalar" else value
+        mean = constant_map(masked_mean(value, seen), mask)
+        sized[name] = mean if material == "scalar" else np.where(unseen, mean, value)
     return Intrinsics(**sized, environment=maps["environment"], mask=mask, camera=camera)
 
 

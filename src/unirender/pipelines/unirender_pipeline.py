@@ -10,6 +10,7 @@ of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` componen
 import logging
 import math
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, overload
@@ -33,6 +34,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
+from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.inputs import (
     as_environment,
     as_material,
@@ -228,12 +230,14 @@ class UniRenderPipeline(DiffusionPipeline):
             raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
         how = Sampling.of(mode, num_inference_steps, num_samples, generator, looks)
         network = self._network(mode, sampler, size)
-        views = []
+        views, thumbnails = [], []
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
             picture, cover = as_picture(image, mask)
             views.append(View(srgb_decode(picture) * cover, cover, camera))
+            thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
-        return decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
+        found = decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
+        return [replace(each, thumbnail=small) for each, small in zip(found, thumbnails, strict=True)]
 
     def render(
         self,
@@ -252,8 +256,8 @@ class UniRenderPipeline(DiffusionPipeline):
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
-                missing, and a missing mask is the whole frame. Missing s and d are derived from the environment where
-                it is given.
+                missing. A missing mask is where the normal is not 0 (the whole frame where it is 0 nowhere); missing s
+                and d are derived from the environment where it is given.
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
@@ -401,7 +405,7 @@ class UniRenderPipeline(DiffusionPipeline):
     ) -> Decomposition:
         if at_hand is None:
             return self.decompose(picture, cover, **sampling)
-        check_decomposition(at_hand, cover, sampling)
+        check_decomposition(at_hand, picture, cover, sampling)
         return at_hand
 
     def _rerender(
