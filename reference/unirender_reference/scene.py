@@ -23,6 +23,7 @@ from unirender_reference.shapes import MeshObject
 
 LIGHT = "light"
 OBJECT = "object"
+NEAR_CLIP, FAR_CLIP = 0.01, 1e4  # the second is Mitsuba's own
 POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
 MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
 MOST_RADIANCE = 1e12  # the sun's luminance is 1.6e9 cd/m^2; squares of far more leave the range of float32
@@ -36,7 +37,7 @@ def sensor_dict(camera: Camera, height: int, width: int) -> dict[str, Any]:
         "type": "perspective",
         "fov": camera.fov_deg,
         "fov_axis": "y",
-        "near_clip": 0.01,
+        **clips(camera.distance()),
         "principal_point_offset_x": 0.5 - camera.principal[0],
         "principal_point_offset_y": 0.5 - camera.principal[1],
         "to_world": to_world,
@@ -57,7 +58,20 @@ def sensor_at(pose: Float[np.ndarray, "4 4"], camera: Camera, height: int, width
     mi = mitsuba()
     turned = np.array(pose, np.float64)
     turned[:3, [0, 2]] *= -1  # Mitsuba's camera looks along its +z, with +x to the left
-    return {**sensor_dict(camera, height, width), "to_world": mi.ScalarTransform4f(turned)}
+    sensor = sensor_dict(camera, height, width)
+    sensor.pop("far_clip", None)
+    return {**sensor, **clips(float(np.linalg.norm(pose[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
+
+
+def clips(distance: float) -> dict[str, float]:
+    """The depths between which a camera at this distance sees the unit sphere.
+
+    Mitsuba's rays begin at the near one. Cameras that these depths suit keep `NEAR_CLIP` and Mitsuba's own far one,
+    so that their pictures stay the same to the bit; inside the sphere there is no better one.
+    """
+    gap = distance - 1
+    found = {"near_clip": gap / 2 if 0 < gap <= NEAR_CLIP else NEAR_CLIP}
+    return found if distance + 1 < FAR_CLIP else {**found, "far_clip": 2 * distance}
 
 
 def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
