@@ -236,7 +236,7 @@ def _fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.
 def _lacking(index: Int[np.ndarray, "m 3"], values: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " m"]:
     """Faces of which a corner has no value, or one that is not finite; indices from 1."""
     missing = np.append(~np.isfinite(values).all(-1), True)  # the last: index 0
-    return missing[np.clip(index, 0, len(values)) - 1].any(1)
+    return np.asarray(missing[np.clip(index, 0, len(values)) - 1].any(axis=1))
 
 
 def _looked_up(index: Int[np.ndarray, "m 3"], count: int, what: str) -> Int[np.ndarray, "m 3"] | None:
