@@ -25,7 +25,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
 from unirender_reference.samplers import stratified_sampler
-from unirender_reference.scene import has_bright_pole, mesh_shape, sensor_dict
+from unirender_reference.scene import envmap_rows, mesh_shape, sensor_dict
 from unirender_reference.shapes import MeshObject
 
 LEAST_FACING = 0.01  # cosine to which normals that face away from the viewer are bent
@@ -244,8 +244,7 @@ def wrapped(environment: Any) -> Any:
 
     mi = mitsuba()
     height, width, _ = environment.shape
-    finer = has_bright_pole(environment.numpy())
-    rows = 2 * height - 1 if finer else height
+    rows = len(envmap_rows(environment.numpy()))
     # Not from numpy, whose memory may be gone while the kernel that gathers still runs.
     place = dr.arange(mi.UInt32, rows * (width + 2) * 3)
     row, channel = place // (3 * (width + 2)), place % 3
@@ -254,7 +253,7 @@ def wrapped(environment: Any) -> Any:
     def texels(row: Any) -> Any:
         return dr.gather(mi.Float, environment.array, (row * width + column) * 3 + channel)
 
-    data = (texels(row // 2) + texels((row + 1) // 2)) / 2 if finer else texels(row)
+    data = (texels(row // 2) + texels((row + 1) // 2)) / 2 if rows > height else texels(row)
     return mi.TensorXf(data, shape=(rows, width + 2, 3))
 
 
