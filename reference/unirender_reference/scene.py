@@ -13,15 +13,19 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_radiance
+from unirender.lighting import texel_solid_angles
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.shapes import MeshObject
 
 LIGHT = "light"
 OBJECT = "object"
-POLE_SHARE = 1e-6  # of the first row, in the second one of a light that has no other
+NEAR_CLIP, FAR_CLIP = 0.01, 1e4  # the second is Mitsuba's own
+POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
+MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
 MOST_RADIANCE = 1e12  # the sun's luminance is 1.6e9 cd/m^2; squares of far more leave the range of float32
 
 
@@ -33,7 +37,7 @@ def sensor_dict(camera: Camera, height: int, width: int) -> dict[str, Any]:
         "type": "perspective",
         "fov": camera.fov_deg,
         "fov_axis": "y",
-        "near_clip": 0.01,
+        **clips(camera.distance()),
         "principal_point_offset_x": 0.5 - camera.principal[0],
         "principal_point_offset_y": 0.5 - camera.principal[1],
         "to_world": to_world,
@@ -54,7 +58,20 @@ def sensor_at(pose: Float[np.ndarray, "4 4"], camera: Camera, height: int, width
     mi = mitsuba()
     turned = np.array(pose, np.float64)
     turned[:3, [0, 2]] *= -1  # Mitsuba's camera looks along its +z, with +x to the left
-    return {**sensor_dict(camera, height, width), "to_world": mi.ScalarTransform4f(turned)}
+    sensor = sensor_dict(camera, height, width)
+    sensor.pop("far_clip", None)
+    return {**sensor, **clips(float(np.linalg.norm(pose[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
+
+
+def clips(distance: float) -> dict[str, float]:
+    """The depths between which a camera at this distance sees the unit sphere.
+
+    Mitsuba's rays begin at the near one. Cameras that these depths suit keep `NEAR_CLIP` and Mitsuba's own far one,
+    so that their pictures stay the same to the bit; inside the sphere there is no better one.
+    """
+    gap = distance - 1
+    found = {"near_clip": gap / 2 if 0 < gap <= NEAR_CLIP else NEAR_CLIP}
+    return found if distance + 1 < FAR_CLIP else {**found, "far_clip": 2 * distance}
 
 
 def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
@@ -80,18 +97,14 @@ def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
     return mesh
 
 
-def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w+2 3"]:
-    """The environment as Mitsuba's `envmap` parameter stores it: one wrapped column on either side."""
+def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w+2 3"]:
+    """The environment as Mitsuba's `envmap` parameter stores it (`envmap_rows`): one wrapped column on either side."""
     environment = envmap_rows(environment)
     return np.concatenate([environment[:, -1:], environment, environment[:, :1]], axis=1)
 
 
-def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The environment, checked, as Mitsuba can sample it: itself, but for a light in the first row alone.
-
-    Mitsuba draws texels by luminance times sin(theta), which is 0 all over such a light: it would render black. The
-    second row gets `POLE_SHARE` of the first. (In the last row sin(theta) is rounded to -9e-8, which is enough
-    where that row is alone.)
+def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """The environment, checked, as Mitsuba can sample it: itself, or with a row between each two (`middle_rows`).
 
     Raises:
         UnirenderError: it is too small, black, negative, not finite or above `MOST_RADIANCE`.
@@ -108,10 +121,33 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
         )
     if environment.max() <= 0:
         raise UnirenderError("environment: all texels are black, expected some light")
-    if not environment[1:].any():
-        environment = environment.copy()
-        environment[1] = POLE_SHARE * environment[0]
-    return environment
+    return middle_rows(environment) if has_bright_pole(environment) else environment
+
+
+def has_bright_pole(environment: Float[np.ndarray, "h w 3"]) -> bool:
+    """Whether Mitsuba would miss light of the first or the last row.
+
+    It draws directions by luminance times sin(theta) of the texels, which is 0 all over these rows: their light is met
+    where the rows beside them draw it. Where those are dark, most samples miss it and a few count for all. A sample
+    that meets a texel counts about as often too much as the texel is brighter than the one beside it (the contrast);
+    the texels' mean contrast, by their share of the light's power, is therefore the variance that they bring.
+    """
+    brightness = luminance(environment).astype(np.float64)
+    power = brightness * texel_solid_angles(*environment.shape[:2])
+    noise = 0.0
+    for pole, beside in ((0, 1), (-1, -2)):
+        least = np.maximum(brightness[beside], brightness[pole] / MOST_CONTRAST)
+        contrast = np.divide(brightness[pole], least, out=np.zeros_like(least), where=least > 0)
+        noise += float((power[pole] * contrast).sum() / power.sum())
+    return noise > POLE_NOISE
+
+
+def middle_rows(rows: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """Bilinear radiance on a grid with a row between each two: the same light, whose poles have bright neighbours."""
+    finer = np.empty((2 * len(rows) - 1, *rows.shape[1:]), rows.dtype)
+    finer[::2] = rows
+    finer[1::2] = (rows[:-1] + rows[1:]) / 2
+    return finer
 
 
 def object_scene(

@@ -237,20 +237,24 @@ def facing(normal: Any, view: Any) -> Any:
 def wrapped(environment: Any) -> Any:
     """A light (eh, ew, 3) as Mitsuba's `envmap` stores it: a copy of the last column before it, of the first behind.
 
-    The tensor stays attached: the gradient of both copies returns to the columns that they came from.
+    The tensor stays attached: the gradient of both copies returns to the columns that they came from, and that of the
+    rows between those of a light with bright poles to their neighbours (`scene.envmap_rows`).
     """
     import drjit as dr
 
     mi = mitsuba()
-    given = environment.numpy()
-    values, rows = environment.array, envmap_rows(given)
-    height, width, _ = rows.shape
-    if not np.array_equal(rows, given):
-        values = dr.replace_grad(mi.Float(rows.ravel()), values)
-    column = np.arange(-1, width + 1) % width
-    index = (np.arange(height)[:, None, None] * width + column[:, None]) * 3 + np.arange(3)
-    data = dr.gather(mi.Float, values, mi.UInt32(index.ravel().astype(np.uint32)))
-    return mi.TensorXf(data, shape=(height, width + 2, 3))
+    height, width, _ = environment.shape
+    rows = len(envmap_rows(environment.numpy()))
+    # Not from numpy, whose memory may be gone while the kernel that gathers still runs.
+    place = dr.arange(mi.UInt32, rows * (width + 2) * 3)
+    row, channel = place // (3 * (width + 2)), place % 3
+    column = (place // 3 % (width + 2) + width - 1) % width
+
+    def texels(row: Any) -> Any:
+        return dr.gather(mi.Float, environment.array, (row * width + column) * 3 + channel)
+
+    data = (texels(row // 2) + texels((row + 1) // 2)) / 2 if rows > height else texels(row)
+    return mi.TensorXf(data, shape=(rows, width + 2, 3))
 
 
 def tensors(values: Mapping[str, Float[np.ndarray, "..."]], attached: Sequence[str] = ()) -> dict[str, Any]:

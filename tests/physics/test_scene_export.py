@@ -81,3 +81,11 @@ def test_a_wrong_scene_would_not_pass(truth: np.ndarray, tmp_path: Path, fault: 
     }
     image = rendered(intrinsics.replace(**wrong[fault]), tmp_path / "scene")
     assert relative(image[..., :3], truth, maps["mask"][..., 0] > 0) > 2 * WITHIN
+
+
+def test_a_card_beyond_mitsubas_far_clip_is_seen(tmp_path: Path) -> None:
+    maps = ball().replace(camera=Camera(0.01))
+    assert rendered(maps, tmp_path / "far")[..., 3].mean() > 0.4
+    assert "far_clip" in (tmp_path / "far" / "scene.xml").read_text()
+    export_scene(tmp_path / "near", ball())
+    assert "far_clip" not in (tmp_path / "near" / "scene.xml").read_text()

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -485,3 +486,28 @@ def test_json_in_the_file_is_what_we_think(tmp_path):
     assert QUAD_FACES.itemsize == 2
     assert constant(1.0)(np.zeros((2, 2))).shape == (2, 1)
     assert mirrored_uv(np.array([[-1.0, 1.0]]))[0] == pytest.approx([0, 0])
+
+
+def textured_quad(tmp_path, sizes: tuple[int, int], texcoord: int = 0, **node: Any) -> MeshObject:
+    def fill(w: GltfWriter) -> None:
+        first, second = (w.texture(random_pixels(size, size, size)) for size in sizes)
+        maps = {"baseColorTexture": {"index": first}, "metallicRoughnessTexture": {"index": second}}
+        maps["baseColorTexture"]["texCoord"] = texcoord
+        w.mesh(w.quad(w.material(pbrMetallicRoughness=maps)), **node)
+
+    return load_mesh(quad_glb(tmp_path, fill))
+
+
+def test_what_a_picture_lost_is_listed(tmp_path):
+    """Of a smaller picture the contrast, of one whose coordinates are missing everything but its mean."""
+    assert textured_quad(tmp_path, (8, 8)).provenance["ignored"] == ""
+    assert textured_quad(tmp_path, (8, 1)).provenance["ignored"] == ""
+    assert textured_quad(tmp_path, (8, 6)).provenance["ignored"] == "sharpness of smaller textures"
+    assert textured_quad(tmp_path, (8, 8), texcoord=3).provenance["ignored"] == "textures of faces without coordinates"
+
+
+def test_instances_of_an_extension_are_listed(tmp_path):
+    instances = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
+    obj = textured_quad(tmp_path, (8, 8), extensions=instances)
+    assert obj.provenance["ignored"] == "mesh_gpu_instancing"
+    assert len(obj.faces) == 2

@@ -1,5 +1,6 @@
 """Lights: normalisation, orientation, splits, the photograph rule, files."""
 
+import re
 import struct
 import tracemalloc
 
@@ -154,6 +155,13 @@ def test_a_radiance_header_says_what_the_pixels_were_multiplied_by(tmp_path, lin
     path = bad_file(tmp_path, "map.hdr", RADIANCE % lines)
     found = lights.load_light(path, normalise=False).environment
     np.testing.assert_allclose(found, np.broadcast_to(np.float32(radiance), found.shape), rtol=1e-6)
+
+
+@pytest.mark.parametrize("order", [b"+Y 16 +X 32", b"-Y 16 -X 32", b"+X 32 -Y 16"])
+def test_radiance_files_in_another_order_of_pixels_are_refused_with_the_reason(tmp_path, order):
+    path = bad_file(tmp_path, "map.hdr", (RADIANCE % b"").replace(b"-Y 16 +X 32", order))
+    with pytest.raises(UnirenderError, match=f"stored as '{re.escape(order.decode())}', expected '-Y height"):
+        lights.load_light(path)
 
 
 @pytest.mark.parametrize("line", [b"EXPOSURE=0", b"EXPOSURE=", b"EXPOSURE=nan", b"COLORCORR=1 1", b"COLORCORR=1 -1 1"])

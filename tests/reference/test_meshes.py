@@ -226,3 +226,55 @@ def test_errors(tmp_path, name, content, message):
         (tmp_path / name).write_text(content)
     with pytest.raises(UnirenderError, match=message):
         load_mesh(tmp_path / name)
+
+
+CORNER_LINES = ["-1 -1 0", "1 -1 0", "1 1 0", "-1 1 0"]
+PURPLE = srgb_decode(np.array([128, 64, 255]) / 255)
+OFF_FILES = {  # the header, what stands behind each vertex and each face, the colours, what is ignored
+    "whole numbers": ("COFF", " 128 64 255 255", "", PURPLE, ""),
+    "floats": ("COFF", " 0.50196 0.25098 1.0", "", PURPLE, ""),
+    "of faces": ("OFF", "", " 128 64 255", PURPLE, ""),
+    "none": ("OFF", "", "", np.full(3, 0.5), ""),
+    "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
+    "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", np.full(3, 0.5), "colours"),
+}
+
+
+@pytest.mark.parametrize("kind", OFF_FILES)
+def test_colors_of_off_files(tmp_path, kind):
+    """They were never read, and nothing said so."""
+    head, of_vertex, of_face, expected, ignored = OFF_FILES[kind]
+    lines = [head, "4 2 0", *(line + of_vertex for line in CORNER_LINES)]
+    lines += ["3 0 1 2" + of_face, "3 0 2 3" + of_face]
+    (tmp_path / "a.off").write_text("\n".join(lines) + "\n")
+    obj = load_mesh(tmp_path / "a.off")
+    assert obj.albedo.reshape(-1, 3) == pytest.approx(
+        np.broadcast_to(expected, obj.albedo.reshape(-1, 3).shape), abs=1e-4
+    )
+    assert obj.provenance["ignored"] == ignored
+
+
+def test_each_face_of_an_off_file_has_its_color(tmp_path):
+    body = "\n".join(["OFF", "4 2 0", *CORNER_LINES, "3 0 1 2 255 0 0", "3 0 2 3 0 0 255 # blue"])
+    (tmp_path / "a.off").write_text(body)
+    found = {tuple(texel) for texel in load_mesh(tmp_path / "a.off").albedo.reshape(-1, 3).tolist()}
+    assert found == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
+    (tmp_path / "b.off").write_text("\n".join(["OFF", "4 1 0", *CORNER_LINES, "4 0 1 2 3 255 0 0"]))
+    assert load_mesh(tmp_path / "b.off").provenance["ignored"] == "colours"
+
+
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), "rgb"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_names_of_colors_in_ply_files(tmp_path, names, binary):
+    form = "binary_little_endian" if binary else "ascii"
+    head = [f"ply\nformat {form} 1.0\nelement vertex 4", *(f"property float {axis}" for axis in "xyz")]
+    head += [*(f"property uchar {name}" for name in names), "element face 2"]
+    head += ["property list uchar int vertex_indices", "end_header", ""]
+    if binary:
+        body = b"".join(point.tobytes() + bytes([128, 64, 255]) for point in QUAD)
+        body += b"".join(b"\3" + face.astype("<i4").tobytes() for face in QUAD_FACES)
+    else:
+        body = "\n".join([*(f"{line} 128 64 255" for line in CORNER_LINES), "3 0 1 2", "3 0 2 3", ""]).encode()
+    (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + body)
+    albedo = load_mesh(tmp_path / "a.ply").albedo.reshape(-1, 3)
+    assert albedo == pytest.approx(np.broadcast_to(PURPLE, albedo.shape), abs=1e-4)

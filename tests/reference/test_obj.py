@@ -1,5 +1,8 @@
 """OBJ and MTL files: polygons, indices, options of maps, the PBR keywords."""
 
+import codecs
+import struct
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,8 +12,10 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
 from unirender_reference.meshes import load_mesh
 from unirender_reference.meshes.mtl import parse_mtl
+from unirender_reference.scene_spec import object_hash
 from unirender_reference.shapes import MeshObject
 
 QUAD = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
@@ -137,3 +142,118 @@ def test_faces_on_each_other_are_one(tmp_path):
     assert len(obj.faces) == 2
     assert obj.provenance["double_faces"] == "1"
     assert obj.normals == pytest.approx(np.tile([0, 0, 1], (len(obj.normals), 1)))
+
+
+def test_faces_without_texture_coordinates_leave_the_others_theirs(tmp_path):
+    """One face without `vt` made the texture of the whole material its mean."""
+    (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
+    faces = "f 1/1 2/2 3/3 4/4\nf 1 2 5\nvt nan 0\nf 1/1 2/2 5/5"
+    mixed = write(tmp_path, "map_Kd a.png", faces, QUAD + "v 0 0 2\n")
+    whole = write(tmp_path, "map_Kd a.png")
+    uv = mixed.uv
+    assert uv is not None
+    assert "textures of faces without coordinates" in mixed.provenance["ignored"]
+    assert whole.provenance["ignored"] == ""
+    h, w, _ = mixed.albedo.shape
+    texels = mixed.albedo[(uv[:, 1] * h).astype(int), (uv[:, 0] * w).astype(int)]
+    tip = mixed.vertices[:, 2] > mixed.vertices[:, 2].min() + 0.1
+    mean = srgb_decode(random_pixels(1, 4, 4) / 255).mean((0, 1))
+    assert texels[tip] == pytest.approx(np.tile(mean, (tip.sum(), 1)), abs=1e-5)
+    shown_texels = {tuple(texel) for texel in np.round(mixed.albedo.reshape(-1, 3), 4)}
+    assert {tuple(texel) for texel in np.round(whole.albedo.reshape(-1, 3), 4)} <= shown_texels
+
+
+def test_faces_without_normals_leave_the_others_theirs(tmp_path):
+    tilted = "vn 0.6 0 0.8\n"
+    obj = write(tmp_path, "Kd 1 1 1", "f 1//1 2//1 3//1\nf 1 3 4", QUAD + tilted)
+    turned = np.isclose(obj.normals, [0.6, 0, 0.8], atol=1e-6).all(-1)
+    assert turned.sum() == 3
+    assert obj.normals[~turned] == pytest.approx(np.tile([0, 0, 1], ((~turned).sum(), 1)))
+
+
+@pytest.mark.parametrize("written", ["\r", "\r\n", "tab", "bom"])
+def test_line_ends_tabs_and_a_byte_order_mark(tmp_path, written):
+    """Keywords behind a byte order mark or before a tab were passed over, and files with CR alone were one line."""
+
+    def spelled(text: str) -> bytes:
+        if written == "tab":
+            text = "".join(line.replace(" ", "\t", 1) for line in text.splitlines(keepends=True))
+        text = text.replace("\n", written) if written[0] == "\r" else text
+        return (codecs.BOM_UTF8 if written == "bom" else b"") + text.encode()
+
+    (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
+    mtl, obj = "newmtl a\nmap_Kd -s 2 2 1 a.png\nPr 0.3\n", f"mtllib a.mtl\n{QUAD}usemtl a\nf 1/1 2/2 3/3 4/4\n"
+    loaded = []
+    for spell in (str.encode, spelled):
+        (tmp_path / "a.mtl").write_bytes(spell(mtl))
+        (tmp_path / "a.obj").write_bytes(spell(obj))
+        loaded.append(load_mesh(tmp_path / "a.obj"))
+    assert object_hash(loaded[0]) == object_hash(loaded[1])
+    assert loaded[1].roughness is not None
+
+
+@pytest.mark.parametrize(
+    ("material", "ignored"), [("Tr 0.7", "alpha"), ("Tr 0", ""), ("d 1\nTr 1", ""), ("d 0.5", "alpha")]
+)
+def test_transparency_is_ignored_and_said(tmp_path, material, ignored):
+    assert write(tmp_path, material).provenance["ignored"] == ignored
+
+
+def test_an_unknown_option_of_a_map_is_named(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
+    with pytest.raises(UnirenderError, match=r"option '-colorspace', which is not known here"):
+        write(tmp_path, "map_Kd -colorspace sRGB a.png")
+    (tmp_path / "-a b.png").write_bytes(png(random_pixels(1, 4, 4)))
+    obj = write(tmp_path, "map_Kd -a b.png")
+    assert shown(obj, obj.albedo).std() > 0
+
+
+def test_a_vertex_without_a_colour_leaves_the_other_faces_theirs(tmp_path):
+    """A face with a corner that has none gets `Kd`, here the grey of a mesh without any; both are said."""
+    red = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\n"
+    (tmp_path / "a.obj").write_text(red + "v 0 0 1\nf 1 2 3\nf 1 2 4\n")
+    obj = load_mesh(tmp_path / "a.obj")
+    assert obj.provenance["ignored"] == "colours of faces with a bare corner"
+    assert obj.uv is not None
+    h, w, _ = obj.albedo.shape
+    texels = obj.albedo[(obj.uv[:, 1] * h).astype(int), (obj.uv[:, 0] * w).astype(int)]
+    upper = obj.vertices[:, 2] > obj.vertices[:, 2].max() - 1e-3
+    assert texels[upper] == pytest.approx(np.full((upper.sum(), 3), 0.5))
+    assert (np.abs(texels - [1, 0, 0]).max(-1) < 1e-6).sum() == 3
+
+
+TIFFS = {
+    "float": (np.float32, 0.25, 0.25),
+    "16 bits in 32": (np.int32, 16384, 0.25),
+    "31 bits": (np.int32, 1 << 29, 0.25),
+    "a negative number": (np.int32, -1, r"got numbers from -1, expected 0 and more"),
+    "a float above 1": (np.float32, 1.5, r"got floats from 1.5 to 1.5, expected \[0, 1\]"),
+    "no number": (np.float32, np.nan, r"got floats from nan"),
+}
+
+
+@pytest.mark.parametrize("kind", TIFFS)
+def test_tiff_of_floats_and_of_32_bits(tmp_path, kind):
+    """Pillow clips them to 8 bits: floats were 0 or 1, whole numbers 1."""
+    dtype, value, expected = TIFFS[kind]
+    Image.fromarray(np.full((4, 4), value, dtype)).save(tmp_path / "a.tiff")
+    if isinstance(expected, str):
+        with pytest.raises(UnirenderError, match=expected):
+            write(tmp_path, "map_Pr a.tiff")
+        return
+    obj = write(tmp_path, "map_Pr a.tiff")
+    assert obj.roughness is not None
+    assert obj.roughness == pytest.approx(np.full_like(obj.roughness, expected), abs=0.5 / 255 + 1e-6)
+
+
+@pytest.mark.parametrize(("kind", "bits", "value"), [(1, 32, 1 << 30), (1, 16, 1 << 14), (2, 16, 1 << 13), (1, 8, 64)])
+def test_tiff_of_whole_numbers(tmp_path, kind, bits, value):
+    """4 x 4 texels of a quarter, written byte by byte; kind 1 has no sign, 2 has one."""
+    entries = [(256, 4, 4), (257, 4, 4), (258, 3, bits), (259, 3, 1), (262, 3, 1), (273, 4, 134), (277, 3, 1)]
+    entries += [(278, 4, 4), (279, 4, 2 * bits), (339, 3, kind)]
+    body = b"".join(struct.pack("<HHII", tag, form, 1, number) for tag, form, number in entries)
+    texels = np.full(16, value, f"<u{bits // 8}").tobytes()
+    (tmp_path / "a.tiff").write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + b"\0" * 4 + texels)
+    obj = write(tmp_path, "map_Pr a.tiff")
+    assert obj.roughness is not None
+    assert obj.roughness == pytest.approx(np.full_like(obj.roughness, 0.25), abs=0.5 / 255 + 1e-6)

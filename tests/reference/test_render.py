@@ -24,7 +24,7 @@ from unirender_reference.render import (
     scene_hash,
     scene_hashes,
 )
-from unirender_reference.scene import MOST_RADIANCE, envmap_data
+from unirender_reference.scene import MOST_RADIANCE, envmap_data, sensor_at, sensor_dict
 from unirender_reference.shapes import make_object
 
 SIZE = 32
@@ -413,3 +413,25 @@ def test_the_brightest_light_has_a_finite_variance(renderer: Renderer) -> None:
     assert np.isfinite(variance).all()
     with pytest.raises(UnirenderError, match="at most 1e"):
         renderer.image(light * np.float32(1.01), 0.2, 1.0, 64)
+
+
+@pytest.mark.parametrize("fov_deg", [0.001, 0.01, 168.0])
+def test_objects_between_the_clips_of_extreme_cameras(fov_deg: float) -> None:
+    """Mitsuba's far clip lies nearer than a camera of 0.01 degrees, its near clip behind the front of the object."""
+    renderer = Renderer(scenes.sphere((1.0, 1.0, 1.0), subdivisions=4), Camera(fov_deg), 16)
+    mask = renderer.geometry(64).require("mask")["mask"]
+    assert mask.mean() == pytest.approx(np.pi / 4 * 0.81, rel=0.1)
+    found = renderer.diffuse(np.ones((4, 8, 3), np.float32), 16).mean
+    assert found[mask[..., 0] == 1].mean() == pytest.approx(1, abs=0.02)
+
+
+def test_clips_of_ordinary_cameras_are_mitsubas_own() -> None:
+    """Rays begin at the near clip: another one would change their bits."""
+    for fov_deg in (0.02, 10.0, 36.0, 90.0, 160.0):
+        sensor = sensor_dict(Camera(fov_deg), 8, 8)
+        assert sensor["near_clip"] == 0.01
+        assert "far_clip" not in sensor
+    near, far = np.eye(4), np.eye(4)
+    near[2, 3], far[2, 3] = 2, 2e4
+    assert "far_clip" not in sensor_at(near, Camera(0.001), 8, 8)
+    assert sensor_at(far, Camera(), 8, 8)["far_clip"] > 2e4 + 1

@@ -18,6 +18,7 @@ taken as it is. Pixels of a Radiance file are divided by what its header says th
 """
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,8 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
 WINDOW_DEG, FADE_DEG = 45.0, 30.0
 MOST_HEADER_BYTES = 2**16  # of a Radiance file
+# Pixels in another order than by rows from the top left, which alone Mitsuba reads.
+RGBE_TURNED = re.compile(rb"#\?.*?\n\n(?!-Y \d+ \+X )([-+][XY] \d+ [-+][XY] \d+)\s*\n", re.DOTALL)
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
 
@@ -154,6 +157,13 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
         with path.open("rb") as file:
             if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
                 raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
+            file.seek(0)
+            turned = RGBE_TURNED.match(file.read(MOST_HEADER_BYTES))
+        if turned:
+            raise UnirenderError(
+                f"light {path}: its pixels are stored as {turned[1].decode()!r}, expected '-Y height +X width' (from "
+                "the top left, by rows); write the file again"
+            )
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]

@@ -16,7 +16,7 @@ from unirender_reference.meshes.gloss import metallic_roughness
 from unirender_reference.meshes.gltf_document import Document
 from unirender_reference.meshes.images import Decode, ImageBudget, linear, nearest, texels_of
 from unirender_reference.meshes.limits import check_materials, texture_side
-from unirender_reference.meshes.surface import IDENTITY, Channel, Material, Texture, Wrap, unit_vectors
+from unirender_reference.meshes.surface import BARE, IDENTITY, Channel, Material, Texture, Wrap, unit_vectors
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 IMAGE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")
@@ -71,6 +71,8 @@ class Materials:
         """
         if (index, sets) not in self._made:
             channels = self._channels(self._json(index))
+            if any(isinstance(channel, Texture) and channel.texcoord not in sets for channel in channels.values()):
+                self.ignored.add(BARE)
             self._made[index, sets] = Material({name: _placed(channel, sets) for name, channel in channels.items()})
         return self._made[index, sets]
 

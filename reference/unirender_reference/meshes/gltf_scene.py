@@ -17,6 +17,7 @@ from unirender_reference.meshes.normals import flat_normals
 from unirender_reference.meshes.surface import Model, Piece
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
+INSTANCING = "EXT_mesh_gpu_instancing"  # where no reader must have it, its mesh stands once, where its node is
 
 
 def read_gltf(path: Path, folder: ModelFolder) -> Model:
@@ -57,6 +58,8 @@ def read_gltf(path: Path, folder: ModelFolder) -> Model:
     ignored = set(materials.ignored)
     if len(used) < sum(map(len, primitives.values())):
         ignored.add("points and lines")
+    if any(INSTANCING in node.get("extensions", {}) for node in document.json.get("nodes", [])):
+        ignored.add(INSTANCING.removeprefix("EXT_"))
     for primitive in used:
         ignored |= {"morph targets"} if "targets" in primitive else set()
         ignored |= {"tangents"} if "TANGENT" in primitive.get("attributes", {}) else set()

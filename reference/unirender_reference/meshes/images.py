@@ -15,6 +15,7 @@ from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
 _LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
+BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED = 258, 339, 2  # TIFF tags, and a value of the second
 STRIP = 500_000  # stored pixels made float at a time
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
 
@@ -76,14 +77,13 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         curve: stored values in [0, 1] -> linear ones, each channel by itself.
 
     Raises:
-        UnirenderError: the image is cut off or damaged.
+        UnirenderError: the image is cut off or damaged, or its numbers are no brightness (negative, floats above 1).
     """
     try:
         image.load()
-        if image.mode.startswith("I;16"):
-            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        image = _eight_bits(image, name)
         image = image if image.mode == mode else image.convert(mode)
-    except MemoryError:
+    except (MemoryError, UnirenderError):
         raise
     except Exception as error:  # Pillow's readers raise whatever a damaged file makes them raise
         raise UnirenderError(f"texture {name}: damaged ({error}); export it again") from error
@@ -101,6 +101,32 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         linear = np.stack([table[:, k][stored[..., k]] for k in range(table.shape[1])], axis=-1)
         texels[top:stop] = area_means(area_means(linear, width, 1), stop - top, 0, low - first, high - first)
     return texels
+
+
+def _eight_bits(image: Image.Image, name: str) -> Image.Image:
+    """Grey of more bits: the upper 8 of whole numbers, 255 times floats in [0, 1]. Pillow would clip both."""
+    if image.mode.startswith("I;16"):
+        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    if image.mode not in ("I", "F"):
+        return image
+    values = np.asarray(image)
+    if image.mode == "F":
+        if not (values.min() >= 0 and values.max() <= 1):  # NaN is neither
+            raise UnirenderError(
+                f"texture {name}: got floats from {values.min():g} to {values.max():g}, expected [0, 1]; export it as "
+                "PNG"
+            )
+        return Image.fromarray(np.round(values * 255).astype(np.uint8))
+    tags = getattr(image, "tag_v2", {})  # of a TIFF; other formats have 16 bits
+    bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
+    if bits == 32 and not signed:
+        values = values.view(np.uint32)
+    if values.min() < 0:
+        raise UnirenderError(
+            f"texture {name}: got numbers from {values.min():,}, expected 0 and more; export it as PNG"
+        )
+    used = 16 if bits == 32 and values.max() < 1 << 16 else bits - int(signed)  # 16 bits are often kept in 32
+    return Image.fromarray((values >> (used - 8)).astype(np.uint8))
 
 
 def area_means(

@@ -27,6 +27,7 @@ from unirender_reference.meshes.trimesh_files import read_through_trimesh
 from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
 
+SMALLER = "sharpness of smaller textures"  # among what is ignored
 READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 
 
@@ -142,6 +143,7 @@ def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
         np.concatenate([piece_normals(piece) for piece in pieces]),
         atlas.uv,
     )
+    smaller = {SMALLER} if any(group.material.has_smaller_textures() for group in groups) else set()
     maps = atlas.maps
     if "roughness" in maps and uv is None:
         uv = np.zeros((len(vertices), 2), np.float32)
@@ -165,7 +167,7 @@ def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
             "textures": str(atlas.tiles),
             "textures_averaged": str(atlas.averaged),
             "textures_baked": str(atlas.baked),
-            "ignored": ", ".join(sorted(model.ignored)),
+            "ignored": ", ".join(sorted(model.ignored | smaller)),
         },
     )
     return obj, sphere

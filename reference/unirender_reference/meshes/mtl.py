@@ -5,6 +5,7 @@ read (`-bm` of `norm`, too); bump maps (`map_Bump`) are heights and are ignored.
 """
 
 import io
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,8 +43,8 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
     """
     entries: dict[str, MtlEntry] = {}
     entry = MtlEntry()
-    for line in io.StringIO(text):
-        keyword, _, rest = line.strip().partition(" ")
+    for line in io.StringIO(text.removeprefix("\ufeff"), newline=None):  # LF, CR LF or CR
+        keyword, rest = (*line.split(None, 1), "", "")[:2]
         keyword, rest = keyword.lower(), rest.strip()
         if keyword == "newmtl":
             entry = entries.setdefault(rest, MtlEntry())
@@ -52,7 +53,7 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
             entry.maps[MAPS[keyword]] = _map(rest)
         elif keyword in IGNORED:
             entry.ignored.add(IGNORED[keyword])
-        elif keyword in ("kd", "pr", "pm", "d", "ke"):
+        elif keyword in ("kd", "pr", "pm", "d", "tr", "ke"):
             try:
                 entry.numbers[keyword] = [float(value) for value in rest.split()]
             except ValueError:  # "Kd spectral file.rfl" and the like
@@ -62,7 +63,7 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
 
 def _map(rest: str) -> tuple[str, dict[str, list[str]]]:
     """A file name, which may hold spaces, behind options of known length (`-o`, `-s`, `-t` take one to three)."""
-    words, options = rest.split(" "), {}
+    words, options = re.split(r"[ \t]", rest), {}
     while words and words[0].lower() in OPTIONS:
         name = words.pop(0).lower()
         values: list[str] = []
@@ -70,7 +71,7 @@ def _map(rest: str) -> tuple[str, dict[str, list[str]]]:
             value = words.pop(0)
             values += [value] if value else []
         options[name] = values
-    return " ".join(words).strip(), options
+    return rest[len(rest) - len(" ".join(words)) :].strip(), options
 
 
 def _is_number(word: str) -> bool:
@@ -100,7 +101,7 @@ class MtlMaterials:
         )
         self._side = texture_side(sum(bool(entry.maps) for entry in here))
         self.ignored = {what for entry in here for what in entry.ignored}
-        if any(entry.numbers.get("d", [1.0])[:1] < [1.0] for entry in here):
+        if any(_opacity(entry) < 1 for entry in here):
             self.ignored.add("alpha")
         if any(max(entry.numbers.get("ke", [0.0]), default=0.0) > 0 for entry in here):
             self.ignored.add("emission")
@@ -127,12 +128,24 @@ class MtlMaterials:
             channels.pop("normal", None)
         return Material(channels)
 
+    def _read(self, file: str) -> bytes:
+        try:
+            return self._folder.read(file, "texture")
+        except UnirenderError as error:
+            option, *more = file.split()
+            if not option.startswith("-") or not more:
+                raise
+            raise UnirenderError(
+                f"texture {file[:80]!r}: got the option {option!r}, which is not known here, expected one of "
+                f"{', '.join(sorted(OPTIONS))} or a file name; take it out of the MTL"
+            ) from error
+
     def _texture(self, channel: str, file: str, options: dict[str, list[str]]) -> Texture:
         if not file:
             raise UnirenderError(f"its MTL has a map without a file name for {channel}; write the name")
         curve = srgb_decode if channel == "albedo" else linear
         if (file, curve) not in self._texels:
-            image = self._images.open(self._folder.read(file, "texture"), repr(file))
+            image = self._images.open(self._read(file), repr(file))
             self._texels[file, curve] = texels_of(image, repr(file), self._side, "RGB", curve)
         texels = self._texels[file, curve]
         if channel == "normal":
@@ -144,6 +157,13 @@ class MtlMaterials:
         transform = np.array([[su, 0, ou], [0, sv, 1 - sv - ov]])
         wrap = "clamp" if options.get("-clamp") == ["on"] else "repeat"
         return Texture(texels, 0, transform, (wrap, wrap))
+
+
+def _opacity(entry: MtlEntry) -> float:
+    """`d`, else 1 - `Tr`."""
+    if entry.numbers.get("d"):
+        return entry.numbers["d"][0]
+    return 1 - (entry.numbers.get("tr") or [0.0])[0]
 
 
 def _number(words: list[str] | None, default: float) -> float:

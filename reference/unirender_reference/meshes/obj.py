@@ -4,12 +4,15 @@ Polygons are cut into fans. Curves, points, lines and smoothing groups are left 
 ones (`load`).
 """
 
+import codecs
+import io
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -23,7 +26,7 @@ from unirender_reference.meshes.limits import (
     check_materials,
 )
 from unirender_reference.meshes.mtl import MtlEntry, MtlMaterials, parse_mtl
-from unirender_reference.meshes.surface import Model, Piece
+from unirender_reference.meshes.surface import BARE, Material, Model, Piece
 
 
 class _Lines:
@@ -31,6 +34,7 @@ class _Lines:
 
     def __init__(self) -> None:
         self.points, self.colors = array("d"), array("d")
+        self.colored = array("q")  # which points have a colour
         self.coordinates, self.normals = array("d"), array("d")
         self.corners = array("q")  # point, coordinate, normal of each corner, from 1; 0 for none
         self.sizes, self.materials = array("q"), array("q")  # of each polygon
@@ -42,7 +46,7 @@ class _Lines:
     def read(self, path: Path) -> None:
         with path.open("rb") as file:
             kept = b""
-            for number, line in enumerate(iter(lambda: file.readline(MAX_LINE_BYTES + 1), b""), start=1):
+            for number, line in enumerate(_each_line(file), start=1):
                 if len(kept) + len(line) > MAX_LINE_BYTES:
                     raise UnirenderError(f"line {number} has more than {MAX_LINE_BYTES:,} bytes, expected fewer")
                 if line.rstrip(b"\r\n").endswith(b"\\"):
@@ -67,6 +71,7 @@ class _Lines:
             )
             if len(values) >= 6:
                 self.colors.extend(map(float, values[3:6]))
+                self.colored.append(len(self.points) // 3 - 1)
             _check_vertices(len(self.points) // 3, "vertices")
         elif keyword == b"vt":
             values = rest.split()
@@ -102,6 +107,16 @@ class _Lines:
         check_faces(self._triangles)
 
 
+def _each_line(file: BinaryIO) -> Iterator[bytes]:
+    """Lines that end in LF, CR LF or, where the file has no LF, CR; one of too many bytes is cut off."""
+    head = file.read(MAX_LINE_BYTES)
+    file.seek(len(codecs.BOM_UTF8) if head.startswith(codecs.BOM_UTF8) else 0)
+    if b"\r" in head and b"\n" not in head:
+        text = io.TextIOWrapper(file, "latin-1", newline="\r")
+        return (line.encode("latin-1") for line in iter(lambda: text.readline(MAX_LINE_BYTES + 1), ""))
+    return iter(lambda: file.readline(MAX_LINE_BYTES + 1), b"")
+
+
 def _check_vertices(count: int, what: str) -> None:
     if count > MAX_VERTICES:
         raise UnirenderError(f"has more than {MAX_VERTICES:,} {what}; decimate the mesh")
@@ -130,45 +145,68 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
             "file?"
         )
     points = np.array(lines.points).reshape(-1, 3)
+    coordinates = np.array(lines.coordinates).reshape(-1, 2)
+    normals = np.array(lines.normals).reshape(-1, 3)
     corners = np.array(lines.corners, np.int64).reshape(-1, 3)
     triangles, polygon = _fans(np.array(lines.sizes, np.int64))
     owner = np.array(lines.materials, np.int64)[polygon]
-    order = np.argsort(owner, kind="stable")  # faces grouped by material
-    present, starts = np.unique(owner[order], return_index=True)
+    points_of, coordinates_of, normals_of = np.moveaxis(corners[triangles], -1, 0)  # (m, 3 corners) each, from 1
+    colors = _colors(lines, len(points))
     names = list(lines.names)
-    used = [names[i] for i in present]
+    used = [names[i] for i in np.unique(owner)]
     entries = _libraries(folder, lines.libraries) if any(name is not None for name in used) else {}
+    mapped = np.array([bool(name in entries and entries[name].maps) for name in names])
+    # Faces of a material that lack what its others have are a piece of their own.
+    kind = 8 * owner + 4 * (mapped[owner] & _lacking(coordinates_of, coordinates)) + 2 * (normals_of == 0).any(1)
+    kind += 0 if colors is None else _lacking(points_of, colors)
+    order = np.argsort(kind, kind="stable")
+    present, starts = np.unique(kind[order], return_index=True)
     materials = MtlMaterials(folder, entries, used)
-    coordinates = np.array(lines.coordinates).reshape(-1, 2)
-    normals = np.array(lines.normals).reshape(-1, 3)
-    colors = np.array(lines.colors).reshape(-1, 3) if len(lines.colors) == len(lines.points) > 0 else None
-    if colors is not None:
-        colors = srgb_decode(np.clip(np.nan_to_num(colors / (255 if colors.max() > 1 else 1)), 0, 1)).astype(np.float64)
     pieces = []
-    for name, group in zip(used, np.split(order, starts[1:]), strict=True):
-        index = corners[triangles[group]]  # (m, 3 corners, 3 kinds)
-        faces = _looked_up(index[..., 0], len(points), "vertex")
+    made: dict[tuple[str | None, bool, bool], Material] = {}
+    ignored = set(materials.ignored)
+    for number, group in zip(present // 8, np.split(order, starts[1:]), strict=True):
+        name = names[number]
+        faces = _looked_up(points_of[group], len(points), "vertex")
         if faces is None:
             raise UnirenderError("a face names vertex 0, OBJ counts from 1; export it again")
-        at = _looked_up(index[..., 1], len(coordinates), "texture coordinate")
-        turned = _looked_up(index[..., 2], len(normals), "normal")
+        at = _looked_up(coordinates_of[group], len(coordinates), "texture coordinate")
+        turned = _looked_up(normals_of[group], len(normals), "normal")
         uv = None if at is None else coordinates[at] * [1, -1] + [0, 1]  # v from below -> from the first row
         textured = uv is not None and bool(np.isfinite(uv).all())
-        mapped = "albedo" in entries[name].maps if name in entries else False
+        maps = entries[name].maps if name in entries else {}
+        own = None if colors is None else colors[faces]
+        if own is not None and np.isnan(own).any():
+            ignored |= set() if np.isnan(own).all() else {"colours of faces with a bare corner"}
+            own = None
+        ignored |= {BARE} if maps and not textured else set()
+        key = name, textured, own is not None
+        if key not in made:
+            made[key] = materials.make(*key)
         pieces.append(
             Piece(
                 vertices=points,
                 faces=faces,
                 normals=None if turned is None else normals[turned],
                 uv={0: uv} if uv is not None and textured else {},
-                colors=None if colors is None or mapped else colors[faces],
-                material=materials.make(name, textured, colors is not None),
+                colors=None if "albedo" in maps else own,
+                material=made[key],
             )
         )
-    ignored = set(materials.ignored)
     if any(name is not None and name not in entries for name in used):
         ignored.add("undefined materials")
     return Model(pieces, frozenset(ignored))
+
+
+def _colors(lines: _Lines, count: int) -> Float[np.ndarray, "n 3"] | None:
+    """Linear colours of the points, NaN where one has none; None where none has."""
+    if not lines.colored:
+        return None
+    stored = np.array(lines.colors).reshape(-1, 3)
+    colors = np.full((count, 3), np.nan)
+    linear = srgb_decode(np.clip(np.nan_to_num(stored / (255 if stored.max() > 1 else 1)), 0, 1))
+    colors[np.array(lines.colored)] = linear
+    return colors
 
 
 def _libraries(folder: ModelFolder, names: Iterable[str]) -> dict[str, MtlEntry]:
@@ -193,6 +231,12 @@ def _fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.
     first = (np.cumsum(sizes) - sizes)[polygon]
     step = np.arange(len(polygon)) - np.repeat(np.cumsum(count) - count, count)
     return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
+
+
+def _lacking(index: Int[np.ndarray, "m 3"], values: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " m"]:
+    """Faces of which a corner has no value, or one that is not finite; indices from 1."""
+    missing = np.append(~np.isfinite(values).all(-1), True)  # the last: index 0
+    return np.asarray(missing[np.clip(index, 0, len(values)) - 1].any(axis=1))
 
 
 def _looked_up(index: Int[np.ndarray, "m 3"], count: int, what: str) -> Int[np.ndarray, "m 3"] | None:

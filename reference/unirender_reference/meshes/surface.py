@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 Wrap = Literal["repeat", "mirror", "clamp"]
 IDENTITY = np.eye(2, 3)
+BARE = "textures of faces without coordinates"  # among what is ignored: they count as their mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +45,11 @@ class Material:
     """The channels of a surface; `albedo` always, `roughness` and `metallic` both or neither, `normal` or not."""
 
     channels: Mapping[str, Channel]
+
+    def has_smaller_textures(self) -> bool:
+        """Whether it has pictures of different size: the smaller ones are interpolated to the largest (`tiles`)."""
+        textures = [channel for channel in self.channels.values() if isinstance(channel, Texture)]
+        return len({texture.texels.shape[:2] for texture in textures} - {(1, 1)}) > 1
 
 
 @dataclass(frozen=True)

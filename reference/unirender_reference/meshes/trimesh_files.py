@@ -3,7 +3,9 @@
 trimesh trusts the counts of a header, so those are held against the size of the file first.
 """
 
+import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,15 @@ from unirender_reference.meshes.limits import (
     float32_step,
 )
 from unirender_reference.meshes.mtl import DEFAULT_ALBEDO
+from unirender_reference.meshes.off_colors import OffColors, read_off_colors
 from unirender_reference.meshes.surface import Channel, Material, Model, Piece, Texture
 
 PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)\s*$", re.MULTILINE)
 DOUBLE = re.compile(rb"^format ascii|^property (double|float64) x", re.MULTILINE)
+PLY_COLOR = re.compile(rb"^(property\s+\w+\s+)((?:diffuse_)?(?:red|green|blue)|[rgb])(?=\s*$)", re.MULTILINE)
+PLY_COLORS = ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")
+USUAL = {b"r": b"red", b"g": b"green", b"b": b"blue"}
+WHITE = Material({"albedo": np.ones(3, np.float32)})
 TEXTURE_COMMENT = re.compile(rb"^comment\s+TextureFile\s+(.+?)\s*$", re.MULTILINE)
 
 
@@ -48,10 +55,15 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
         head = file.read(65536)
     _check_claims(path.suffix.lower(), head, length)
     resolver = FolderResolver(folder)
-    scene = trimesh.load_scene(path, process=False, resolver=resolver)
+    renamed = _with_usual_colors(path, head) if path.suffix.lower() == ".ply" else None
+    if renamed is None:
+        scene = trimesh.load_scene(path, process=False, resolver=resolver)
+    else:
+        scene = trimesh.load_scene(renamed, file_type="ply", process=False, resolver=resolver)
     if resolver.error:
         raise resolver.error
     texture = _texture(folder, head)
+    off = read_off_colors(path) if path.suffix.lower() == ".off" else OffColors()
     pieces = []
     for mesh in scene.geometry.values():
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
@@ -59,8 +71,21 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
             if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
                 raise UnirenderError(f"its faces index outside the {len(mesh.vertices):,} vertices; export it again")
             step = 0.0 if DOUBLE.search(head) or path.suffix.lower() == ".off" else float32_step(mesh.vertices)
-            pieces.append(_piece(mesh, texture, step))
-    return Model(pieces, frozenset())
+            piece = _piece(mesh, texture, step)
+            pieces.append(piece if not off.known else replace(piece, colors=off.corners(piece.faces), material=WHITE))
+    return Model(pieces, frozenset({"colours"} if off.left_out else ()))
+
+
+def _with_usual_colors(path: Path, head: bytes) -> io.BytesIO | None:
+    """The file with `red green blue` for the properties `diffuse_red ...` or `r g b`, where it has these alone."""
+    header = head.partition(b"end_header")[0]
+    spelled = [name.decode() for _, name in PLY_COLOR.findall(header)]
+    if {"red", "green", "blue"} <= set(spelled) or not any(set(names) <= set(spelled) for names in PLY_COLORS):
+        return None
+    full = PLY_COLOR.sub(lambda found: found[1] + USUAL[found[2].removeprefix(b"diffuse_")[:1]], header)
+    with path.open("rb") as file:
+        file.seek(len(header))
+        return io.BytesIO(full + file.read())
 
 
 def _check_claims(suffix: str, head: bytes, length: int) -> None:

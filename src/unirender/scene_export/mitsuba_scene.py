@@ -16,6 +16,7 @@ from unirender.files import write_png
 from unirender.lighting import sample_environment
 from unirender.scene_export.card import Card
 
+FAR_CLIP = 1e4  # Mitsuba's own
 MOST_VERTICES = 1024  # along a side of the card's grid
 LATLONG_ROWS = 256  # of the finest map that a coarse light is interpolated to
 
@@ -81,6 +82,7 @@ def scene_xml(card: Card) -> str:
         offset_x=repr(0.5 - float(principal[0])),
         offset_y=repr(0.5 - float(principal[1])),
         distance=repr(card.distance),
+        far_clip=f'<float name="far_clip" value="{2 * card.distance!r}"/>' if card.distance > FAR_CLIP / 2 else "",
         width=card.width,
         height=card.height,
         base_color=_texture("base_color", raw=False),
@@ -105,7 +107,7 @@ _SCENE = """<scene version="3.0.0">
   </integrator>
   <sensor type="perspective">
     <float name="fov" value="{fov}"/>
-    <string name="fov_axis" value="y"/>
+    <string name="fov_axis" value="y"/>{far_clip}
     <float name="principal_point_offset_x" value="{offset_x}"/>
     <float name="principal_point_offset_y" value="{offset_y}"/>
     <transform name="to_world"><lookat origin="0, 0, {distance}" target="0, 0, 0" up="0, 1, 0"/></transform>
