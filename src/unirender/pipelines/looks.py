@@ -10,7 +10,6 @@ and light are the mean over looks with the channels in their order, roughness an
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -66,7 +65,7 @@ def check_looks(looks: Any, mode: str) -> int:
     Raises:
         UnirenderError: it is no such number, or samples are drawn, whose spread a mean would hide.
     """
-    if isinstance(looks, bool) or not isinstance(looks, Integral) or not 1 <= looks <= len(LOOKS):
+    if isinstance(looks, bool) or not isinstance(looks, int | np.integer) or not 1 <= looks <= len(LOOKS):
         raise UnirenderError(f"looks: got {looks!r}, expected a whole number from 1 to {len(LOOKS)}")
     if looks > 1 and mode != "mean":
         raise UnirenderError(f"looks: got {looks} in mode {mode}, whose samples are their own mean; use mode 'mean'")
