@@ -125,6 +125,11 @@ def test_a_picture_that_was_written_here_brings_its_camera(
     assert "2 pictures (2 of them from before)" in capsys.readouterr().out
     metas = [json.loads((tmp_path / "maps" / name / "meta.json").read_text()) for name in ("b.exr", "c.exr")]
     assert [meta["fov_deg"] for meta in metas] == [60, 36]
+    for name, meta in zip(("b.exr", "c.exr"), metas, strict=True):  # of a version that knew no looks
+        older = {key: value for key, value in meta.items() if key != "looks"}
+        (tmp_path / "maps" / name / "meta.json").write_text(json.dumps(older))
+    assert run("decompose", tmp_path / "film", "--output", tmp_path / "maps") == 0
+    assert "2 pictures (2 of them from before)" in capsys.readouterr().out
     assert run("decompose", tmp_path / "film", "--output", tmp_path / "maps", *given) == 1
     assert "is a result with another fov" in capsys.readouterr().err
 

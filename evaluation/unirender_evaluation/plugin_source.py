@@ -3,18 +3,21 @@
 They are the module that was named, and those that define the method's class and the classes below it; and what these
 import, by the import statements anywhere in them, from their own folder and below. The statements are read, not run:
 what counts depends neither on what else has been imported nor on what a method imports later. Of a file among the
-installed packages its own package counts, no other. What is found in other ways belongs into a method's `config`.
+installed packages its own package counts, no other, and of Python's own library nothing. What is found in other ways
+belongs into a method's `config`.
 """
 
 import ast
 import hashlib
 import inspect
+import sysconfig
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 INSTALLED = ("site-packages", "dist-packages")
+STANDARD_LIBRARY = Path(sysconfig.get_path("stdlib")).resolve()
 OURS = ("unirender", "unirender_evaluation", "unirender_reference")  # which have versions of their own
 
 
@@ -27,7 +30,7 @@ def source_sha256(kind: type, *makers: Any) -> str:
         *makers: what was called to make it, and the module that has it.
     """
     own = {file for file in map(_file, (kind, *makers)) if file is not None}
-    files = own | {file for file in map(_file, kind.__mro__) if file is not None}
+    files = own | {file for file in map(_file, kind.__mro__) if file is not None and not _is_pythons(file)}
     roots = {_root(file)[0] for file in own if not _is_installed(file)}
     waiting = [file for file in files if file in own or not _is_installed(file)]
     while waiting:
@@ -47,6 +50,10 @@ def _file(defined: Any) -> Path | None:
 
 def _is_installed(file: Path) -> bool:
     return any(part in INSTALLED for part in file.parts)
+
+
+def _is_pythons(file: Path) -> bool:
+    return file.is_relative_to(STANDARD_LIBRARY) and not _is_installed(file)
 
 
 def _imported(file: Path, roots: set[Path]) -> Iterator[Path]:

@@ -14,11 +14,12 @@ from unirender.errors import UnirenderError
 # How Pillow names the pixels it cuts -> names under which it keeps the high, and the low bytes.
 SIXTEEN = {"RGB;16B": ("RGB;16B", "RGB;16L"), "RGBA;16B": ("RGBA;16B", "RGBA;16L")}
 GREY_AND_ALPHA = "LA;16B"  # four bytes a pixel: the grey's, then the alpha's
-COLOURED = 2.5 / 255  # largest difference of the channels of a grey picture that was a JPEG's
+COLOURED = 0.1  # mean difference of the channels; a network's grey pictures have a hundredth
 
 
 def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
-    """Values in [0, 1] of a PNG; alpha is dropped. Grey is as good as three equal channels, and the reverse.
+    """Values in [0, 1] of a PNG; alpha is dropped. Grey is as good as three equal channels, and the reverse: of
+    channels that differ a little, one value a pixel is the mean.
 
     Raises:
         UnirenderError: not a readable PNG, or one in colour where `channels` is 1.
@@ -39,12 +40,13 @@ def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
     value = value if value.ndim == 3 else value[..., None]
     if channels == 3:
         return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value.astype(np.float32)
-    if (difference := float(np.ptp(value, axis=-1).max())) > COLOURED:
+    if (difference := float(np.ptp(value, axis=-1).mean())) > COLOURED:
         raise UnirenderError(
-            f"predictions: {path} is in colour: its channels differ by up to {difference:.2g}, expected one value a "
-            "pixel; write it as grey (of glTF's metallicRoughness: roughness is its green channel, metallic its blue)"
+            f"predictions: {path} is in colour: its channels differ by {difference:.2g} in the mean, expected one "
+            "value a pixel; write it as grey: of glTF's metallicRoughness, roughness is the green channel and metallic "
+            "the blue; of a network's three channels that should be one, their mean"
         )
-    return value[..., :1].astype(np.float32)
+    return value.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
 
 
 def _sixteen_bits(path: Path, stored: str) -> np.ndarray:

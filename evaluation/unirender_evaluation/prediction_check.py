@@ -18,6 +18,7 @@ from unirender_evaluation.tasks import PROTOCOLS, tasks
 
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
+NEAR = 0.7  # likeness of names, of `difflib`: that of `convention` is 0.95, that of `config` 0.47
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
 GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
@@ -156,7 +157,11 @@ def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
 
 
 def _is_settings(path: Path) -> bool:
-    return path.name.lower().endswith(SETTINGS_LIKE) and path.is_file()
+    """Whether a file is probably meant to be the conventions: a method's other settings do no harm."""
+    name = path.name.lower()
+    stem = name.removesuffix(".txt").removesuffix(".toml")
+    is_near = bool(difflib.get_close_matches(stem, [FILE.removesuffix(".toml")], cutoff=NEAR))
+    return name.endswith(SETTINGS_LIKE) and is_near and path.is_file()
 
 
 def _unread_settings(path: Path, folder: Path) -> str:

@@ -28,9 +28,9 @@ def mask_source(method: str, records: Iterable[Record]) -> Literal["own", "paste
 def doubts(method: str, records: Iterable[Record]) -> list[str]:
     """What a run's records say of a stranger's maps that is probably a mistake, a sentence each, for its note."""
     own = [record.values for record in records if record.method == method]
-    empty = sum(values.get(OWN_MASK) == 0 for values in own)
+    empty, masks = sum(values.get(OWN_MASK) == 0 for values in own), sum(OWN_MASK in values for values in own)
     away, normals = sum(FACING_AWAY in values for values in own), sum(NORMALS in values for values in own)
-    found = [f"its own mask meets the object on none of {empty} pictures (is it 0?)"] if empty else []
+    found = [f"its own mask misses the object on {empty} of {masks} pictures (is it 0?)"] if empty else []
     if away:
         found.append(
             f"its normals face away from the viewer on {away} of {normals} pictures (OpenCV axes? normal_axes in "

@@ -77,8 +77,9 @@ def score(
                 f"score: got pictures of {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
             )
         found = _mask(mask, t)
-        doubt = range_doubt(p, found)
-        if doubt is not None and range_doubt(t, found) is None:  # a truth of such values is of another exposure
+        usual = max(float(np.median(t[found[..., 0] > 0])), 1.0)
+        doubt = range_doubt(p, found, usual)
+        if doubt is not None and range_doubt(t, found, usual) is None:  # a truth of such values has other units, too
             raise UnirenderError(f"score: the prediction is in other units than the truth: {doubt}; convert it")
         values = score_image(p, t, found, quantity=quantity, **options)
     chosen = values if variant is None else {key: value for key, value in values.items() if _is_of(key, variant)}

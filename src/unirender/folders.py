@@ -36,7 +36,8 @@ RARE_SUFFIXES = (".avif", ".gif", ".j2k", ".jfif", ".jp2", ".mpo", ".pbm", ".pgm
 FIGURES = ("roughness_mean", "metallic_mean", "clipped", "remarks", "std_max")  # of `meta.json`, for the summary
 INPUT_SHA256 = "input_sha256"
 ELSEWHERE = ("device", "input")  # of `meta.json`: another machine or another path to the picture is no other setting
-AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # pictures of one batch of the network, and their pixels
+ADDED = {"looks": 1}  # settings that an older `meta.json` does not name, and what they were
+AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # looks at pictures of one batch of the network, and pixels of the pictures
 
 Read = Callable[[Path, Path | None], Picture]
 Decompose = Callable[[list[Picture]], "list[Decomposition]"]
@@ -155,7 +156,7 @@ def decompose_folder(
                 continue
             yield path, picture, meta | of_picture(picture)
 
-    for batch in batches(wanted()):
+    for batch in batches(wanted(), max(AT_ONCE // int(settings.get("looks", 1)), 1)):
         results = decompose([picture for _, picture, _ in batch])
         for (path, _, meta), result in zip(batch, results, strict=True):
             try:
@@ -174,14 +175,14 @@ def of_picture(picture: Picture) -> dict[str, Any]:
 
 
 def batches(
-    items: Iterable[tuple[Path, Picture, dict[str, Any]]],
+    items: Iterable[tuple[Path, Picture, dict[str, Any]]], most: int = AT_ONCE
 ) -> Iterator[list[tuple[Path, Picture, dict[str, Any]]]]:
-    """Groups of at most `AT_ONCE` pictures and about `PIXELS_AT_ONCE` pixels, in order."""
+    """Groups of at most `most` pictures and about `PIXELS_AT_ONCE` pixels, in order."""
     batch: list[tuple[Path, Picture, dict[str, Any]]] = []
     pixels = 0
     for item in items:
         height, width = item[1].image_srgb.shape[:2]
-        if batch and (len(batch) == AT_ONCE or pixels + height * width > PIXELS_AT_ONCE):
+        if batch and (len(batch) == most or pixels + height * width > PIXELS_AT_ONCE):
             yield batch
             batch, pixels = [], 0
         batch.append(item)
@@ -230,7 +231,9 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     now = json.loads(json.dumps(dict(meta), default=str))
-    differing = [name for name, value in now.items() if name not in ELSEWHERE and stored.get(name) != value]
+    differing = [
+        name for name, value in now.items() if name not in ELSEWHERE and stored.get(name, ADDED.get(name)) != value
+    ]
     if differing:
         said = ("picture or mask (a file changed since)" if name == INPUT_SHA256 else name for name in differing)
         raise UnirenderError(

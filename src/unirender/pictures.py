@@ -225,7 +225,7 @@ def _read_display_picture(path: Path) -> Picture:
 
 def _has_sixteen_bit_colors(path: Path) -> bool:
     """Whether Pillow drops half of the bits of a picture's channels, by how it would decode them."""
-    with Image.open(path) as file:
+    with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning), Image.open(path) as file:
         return not file.mode.startswith("I") and any(";16" in str(tile.args) for tile in file.tile)
 
 

@@ -382,7 +382,7 @@ def test_what_is_probably_a_mistake_is_noted(suite: Suite, tmp_path: Path) -> No
     n = len(suite.scenes[0].materials)
     assert doubts("guess", records) == []
     mask, normals = doubts("turned", records)
-    assert re.search(r"meets the object on none of \d+ pictures", mask)
+    assert re.search(r"misses the object on \d+ of \d+ pictures", mask)
     assert f"normals face away from the viewer on {n} of {n} pictures (OpenCV axes? normal_axes" in normals
 
 

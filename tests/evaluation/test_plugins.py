@@ -1,5 +1,6 @@
 """Methods that are not installed: found by file or by module, and every way in which that can fail, named."""
 
+import hashlib
 import subprocess
 import sys
 from pathlib import Path
@@ -166,6 +167,20 @@ def test_an_edited_neighbour_is_another_configuration(
     with (tmp_path / edited).open("a") as file:
         file.write("\n# edited\n")
     assert source_sha256(kind, kind) != before
+
+
+def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else another patch version of Python would be another method."""
+    bodies = {"plain_mine": "class Mine:\n", "abstract_mine": "from abc import ABC\nclass Mine(ABC):\n"}
+    for name, head in bodies.items():
+        (tmp_path / f"{name}.py").write_text(
+            head + "    name, config = 'mine', {}\n    def render(self, intrinsics): ...\n"
+        )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in bodies:
+        kind = type(named_plugin(f"{name}:Mine").method)
+        own = hashlib.sha256((tmp_path / f"{name}.py").read_bytes()).digest()
+        assert source_sha256(kind, kind) == hashlib.sha256(own).hexdigest()
 
 
 def test_an_installed_method_is_its_own_package_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

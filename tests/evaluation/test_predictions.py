@@ -84,7 +84,7 @@ def test_sixteen_bits_are_read_in_full(tmp_path: Path, colour_type: int, channel
     expected = values[..., :3] / 65535 if channels > 2 else values[..., [0, 0, 0]] / 65535
     np.testing.assert_allclose(read_png(tmp_path / "a.png", 3), expected, rtol=0, atol=1e-6)
     if channels > 2:
-        with pytest.raises(UnirenderError, match=r"a.png is in colour: .* metallic its blue"):
+        with pytest.raises(UnirenderError, match=r"a.png is in colour: .* metallic the blue"):
             read_png(tmp_path / "a.png", 1)
         write_png16(tmp_path / "a.png", np.broadcast_to(values[..., :1], values.shape), colour_type, filter_type)
     grey = read_png(tmp_path / "a.png", 1)
@@ -93,6 +93,15 @@ def test_sixteen_bits_are_read_in_full(tmp_path: Path, colour_type: int, channel
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:70])
     with pytest.raises(UnirenderError, match=r"a.png is not a readable PNG"):
         read_png(tmp_path / "a.png", 3)
+
+
+def test_channels_that_differ_a_little_are_one_value(tmp_path: Path) -> None:
+    """As a network's autoencoder writes a grey picture."""
+    rng = np.random.default_rng(0)
+    pixels = np.clip(rng.integers(40, 200, (8, 8, 1)) + rng.integers(-6, 7, (8, 8, 3)), 0, 255).astype(np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    expected = pixels.mean(axis=-1, keepdims=True) / 255
+    np.testing.assert_allclose(read_png(tmp_path / "a.png", 1), expected, atol=1e-6)
 
 
 def test_a_mask_among_the_maps_is_the_methods_own(suite: Suite, tmp_path: Path) -> None:
@@ -267,7 +276,7 @@ def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, co
     [
         (lambda picture, mask: 255 * picture, r"its median in the mask is .* \(0 to 255\?\)"),
         (lambda picture, mask: 2 * picture - mask, r"a tenth of its values in the mask is below .* \(-1 to 1\?\)"),
-        (lambda picture, mask: picture + (1 - mask), r"in the mean where no object is, .*premultiplied = false"),
+        (lambda picture, mask: picture + (1 - mask), r"\(median\) where no object is, .*premultiplied = false"),
     ],
 )
 def test_pictures_in_other_units_are_refused(suite: Suite, tmp_path: Path, change: Any, said: str) -> None:
@@ -288,6 +297,26 @@ def test_pictures_in_other_units_are_refused(suite: Suite, tmp_path: Path, chang
     if "premultiplied" in said:
         (tmp_path / "mine" / "conventions.toml").write_text("premultiplied = false\n")
         assert problems_of(suite, tmp_path / "mine") == ()
+
+
+def test_stray_pixels_and_ringing_are_scored(suite: Suite) -> None:
+    task = first(suite, "rendering", "given")
+    assert task.truth_image is not None
+    rng = np.random.default_rng(0)
+    made = (task.truth_image + (task.mask > 0) * rng.normal(0, 0.04, task.truth_image.shape)).astype(np.float32)
+    made[0, 0] = 300
+    made *= 5
+    row = make_row(SimpleNamespace(name="mine", config={}, render=lambda intrinsics: made), "external")
+    answered = engine.answer(row, task).image
+    assert answered is not None
+    np.testing.assert_array_equal(answered, made)
+
+
+def test_settings_of_a_method_do_no_harm(suite: Suite, tmp_path: Path) -> None:
+    answer_all(suite, tmp_path)
+    (tmp_path / "config.toml").write_text("steps = 3\n")
+    (tmp_path / "pyproject.toml").write_text("")
+    assert problems_of(suite, tmp_path) == ()
 
 
 def test_conventions_under_another_name_or_elsewhere_are_problems(suite: Suite, tmp_path: Path) -> None:

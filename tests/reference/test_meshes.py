@@ -236,6 +236,8 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "of faces": ("OFF", "", " 128 64 255", PURPLE, ""),
     "none": ("OFF", "", "", np.full(3, 0.5), ""),
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
+    "words": ("OFF", "", " a b c", np.full(3, 0.5), "colours"),
+    "words of vertices": ("COFF", " a b c", "", np.full(3, 0.5), "colours"),
     "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", np.full(3, 0.5), "colours"),
 }
 

@@ -171,6 +171,35 @@ def test_faces_without_normals_leave_the_others_theirs(tmp_path):
     assert obj.normals[~turned] == pytest.approx(np.tile([0, 0, 1], ((~turned).sum(), 1)))
 
 
+@pytest.mark.parametrize("lacking", ["coordinates", "colours"])
+def test_faces_smooth_across_what_some_of_them_lack(tmp_path, lacking):
+    """Faces without `vt` or a colour were a piece of their own, and a crease ran around it."""
+    (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
+    sphere = trimesh.creation.icosphere(2)
+    points = sphere.vertices.tolist()
+
+    def normals(some: bool) -> np.ndarray:
+        """Of each point."""
+        color = [" 1 0 0" if not some or i % 7 else "" for i in range(len(points))] if lacking == "colours" else None
+        head = [f"v {x} {y} {z}{color[i] if color else ''}" for i, (x, y, z) in enumerate(points)]
+        head += [f"vt {x} {y}" for x, y, _ in points]
+        faces = [
+            "f " + " ".join(f"{v}/{v}" if not some or i % 7 or color else f"{v}" for v in face)
+            for i, face in enumerate((sphere.faces + 1).tolist())
+        ]
+        material = "Kd 1 1 1" if color else "map_Kd a.png"
+        obj = write(tmp_path, material, "\n".join(faces), "\n".join(head) + "\n")
+        assert (obj.provenance["meshes"], bool(obj.provenance["ignored"])) == (("2", True) if some else ("1", False))
+        radial = obj.vertices / np.linalg.norm(obj.vertices, axis=1, keepdims=True)
+        at = np.argmax(radial @ sphere.vertices.T, axis=1)
+        own = np.full((len(points), 3), np.nan)
+        own[at] = obj.normals
+        assert own[at] == pytest.approx(obj.normals, abs=1e-5)  # one normal at each point
+        return own
+
+    assert normals(True) == pytest.approx(normals(False), abs=1e-5)
+
+
 @pytest.mark.parametrize("written", ["\r", "\r\n", "tab", "bom"])
 def test_line_ends_tabs_and_a_byte_order_mark(tmp_path, written):
     """Keywords behind a byte order mark or before a tab were passed over, and files with CR alone were one line."""
@@ -227,7 +256,11 @@ TIFFS = {
     "16 bits in 32": (np.int32, 16384, 0.25),
     "31 bits": (np.int32, 1 << 29, 0.25),
     "a negative number": (np.int32, -1, r"got numbers from -1, expected 0 and more"),
+    "a float rounded up": (np.float32, 1.0000001, 1.0),
+    "a float of resampling": (np.float32, -1e-4, 0.0),
     "a float above 1": (np.float32, 1.5, r"got floats from 1.5 to 1.5, expected \[0, 1\]"),
+    "a float a little above 1": (np.float32, 1 + 2**-9, r"got floats from 1.00195312 to 1.00195312, expected"),
+    "a float below 0": (np.float32, -(2**-9), r"got floats from -0.00195312"),
     "no number": (np.float32, np.nan, r"got floats from nan"),
 }
 

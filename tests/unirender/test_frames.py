@@ -180,6 +180,7 @@ def test_batches_are_bounded() -> None:
     items: list[Any] = [(Path("a"), picture, {}) for picture in [small] * (AT_ONCE + 1) + [large, large, small]]
     assert [len(batch) for batch in batches(items)] == [AT_ONCE, 2, 2]
     assert [item for batch in batches(items) for item in batch] == items
+    assert max(len(batch) for batch in batches(items, 1)) == 1
 
 
 def make_frame(folder: Path, picture: Path, albedo: float, wide: int = 6, roughness: float = 0.5) -> tuple[Path, Path]:

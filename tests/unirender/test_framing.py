@@ -57,22 +57,22 @@ def test_a_cut_out_object_is_reduced_and_not_enlarged() -> None:
 
 
 def test_haze_and_stray_pixels_are_left_out_only_where_they_hardly_count() -> None:
-    mask = disc(128, 128, 64, 64, 12)
+    mask = disc(128, 128, 64, 64, 20)
     cut = Frame.around(mask, SIZE)
     for haze in (1e-4, 1 / 255, FAINT):
         assert Frame.around(np.maximum(mask, np.float32(haze)), SIZE) == cut
     assert Frame.around(np.maximum(mask, np.float32(FAINT + 0.01)), SIZE).cut is None
     stray = mask.copy()
-    stray[0, 0] = stray[127, 5] = 1
+    stray[0, 0] = 1
     assert Frame.around(stray, SIZE) == cut
-    stray[126, 6] = 1  # touches at a corner: a part of two
+    stray[127, 5] = stray[126, 6] = 1  # they touch at a corner: a part of two
     assert Frame.around(stray, SIZE).cut is None
     np.testing.assert_array_equal(visible_parts(stray)[[0, 127, 126], [0, 5, 6]], [False, True, True])
 
 
 def test_what_is_left_out_is_no_part_of_the_object() -> None:
     """It has coverage, and neither a surface nor a say in the material of the whole."""
-    mask = disc(128, 128, 64, 64, 14)
+    mask = disc(128, 128, 64, 64, 20)
     haze, stray = np.maximum(mask, np.float32(1 / 255)), mask.copy()
     stray[0, 0] = 1
     picture = np.full((128, 128, 3), 0.5, np.float32)
@@ -80,7 +80,7 @@ def test_what_is_left_out_is_no_part_of_the_object() -> None:
     ways: list[dict[str, Any]] = [{}, {"tile": True, "size": 32}, {"material": "map"}]
     for settings in ways:
         clean = pipeline.decompose(picture, mask, **settings)
-        for given, tolerance in ((stray, 1e-6), (haze, 0.1)):  # haze in the square adds some background to what is seen
+        for given, tolerance in ((stray, 1e-5), (haze, 0.1)):  # haze in the square adds some background to what is seen
             found = pipeline.decompose(picture, given, **settings)
             assert found.roughness == pytest.approx(clean.roughness, rel=max(tolerance / 10, 1e-4))
             assert found.metallic == pytest.approx(clean.metallic, rel=max(tolerance / 10, 1e-4))

@@ -17,6 +17,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
 _LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
 BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED = 258, 339, 2  # TIFF tags, and a value of the second
 STRIP = 500_000  # stored pixels made float at a time
+SLACK = 1e-3  # by which floats may miss [0, 1]: rounding, resampling
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
 
 
@@ -111,12 +112,12 @@ def _eight_bits(image: Image.Image, name: str) -> Image.Image:
         return image
     values = np.asarray(image)
     if image.mode == "F":
-        if not (values.min() >= 0 and values.max() <= 1):  # NaN is neither
+        if not (values.min() >= -SLACK and values.max() <= 1 + SLACK):  # NaN is neither
             raise UnirenderError(
-                f"texture {name}: got floats from {values.min():g} to {values.max():g}, expected [0, 1]; export it as "
-                "PNG"
+                f"texture {name}: got floats from {values.min():.9g} to {values.max():.9g}, expected [0, 1]; export it "
+                "as PNG"
             )
-        return Image.fromarray(np.round(values * 255).astype(np.uint8))
+        return Image.fromarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
     tags = getattr(image, "tag_v2", {})  # of a TIFF; other formats have 16 bits
     bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
     if bits == 32 and not signed:

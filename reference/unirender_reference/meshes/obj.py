@@ -1,13 +1,14 @@
 """Wavefront OBJ: polygons of any size, absolute and relative indices, materials, vertex colours.
 
 Polygons are cut into fans. Curves, points, lines and smoothing groups are left out: faces without normals get creased
-ones (`load`).
+ones (`normals`).
 """
 
 import codecs
 import io
 from array import array
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,9 +24,11 @@ from unirender_reference.meshes.limits import (
     MAX_VERTICES,
     check_bytes,
     check_faces,
+    check_geometry,
     check_materials,
 )
 from unirender_reference.meshes.mtl import MtlEntry, MtlMaterials, parse_mtl
+from unirender_reference.meshes.normals import piece_normals
 from unirender_reference.meshes.surface import BARE, Material, Model, Piece
 
 
@@ -195,7 +198,25 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
         )
     if any(name is not None and name not in entries for name in used):
         ignored.add("undefined materials")
-    return Model(pieces, frozenset(ignored))
+    return Model(_smoothed(pieces, present // 8), frozenset(ignored))
+
+
+def _smoothed(pieces: list[Piece], owners: Int[np.ndarray, " k"]) -> list[Piece]:
+    """Gives the pieces of one material that have no normals those of all its faces without, as if it were not split."""
+    bare = np.array([piece.normals is None for piece in pieces])
+    split = [i for i in np.unique(owners[bare]) if (bare & (owners == i)).sum() > 1]
+    if split:
+        check_geometry(np.concatenate([piece.vertices[piece.faces] for piece in pieces]), step=0)
+    result = list(pieces)
+    for owner in split:
+        parts = np.flatnonzero(bare & (owners == owner))
+        first = pieces[parts[0]]
+        faces = np.concatenate([pieces[k].faces for k in parts])
+        normals = piece_normals(Piece(first.vertices, faces, None, {}, None, first.material))
+        ends = np.cumsum([len(pieces[k].faces) for k in parts])
+        for k, own in zip(parts, np.split(normals, ends[:-1]), strict=True):
+            result[k] = replace(pieces[k], normals=own)
+    return result
 
 
 def _colors(lines: _Lines, count: int) -> Float[np.ndarray, "n 3"] | None:

@@ -44,7 +44,8 @@ class OffColors:
 def read_off_colors(path: Path) -> OffColors:
     """The colours of a file that trimesh has read.
 
-    Where some vertices or faces have none, and on faces with more than three corners, they are left out.
+    Where some vertices or faces have none, where words stand in their place, and on faces with more than three corners,
+    they are left out.
     """
     text = re.sub(r"#[^\n]*", "", path.read_text("utf-8", "replace"))
     head, _, body = text.partition("OFF")
@@ -63,5 +64,8 @@ def _linear(numbers: list[list[str]]) -> Float[np.ndarray, "n 3"] | None:
     if not numbers or {len(words) for words in numbers} - {3, 4}:
         return None
     whole = all(word.isdigit() for words in numbers for word in words[:3])
-    colors = np.array([words[:3] for words in numbers], np.float64) / (255 if whole else 1)
+    try:
+        colors = np.array([words[:3] for words in numbers], np.float64) / (255 if whole else 1)
+    except ValueError:  # words
+        return None
     return srgb_decode(np.clip(np.nan_to_num(colors), 0, 1).astype(np.float32)).astype(np.float64)

@@ -23,7 +23,7 @@ SMALL = 2 / 3  # an object whose square has at most this share of the picture's 
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
-STRAY = 0.005  # of what counts: parts of the mask that together hold less are not looked for
+STRAY = 0.001  # of what counts: parts of the mask that together hold less are not looked for
 MOST_LEFT_OUT = 0.01  # of what counts, whose maps nobody needs
 THUMBNAIL_SIDE = 32  # pixels
 

@@ -68,7 +68,10 @@ def check_looks(looks: Any, mode: str) -> int:
     if isinstance(looks, bool) or not isinstance(looks, int | np.integer) or not 1 <= looks <= len(LOOKS):
         raise UnirenderError(f"looks: got {looks!r}, expected a whole number from 1 to {len(LOOKS)}")
     if looks > 1 and mode != "mean":
-        raise UnirenderError(f"looks: got {looks} in mode {mode}, whose samples are their own mean; use mode 'mean'")
+        raise UnirenderError(
+            f"looks: got {looks} in mode {mode}, expected 1, since a mean would hide the spread of samples; use mode "
+            "'mean', which one step and one sample are"
+        )
     return int(looks)
 
 
