@@ -80,7 +80,7 @@ def test_what_is_left_out_is_no_part_of_the_object() -> None:
     ways: list[dict[str, Any]] = [{}, {"tile": True, "size": 32}, {"material": "map"}]
     for settings in ways:
         clean = pipeline.decompose(picture, mask, **settings)
-        for given, tolerance in ((stray, 1e-5), (haze, 0.1)):  # haze in the square adds some background to what is seen
+        for given, tolerance in ((stray, 1e-5), (haze, 0.2)):  # haze in the square adds some background to what is seen
             found = pipeline.decompose(picture, given, **settings)
             assert found.roughness == pytest.approx(clean.roughness, rel=max(tolerance / 10, 1e-4))
             assert found.metallic == pytest.approx(clean.metallic, rel=max(tolerance / 10, 1e-4))
