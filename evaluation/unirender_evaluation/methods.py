@@ -226,7 +226,8 @@ class CompositeOf:
     """Edits and relights with another method's decomposition and the closed-form composite: what its renderer has to
     beat.
 
-    Anchored: what the decomposition could not explain of the picture is carried over, by our pipeline's own rule.
+    By our pipeline's own rules, under another light s and d keep a part of what they have beyond their own, and, where
+    it is anchored, what the decomposition could not explain of the picture is carried over.
     """
 
     def __init__(self, base: Any, anchored: bool, edited: dict[str, Intrinsics] | None = None) -> None:
@@ -261,8 +262,12 @@ class CompositeOf:
         specular: Image | None = None,
         diffuse: Image | None = None,
     ) -> Image:
+        from unirender.pipelines.carried_light import with_carried_light
+
         before = self.base.decompose(image_srgb, mask, camera).replace(mask=mask)
         after = with_derived_light(before.replace(environment=environment, specular=specular, diffuse=diffuse))
+        derived = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        after = with_carried_light(before, after, derived)
         return self._answer(image_srgb, mask, before, after)
 
     def _answer(self, image_srgb: Image, mask: Mask, before: Intrinsics, after: Intrinsics) -> Image:

@@ -191,7 +191,7 @@ def test_a_light_is_chosen_turned_and_brought_along(server: Server, tmp_path: Pa
         assert page.ask(light) != predicted
         page.drag("#turn input[type=range]", 0.5, 0.8)
         turned = changed(page, city)
-        assert "nothing casts a shadow" in page.ask("return document.querySelector('#view').textContent")
+        assert "nothing casts a new shadow" in page.ask("return document.querySelector('#view').textContent")
         page.click("#light-section > button")
         page.upload("#own-light input[type=file]", tmp_path / "nan.exr")
         assert "NaN or infinite" in page.wait(SENTENCE)

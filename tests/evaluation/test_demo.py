@@ -190,7 +190,7 @@ def test_a_light_is_the_pipelines_and_can_be_turned(pipeline: UniRenderPipeline,
     turned = session.view(pipeline, subject, Controls(turn_deg=90))
     before, after = (maps.require("environment")["environment"] for maps in (subject.maps, turned.intrinsics))
     np.testing.assert_allclose(after, session.turned(before, 90), rtol=0, atol=1e-6)
-    assert "nothing casts a shadow" in turned.remarks[0]
+    assert "nothing casts a new shadow" in turned.remarks[0]
 
 
 def test_what_came_from_the_viewer_comes_from_the_right_after_a_quarter_turn() -> None:

@@ -21,6 +21,7 @@ from unirender.commands import MUCH_COARSE
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender.pictures import Picture
+from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.editing import anchor, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.inputs import as_environment, as_material
 from unirender.pipelines.results import Decomposition
@@ -156,7 +157,8 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
         light = turned(own if controls.light is None else as_environment(controls.light), controls.turn_deg)
         edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
         derived = ("specular", "diffuse")
-        remarks.append("Under a light that was changed, nothing casts a shadow.")
+        edited = with_carried_light(before, edited, derived)
+        remarks.append("Under a light that was changed, nothing casts a new shadow.")
     elif controls.roughness is not None:
         target = edited.require("roughness")["roughness"]
         edited = edited.replace(specular=specular_for_roughness(before, target)[0])

@@ -32,6 +32,7 @@ from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
+from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.framing import thumbnail
@@ -360,7 +361,8 @@ class UniRenderPipeline(DiffusionPipeline):
         """Decomposes, puts the object under another light, renders.
 
         s and d are derived from the predicted normal and roughness at the light's own resolution, unless they are
-        given.
+        given, and what the decomposition's s and d have beyond its own light is carried over
+        (`unirender.pipelines.carried_light`).
 
         Args:
             image_srgb: as for `decompose`.
@@ -392,6 +394,7 @@ class UniRenderPipeline(DiffusionPipeline):
         else:
             edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
         missing = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
+        edited = with_carried_light(before, edited, missing, shadows=shadows)
         derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)

@@ -1,0 +1,94 @@
+"""What a decomposition's s and d have beyond the light that they reveal, carried over to another light.
+
+Under another light, s and d are derived from the predicted normals and roughness alone. The decomposition's own s and d
+have more: shadows, what surfaces reflect onto one another, shape that the normals miss. All of it is in the ratio of
+them to what the same normals receive from the decomposition's own light. A part of it belongs to that light, so that it
+is carried over as far as the two lights do the same to the object: for d, and for s alike,
+
+    d_1 = D(L_1) exp(r K log clip((d_0 + e) / (D(L_0) + e), 1/3, 3)),    r = max(corr(log D(L_1), log D(L_0)), 0)
+
+D is what normals receive of a light without shadows (or with, where d_1 has them), and corr is taken over the object
+and the channels, each about its own mean. K is a smoothing, the wider the less the lights agree: fine detail of the
+ratio is what `unirender.pipelines.closure` put there, and rather the albedo's. Under its own light an object gets its
+own s and d back; under one that has nothing to do with it, nothing is carried.
+"""
+
+import math
+from collections.abc import Collection
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import uniform_filter
+
+from unirender.intrinsics import Intrinsics
+from unirender.pipelines.derived_light import derived_light
+from unirender.pipelines.revealed_light import agreeing_light
+
+MOST_RATIO = 3.0  # either way
+FLOOR = 0.02  # radiance added to both sides of each ratio: e
+EVEN = 0.05  # spread of log light over the object that all lights are taken to share: two even ones agree
+SMOOTHING = 0.13  # standard deviation of K where lights do not agree, of the side of a square as large as the object
+
+
+def with_carried_light(
+    before: Intrinsics, after: Intrinsics, names: Collection[str], *, shadows: bool = False
+) -> Intrinsics:
+    """The maps under another light, with what their own s and d have beyond their own light.
+
+    Args:
+        before: normal, roughness, specular, diffuse, mask, and the environment as the network predicts it.
+        after: the same maps, with s and d derived from another environment.
+        names: of specular and diffuse, those that were derived.
+        shadows: whether they were derived with the shadows that the picture's own surfaces cast.
+
+    Raises:
+        UnirenderError: a map is missing.
+    """
+    if not names:
+        return after
+    old, mask = before.require("specular", "diffuse", "mask"), before.require("mask")["mask"]
+    new = after.require(*names)
+    explained = derived_light(before, agreeing_light(before), names, mirrors=False, shadows=shadows)
+    carried = {}
+    for name in names:
+        trust = agreement(new[name], explained[name], mask)
+        log_ratio = np.log((old[name] + FLOOR) / (explained[name] + FLOOR))
+        bounded = np.clip(log_ratio, -math.log(MOST_RATIO), math.log(MOST_RATIO))
+        smooth = _smoothed(bounded, mask, SMOOTHING * (1 - trust) * math.sqrt(mask.sum()))
+        carried[name] = (new[name] * np.exp(trust * smooth)).astype(np.float32)
+    return after.replace(**carried)
+
+
+def agreement(
+    one: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]
+) -> float:
+    """r: how far two lights do the same to an object, in [0, 1].
+
+    Args:
+        one: s or d under the first light.
+        other: the same under the second; an own factor for each channel makes no difference.
+        mask: coverage.
+    """
+    if not mask.any():
+        return 0.0
+    logs = [np.log(light + FLOOR) for light in (one, other)]
+    first, second = (log - np.average(log, axis=(0, 1), weights=np.broadcast_to(mask, log.shape)) for log in logs)
+
+    def product(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]) -> float:
+        return float((mask * a * b).sum(dtype=np.float64) / (3 * mask.sum(dtype=np.float64))) + EVEN**2
+
+    alike = product(first, second) / math.sqrt(product(first, first) * product(second, second))
+    return min(max(alike, 0.0), 1.0)
+
+
+def _smoothed(
+    values: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], sigma: float
+) -> Float[np.ndarray, "h w 3"]:
+    """The values, averaged over the object alone: twice over a square, which has the standard deviation `sigma`."""
+    side = 1 + 2 * round((math.sqrt(6 * sigma**2 + 1) - 1) / 2)  # odd, so that nothing moves
+    if side <= 1:
+        return values
+    weighted = np.concatenate([values * mask, mask], axis=-1).astype(np.float32)
+    for _ in range(2):
+        weighted = uniform_filter(weighted, (side, side, 1), mode="constant")
+    return np.where(mask > 0, weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-6), 0)

@@ -1,0 +1,123 @@
+"""What s and d have beyond their own light, under another one."""
+
+import numpy as np
+import pytest
+
+from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import environment_directions
+from unirender.pipelines.carried_light import MOST_RATIO, agreement, with_carried_light
+from unirender.pipelines.derived_light import derived_light
+from unirender.pipelines.editing import under_light
+from unirender.pipelines.revealed_light import agreeing_light
+
+SIDE = 48
+NAMES = ("specular", "diffuse")
+
+
+def lamp(x: float, y: float, z: float, colour: tuple[float, float, float] = (1.0, 0.9, 0.7)) -> np.ndarray:
+    """A wide lamp in a dim sky."""
+    towards = np.array([x, y, z]) / np.linalg.norm([x, y, z])
+    glow = np.exp(4 * (environment_directions(16, 32) @ towards - 1))
+    return (0.1 + 3 * glow[..., None] * np.array(colour)).astype(np.float32)
+
+
+OWN = lamp(1, 1, 1)
+OPPOSITE = lamp(-1, -1, 0.4)
+
+
+def found(shadow: float = 0.6) -> Intrinsics:
+    """A ball whose right half lies in a shadow that its own light cannot explain."""
+    y, x = (np.mgrid[:SIDE, :SIDE].astype(np.float32) + 0.5) / SIDE * 2.4 - 1.2
+    z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
+    mask = (x**2 + y**2 < 1)[..., None].astype(np.float32)
+    bare = Intrinsics(
+        normal=np.stack([x, -y, z], axis=-1) * mask, roughness=0.5 * mask, mask=mask, environment=OWN, camera=Camera()
+    )
+    shade = np.where((np.abs(y) < 0.3)[..., None], shadow, 1).astype(np.float32)
+    return bare.replace(
+        **{name: value * shade for name, value in derived_light(bare, OWN, NAMES, shadows=False).items()}
+    )
+
+
+def relit(before: Intrinsics, environment: np.ndarray) -> tuple[Intrinsics, Intrinsics]:
+    """Without what is carried over, and with it."""
+    after = under_light(before, environment, "keep", mirrors=False)
+    return after, with_carried_light(before, after, NAMES)
+
+
+def error(one: Intrinsics, other: Intrinsics) -> float:
+    """Root mean square of log d and log s over the object."""
+    inside = one.require("mask")["mask"][..., 0] > 0
+    logs = [[np.log(maps.require(name)[name][inside] + 0.02) for name in NAMES] for maps in (one, other)]
+    return float(np.sqrt(np.mean(np.square(np.subtract(*logs)))))
+
+
+def test_under_its_own_light_an_object_gets_its_own_light_back() -> None:
+    before = found()
+    without, carried = relit(before, agreeing_light(before))
+    assert error(without, before) > 0.1
+    assert error(carried, before) < 0.02
+
+
+def test_a_shadow_is_carried_to_a_light_from_the_same_side_and_not_to_the_opposite_one() -> None:
+    before = found()
+    beside = lamp(1, 0.6, 1.3)
+    without, carried = relit(before, beside)
+    middle = np.s_[SIDE // 2 - 2 : SIDE // 2 + 2, SIDE // 3 : 2 * SIDE // 3]
+    change = carried.require("diffuse")["diffuse"][middle] / without.require("diffuse")["diffuse"][middle]
+    assert 0.5 < change.mean() < 0.9
+    without, carried = relit(before, OPPOSITE)
+    assert np.array_equal(carried.require("diffuse")["diffuse"], without.require("diffuse")["diffuse"])
+
+
+def test_what_is_carried_is_bounded_and_0_outside_of_the_object() -> None:
+    before = found(shadow=1e-4)
+    without, carried = relit(before, OWN)
+    for name in NAMES:
+        old, new = without.require(name)[name], carried.require(name)[name]
+        assert (new <= old * MOST_RATIO * 1.001).all()
+        assert (new >= old / MOST_RATIO / 1.001).all()
+        assert not new[before.require("mask")["mask"][..., 0] == 0].any()
+
+
+@pytest.mark.parametrize("names", [("diffuse",), ("specular",), ()])
+def test_light_that_is_given_stays_as_it_is(names: tuple[str, ...]) -> None:
+    before = found()
+    after, carried = (
+        under_light(before, OWN, "keep"),
+        with_carried_light(before, under_light(before, OWN, "keep"), names),
+    )
+    for name in NAMES:
+        same = np.array_equal(after.require(name)[name], carried.require(name)[name])
+        assert same == (name not in names), name
+
+
+def test_lights_agree_whatever_their_power_and_tint_and_not_where_they_come_from_other_sides() -> None:
+    ball = found().replace(specular=None, diffuse=None)
+    mask = ball.require("mask")["mask"]
+    own, tinted, opposite, even = (
+        derived_light(ball, light.astype(np.float32), ["diffuse"], shadows=False)["diffuse"]
+        for light in (OWN, 7 * OWN * np.array([1, 2, 0.5]), OPPOSITE, np.ones((16, 32, 3)))
+    )
+    assert agreement(own, own, mask) == pytest.approx(1, abs=1e-6)
+    assert agreement(own, tinted, mask) > 0.99
+    assert agreement(own, opposite, mask) == 0
+    assert agreement(even, 3 * even, mask) > 0.99, "two even lights do the same"
+    assert agreement(own, even, mask) < 0.15
+    assert agreement(own, own, 0 * mask) == 0, "of nothing"
+
+
+def test_the_finer_detail_is_carried_only_between_lights_that_agree() -> None:
+    before = found()
+    checks = np.indices((SIDE, SIDE)).sum(axis=0) % 2
+    detail = np.where(checks, 1.3, 1 / 1.3).astype(np.float32)[..., None]
+    speckled = before.replace(**{name: before.require(name)[name] * detail for name in NAMES})
+    for environment, least, most in ((agreeing_light(speckled), 0.9, 1.1), (lamp(1, 0.2, 1.6), 0.0, 0.2)):
+        smooth, fine = relit(before, environment)[1], relit(speckled, environment)[1]
+        log_ratio = np.log(fine.require("diffuse")["diffuse"] + 1e-6) - np.log(
+            smooth.require("diffuse")["diffuse"] + 1e-6
+        )
+        inside = np.s_[SIDE // 3 : 2 * SIDE // 3, SIDE // 3 : 2 * SIDE // 3]
+        share = np.mean(log_ratio[inside] * np.log(detail[inside])) / np.log(1.3) ** 2
+        assert least <= share <= most
