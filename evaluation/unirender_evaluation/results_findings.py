@@ -97,7 +97,7 @@ def _word(found: Comparison) -> str:
 
 
 def against_trivial(results: Results, questions: Sequence[Question]) -> str:
-    """A table with a line for each question: row `a`, the best trivial row, their difference, the best that is possible.
+    """A table with a line for each question: row `a`, the best trivial row, their difference, the best possible.
 
     That is the noise ceiling where there is one. Questions that row `a` or all trivial rows have no answer to are left
     out.
