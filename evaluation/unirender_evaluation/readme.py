@@ -3,7 +3,8 @@
     python -m unirender_evaluation.readme RUN [--readme README.md] [--stored FOLDER] [--of CHECKPOINT]
 
 `RUN` is the folder that `unirender bench run` wrote, or its results file. The README gets tables of the suite and the
-facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`.
+facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`; of
+`standard` also a table of a few lines, `STANDING`.
 The stored folder (`evaluation/results` of a checkout, which the documentation reads) gets a folder by the name of the
 suite, with every value (`results.json.gz`) and one Markdown file per table; from that file the command makes both anew.
 Its rows of ours must be those of the shipped checkpoint that the suite takes by itself. With `--of` those of another
@@ -24,9 +25,11 @@ from unirender.errors import UnirenderError
 from unirender.files import checkpoint_sha256
 from unirender.shipped import checkpoint_folder, shipped_for, shipped_names, trained_pixels
 from unirender_evaluation.claims import OPTIMISED
+from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import NAME, PACKED, Results
 from unirender_evaluation.results_file import read_results, write_results
+from unirender_evaluation.results_findings import Question, against_trivial
 from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.table_list import ALL_TABLES
@@ -34,6 +37,7 @@ from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.tasks import LIGHT
 
 SHIPPED_SUITE = "tiny"
+STANDING_SUITE = "standard"
 SHOWN = (  # table, protocol, subset
     ("rendering", "from-image", "main"),
     ("inverse", "single-image", "main"),
@@ -43,6 +47,17 @@ SHOWN = (  # table, protocol, subset
     ("physics", "physics", "main"),
 )
 HEADLINES = SHOWN[:3]
+OURS = "ours-mean"
+STANDING = (
+    Question("albedo", "inverse", "single-image", "albedo", "psnr", OURS),
+    Question("normals", "inverse", "single-image", "normal", "cosine", OURS),
+    Question("roughness", "inverse", "single-image", "roughness", "mse", OURS),
+    Question("metallic", "inverse", "single-image", "metallic", "mse", OURS),
+    Question("light, on a matte ball", *LIGHT, MATTE_BALL, "rmse_relative", OURS, scale="aligned"),
+    Question("edit of metallic", "rendering", "from-image", "edit_metallic", "psnr", OURS),
+    Question("edit of roughness", "rendering", "from-image", "edit_roughness", "psnr", OURS),
+    Question("relit by a given HDRI", "relighting", "from-image-hdri", "relit", "psnr", OURS),
+)
 
 
 def whole_run(path: Path) -> tuple[Results, list[Table]]:
@@ -141,6 +156,16 @@ def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = S
     return "\n".join(to_markdown(table) for table in chosen)
 
 
+def standing_text(results: Results) -> str:
+    """Our row against the best that needs no model: `STANDING`, and what it was measured on."""
+    run, objects = results.run, len({record.object for record in results.records})
+    facts = (
+        f"`{shipped_for(run.resolution).name}` on `{run.suite}`: {objects} objects, none of them trained on, at "
+        f"{run.resolution} x {run.resolution} pixels ({run.date}). Inside the mask, sRGB, not aligned but for the ball."
+    )
+    return f"{against_trivial(results, STANDING)}\n{facts}"
+
+
 def store(folder: Path, results: Results, tables: Sequence[Table]) -> None:
     """Every value, and one Markdown file per table, numbered in order; those of an earlier run with other tables go."""
     write_results(folder / (NAME + PACKED), results.run, results.records)
@@ -185,6 +210,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
             slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
             text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")
+            if suite == STANDING_SUITE:
+                text = fill(text, "standing", standing_text(results))
             facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=trained_pixels)))
             arguments.readme.write_text(fill(text, "checkpoint", facts))
         if arguments.stored:

@@ -1,9 +1,11 @@
-"""Questions put to stored results, answered in Markdown: what the page *What the tables say* is made of.
+"""Questions put to stored results, answered in Markdown: what the page *What the tables say* is made of, and the
+table at the top of the README.
 
 Nothing is measured here: every figure is a mean of records, or a paired difference of two rows over the samples that
 both answered, with the interval over objects.
 """
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +29,10 @@ _THIRDS = (("0 to 0.3", 0.0, 0.35), ("0.4 to 0.6", 0.35, 0.65), ("0.7 to 1", 0.6
 
 @dataclass(frozen=True)
 class Question:
-    """One number of row `a` against that of row `b`; `scale`: how it is aligned, where its metric has such variants."""
+    """One number of row `a` against that of row `b`, or of the best trivial row (`against_trivial`).
+
+    `scale`: how it is aligned, where its metric has such variants.
+    """
 
     text: str
     table: str
@@ -35,7 +40,7 @@ class Question:
     quantity: str
     metric: str
     a: str
-    b: str
+    b: str = ""
     scale: Scale = "raw"
 
     @property
@@ -76,15 +81,59 @@ def _answer(results: Results, question: Question) -> list[str]:
     metric = question.kind
     found = compare(records, metric, question.key, question.a, question.b)
     means = [f"{np.mean([values[sample] for sample in shared]):.{metric.decimals}f}" for values in (a, b)]
+    counts = f"{found.difference.n} ({found.difference.clusters})"
+    return [question.text, *labels, *means, _difference(found, metric), _word(found), counts]
+
+
+def _difference(found: Comparison, metric: Metric) -> str:
     difference, decimals = found.difference, metric.decimals
-    shown = f"{difference.mean:+.{decimals}f} [{difference.low:+.{decimals}f}, {difference.high:+.{decimals}f}]"
-    return [question.text, *labels, *means, shown, _word(found), f"{difference.n} ({difference.clusters})"]
+    return f"{difference.mean:+.{decimals}f} [{difference.low:+.{decimals}f}, {difference.high:+.{decimals}f}]"
 
 
 def _word(found: Comparison) -> str:
     if not found.decided:
         return "one object: no interval"
     return "**A is better**" if found.a_beats_b else "**B is better**" if found.b_beats_a else "no difference shown"
+
+
+def against_trivial(results: Results, questions: Sequence[Question]) -> str:
+    """A table with a line for each question: row `a`, the best trivial row, their difference, the best possible.
+
+    That is the noise ceiling where there is one. Questions that row `a` or all trivial rows have no answer to are left
+    out.
+
+    Raises:
+        UnirenderError: no question is left.
+    """
+    lines = [line for question in questions if (line := _against_trivial(results, question))]
+    if not lines:
+        raise UnirenderError("against trivial rows: no question has answers of our row and of a trivial one; run both")
+    return _table(["", _label(results, questions[0].a), "without a model", "difference [95 %]", "perfect"], lines)
+
+
+def _against_trivial(results: Results, question: Question) -> list[str] | None:
+    metric = question.kind
+    records = Selection(question.table, question.protocol).of(results.records)
+
+    def means(kind: str) -> dict[str, float]:
+        rows = [info.key for info in results.run.methods if info.kind == kind]
+        found = {row: list(values_of(records, row, question.key).values()) for row in rows}
+        return {row: float(np.mean(values)) for row, values in found.items() if values}
+
+    ours, trivial, ceilings = means("ours").get(question.a), means("trivial"), means("ceiling")
+    if ours is None or not trivial:
+        return None
+    best = min(trivial, key=lambda row: -trivial[row] if metric.higher_is_better else trivial[row])
+    found = compare(records, metric, question.key, question.a, best)
+    perfect = ceilings.get("noise-ceiling", metric.perfect)
+    unit = f" ({metric.unit})" if metric.unit else ""
+    return [
+        f"{question.text}, {metric.label}{unit} {metric.arrow}",
+        f"{ours:.{metric.decimals}f}",
+        f"{trivial[best]:.{metric.decimals}f} ({_label(results, best)})",
+        _difference(found, metric),
+        "∞" if math.isinf(perfect) else f"{perfect:.{metric.decimals}f}",
+    ]
 
 
 def together(runs: Mapping[str, Results]) -> Results:

@@ -93,6 +93,23 @@ def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> Non
     assert "21.50" in after
 
 
+def test_the_readme_says_where_our_row_stands_on_the_suite_that_strangers_read(tmp_path: Path) -> None:
+    run = write_example(tmp_path / "run", suite="standard")
+    for i in range(2):
+        values = {"albedo.psnr@masked-srgb-raw": 24.0}
+        record = Record("inverse", "single-image", "ours-mean", f"s{i}", f"object{i}", values, key=f"o{i}")
+        append_record(run / "records.jsonl", record)
+    weights = {"weights": checkpoint_sha256(checkpoint_folder("tiny"))}
+    methods = (MethodInfo("mine", "Mine", "trivial"), MethodInfo("ours-mean", "Ours (mean)", "ours", config=weights))
+    write_run(run / "run.json", RunInfo("standard", "0" * 64, 64, methods, date="2026-11-21"))
+    target = tmp_path / "README.md"
+    target.write_text(README + SLOT.format("results-standard") + SLOT.format("standing"))
+    assert readme.main([str(run), "--readme", str(target)]) == 0
+    standing = target.read_text().split("<!-- standing:begin -->")[1]
+    assert "| albedo, PSNR (dB) ↑ | 24.00 | 21.50 (Mine) |" in standing
+    assert "`tiny` on `standard`: 2 objects" in standing
+
+
 @pytest.mark.parametrize(("scenes", "option"), [(4, ""), (24, " --optimise-scenes 24"), (0, "")])
 def test_the_command_says_how_many_scenes_were_optimised(scenes: int, option: str) -> None:
     records = [Record(*LIGHT, OPTIMISED, f"s{i}", f"o{i}", {"light.log_rmse": 1.0}) for i in range(scenes)]

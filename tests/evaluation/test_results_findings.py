@@ -13,6 +13,7 @@ from unirender_evaluation.results_data import Results, definitions
 from unirender_evaluation.results_findings import (
     NOT_RUN,
     Question,
+    against_trivial,
     answers,
     by_material,
     by_object,
@@ -52,6 +53,27 @@ def test_an_answer_is_both_means_over_shared_samples_and_the_paired_difference()
     assert found == [["albedo", *rows, *means, "+8.00 [+8.00, +8.00]", "**A is better**", "4 (2)"]]
     backwards = lines(answers(small_results(), [question("input-as-albedo", "ours-mean")]))
     assert backwards[0][5:7] == ["-8.00 [-8.00, -8.00]", "**B is better**"]
+
+
+def test_our_row_stands_against_the_best_trivial_one_and_what_is_possible() -> None:
+    one = small_results()
+    worse = [replace(r, method="mean-albedo", values={metric_key("albedo", "psnr"): 9.0}) for r in small_records()]
+    worse = [r for r in worse if r.table == "inverse"][:4]
+    run = replace(RUN, methods=(replace(METHODS[1], key="mean-albedo", label="mean albedo"), *METHODS))
+    asked = [
+        Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-mean"),
+        Question("roughness", "inverse", "single-image", "roughness", "mse", "ours-mean"),
+        Question("relit", "relighting", "from-image-hdri", "relit", "psnr", "ours-mean"),
+        Question("normals", "inverse", "single-image", "normal", "cosine", "ours-mean"),  # nobody's
+    ]
+    both = replace(one, run=run, records=(*one.records, *worse))
+    shown = lines(against_trivial(both, asked))
+    assert shown[0] == ["albedo, PSNR (dB) ↑", "20.75", "12.75 (input as albedo)", "+8.00 [+8.00, +8.00]", "46.75"]
+    assert shown[1][:3] == ["roughness, MSE ↓", "0.0482", "0.0786 (input as albedo)"]
+    assert shown[2][0::4] == ["relit, PSNR (dB) ↑", "∞"]
+    assert len(shown) == 3
+    with pytest.raises(UnirenderError, match="run both"):
+        against_trivial(small_results(methods=("ours-mean",)), asked)
 
 
 def test_rows_of_two_runs_of_a_suite_are_paired_by_sample() -> None:

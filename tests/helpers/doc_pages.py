@@ -5,11 +5,10 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-import torch
 from accelerate.tracking import GeneralTracker, on_main_process
 from inline_executor import Inline
 from reference_scenes import environment, sphere
@@ -21,8 +20,6 @@ from unirender.color import image_srgb, unpremultiply
 from unirender.exr import image_channels, write_exr
 from unirender.files import write_png
 from unirender.training.groups import read_groups
-from unirender.training.source import ShardSource
-from unirender.training.trainer import RunConfig, Trainer
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.prediction_check import folder_problems, questions
 from unirender_evaluation.predictions import PredictionFolder
@@ -154,35 +151,38 @@ class MyTracker(GeneralTracker):
     name = "mine"
     requires_logging_directory = False
 
-    def __init__(self) -> None:
+    told: ClassVar[list[dict[str, Any]]] = []
+
+    def __init__(self, run_name: str = "") -> None:
         super().__init__()
-        self.lines: list[dict[str, Any]] = []
 
     @property
     def tracker(self) -> list[dict[str, Any]]:
-        return self.lines
+        return self.told
 
     @on_main_process
     def store_init_configuration(self, values: dict[str, Any]) -> None:
-        self.lines.append(values)
+        self.told.append(values)
 
     @on_main_process
     def log(self, values: dict[str, Any], step: int | None = None, **options: Any) -> None:
-        self.lines.append(values)
+        self.told.append(values)
 
 
 def training() -> Names:
-    """Pictures with maps, and a run of one step."""
-    config = dataclasses.replace(TRAIN, batch_size=2)
-    trainer = Trainer(config, RunConfig(Path("run"), steps=1, log_every=1), torch.device("cpu"), torch.float32)
-    source = ShardSource(write_dataset(Path("shards"), size=32), config.batch_size, config.seed)
+    """Pictures with maps, and a data set."""
+    MyTracker.told.clear()
+    write_dataset(Path("data"), size=32)
     pictures = {"mug": own_picture(0), "cup": own_picture(1)}
-    return {"pictures": pictures, "config": config, "trainer": trainer, "source": source, "MyTracker": MyTracker}
+    return {"pictures": pictures, "MyTracker": MyTracker, "SMALL": dataclasses.replace(TRAIN, batch_size=2)}
 
 
 def check_training(names: Names) -> None:
-    names["source"].close()
-    assert Path("run/log.jsonl").read_text(encoding="utf-8").count("\n") == 1
+    for run in ("colour_first", "tracked"):
+        config = json.loads(Path(run, "config.json").read_text(encoding="utf-8"))
+        assert config["train"]["loss"]["albedo"] == 4.0
+        assert Path(run, "pipeline", "model_index.json").is_file()
+    assert any("albedo" in values for values in MyTracker.told)
 
 
 def optimizer() -> Names:
@@ -240,6 +240,6 @@ EXAMPLES = {
     "score_your_method.md": Example(stranger, check=check_predictions),
     "shade.md": Example(shaded, {"spp=256": "spp=16", "spp=64": "spp=16"}, check_gradients),
     "tour.md": Example(mug, {"resolution=128": "resolution=32", "spp=256": "spp=16"}, check_tour),
-    "training.md": Example(training, check=check_training),
+    "training.md": Example(training, {"minutes=30": "steps=1", 'PRESETS["tiny"]': "SMALL"}, check=check_training),
 }
 """By the page's name. An example that needs nothing is `Example()`."""
