@@ -9,8 +9,8 @@ is carried over as far as the two lights do the same to the object: for d, and f
 
 D is what normals receive of a light without shadows (or with, where d_1 has them), and corr is taken over the object
 and the channels, each about its own mean. K is a smoothing, the wider the less the lights agree: fine detail of the
-ratio is what `unirender.pipelines.closure` put there, and rather the albedo's. Under its own light an object gets its
-own s and d back; under one that has nothing to do with it, nothing is carried.
+ratio is what `unirender.pipelines.closure` put there, and holds for its own light alone. Under its own light an object
+gets its own s and d back; under one that has nothing to do with it, nothing is carried.
 """
 
 import math

@@ -12,7 +12,7 @@ what a texel counts for as predicted), and the steps are few, since s and d also
 wrong about.
 
 `agreeing_light` looks at both: it is the light that a decomposition returns. `revealed_light` looks at s alone (c = 0):
-an edit takes the s of another roughness from it, for which d says nothing (docs/training.md).
+an edit takes the s of another roughness from it, for which d says nothing (docs/training_record.md).
 
 Notation: L the light's texels; W, C what the lobe and the cosine of each pixel take of each texel
 (`unirender.lobes.lobe_matrix`, `cosine_matrix`); c how much d counts beside s.
