@@ -220,13 +220,14 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     """
     import numpy as np
 
-    from unirender.pictures import read_mask, read_picture
+    from unirender.pictures import read_mask_file, read_picture
 
     picture = read_picture(path)
     remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
     if mask is not None:
-        coverage = read_mask(mask, (height, width))
+        coverage, lost = read_mask_file(mask, (height, width))
+        remarks |= lost
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() == 1:
             remarks["mask"] = "the mask covers the whole frame, which is taken as the object"
