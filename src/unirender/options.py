@@ -111,6 +111,10 @@ class ModelOptions:
         pipeline.set_progress_bar_config(disable=not self.progress or not sys.stderr.isatty())
         return pipeline
 
+    def side(self, pipeline: "UniRenderPipeline") -> int:
+        """Of the square at which the network runs, pixels."""
+        return self.size or pipeline.size
+
     @property
     def mode(self) -> str:
         """`mean`, or `sample` where several samples or steps are asked for."""
@@ -165,7 +169,7 @@ class ModelOptions:
             "seed": self.seed,
             "steps": steps,
             "sampler": (self.sampler or sampler_name(pipeline.scheduler)) if steps > 1 else None,
-            "size": self.size or pipeline.size,
+            "size": self.side(pipeline),
             "samples": self.samples,
             "device": str(pipeline.device),
             "dtype": str(pipeline.dtype).removeprefix("torch."),

@@ -316,8 +316,8 @@ class UniRenderPipeline(DiffusionPipeline):
             roughness: new value or map, [0, 1]; None: unchanged.
             metallic: new value or map, [0, 1]; None: unchanged.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
-            decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, tile,
-                material and closed are its own.
+            decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
+                tile, material and closed are its own.
             **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
                 and closed, as for `decompose`.
 
