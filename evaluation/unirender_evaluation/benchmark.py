@@ -31,7 +31,6 @@ from unirender.files import checkpoint_sha256, replace_file
 from unirender.shipped import checkpoint_folder, shipped_for
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
-from unirender_evaluation.engine import Job, Store
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview_pictures import MultiviewPictures
@@ -49,6 +48,7 @@ from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
 from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
+from unirender_evaluation.store import KEPT, Job, Store
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import load_suite
@@ -196,7 +196,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
         _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
     if others := store.of_other_code():
-        say(f"{others} records of other code are not used; {store.unused_path} keeps them")
+        say(f"{others} records of other code are not used; {store.unused_path} keeps the last {KEPT} of each")
     info = _run_info(config, here, check, records)
     write_run(config.out / "run.json", info)
     write_csv(config.out / "records.csv", records)

@@ -20,12 +20,13 @@ from uuid import uuid4
 from unirender.errors import UnirenderError
 from unirender.files import replace_file
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
-from unirender_evaluation.engine import Job, content_key, method_jobs
+from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
 from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, evenly
+from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions, versions

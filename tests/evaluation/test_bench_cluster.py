@@ -16,8 +16,8 @@ from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.benchmark import BenchConfig, _work, build_rows, prepare
 from unirender_evaluation.bounds import CEILING_KEY
 from unirender_evaluation.commands import BenchRun
-from unirender_evaluation.engine import Job, Store
 from unirender_evaluation.records import Record
+from unirender_evaluation.store import Job, Store
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.versions import Versions

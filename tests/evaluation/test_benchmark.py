@@ -25,7 +25,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.benchmark import BenchConfig, _work
 from unirender_evaluation.dry_run import planned
-from unirender_evaluation.engine import KEY_PREFIX, Job, Prediction, Store, content_key, method_jobs, score
+from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
@@ -33,6 +33,7 @@ from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
+from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
@@ -340,6 +341,19 @@ def test_records_of_other_code_are_kept(suite: Suite, tmp_path: Path) -> None:
         assert store.of_other_code() == others
         assert [record.key for record in store.close()] == [key]
     assert Store.open(path).known.keys() == {mine, other}
+
+
+def test_of_one_measurement_the_last_few_wait(suite: Suite, tmp_path: Path) -> None:
+    """However many states of the code a folder has seen."""
+    path = tmp_path / "records.jsonl"
+    keys = [content_key(suite, suite.scenes[0], "what", {}, f"code {i}") for i in range(KEPT + 3)]
+    for key in keys:
+        store = Store.open(path)
+        for sample in ("a", "b"):
+            store.add(Record("inverse", "single-image", "m", sample, "o", {}, f"{key}-{sample}"))
+        store.close()
+    waiting = [record.key for record in map(Record.from_json, (tmp_path / "unused.jsonl").read_text().splitlines())]
+    assert waiting == [f"{key}-{sample}" for key in keys[-1 - KEPT : -1] for sample in ("a", "b")]
 
 
 class Killer:
