@@ -33,6 +33,7 @@ VOCABULARY = {
         "sixteen_bits",
         "surface_light",
         "symmetries",
+        "whole_files",
         "writing",
     )
 }

@@ -27,8 +27,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.errors import UsageError
-from unirender.files import checkpoint_sha256, replace_file
-from unirender.shipped import checkpoint_folder, shipped_for
+from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
+from unirender.whole_files import replace_file
 from unirender_evaluation import bounds, multiview_methods, physics_rows
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import Variant

@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation import lpips
 from unirender_evaluation.prediction_check import PredictionError, folder_problems
 from unirender_evaluation.public_answers import asked, questions, read_answer, takes_part

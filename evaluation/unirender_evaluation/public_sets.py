@@ -18,8 +18,8 @@ from PIL import Image
 from unirender.camera import Camera
 from unirender.display_files import srgb_values, stored_values
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
 from unirender.intrinsics import Intrinsics
+from unirender.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.specs import TableSpec

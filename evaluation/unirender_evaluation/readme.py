@@ -21,8 +21,7 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
-from unirender.shipped import checkpoint_folder, shipped_for, shipped_names, trained_pixels
+from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for, shipped_names, trained_pixels
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import NAME, PACKED, Results

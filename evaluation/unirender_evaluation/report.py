@@ -19,7 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.gallery import GalleryItem, hero, shelves, shown_width
 from unirender_evaluation.metrics import Variant

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks

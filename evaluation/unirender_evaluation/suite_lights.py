@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
 from unirender.lighting import resample_environment
+from unirender.whole_files import file_sha256
 from unirender_evaluation.suite_objects import drawn, missing_folder
 from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_reference.mesh_folder import MeshFile

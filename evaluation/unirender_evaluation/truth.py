@@ -19,7 +19,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights

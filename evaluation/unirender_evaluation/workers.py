@@ -18,7 +18,7 @@ from typing import Any
 from uuid import uuid4
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs

@@ -157,8 +157,7 @@ class ModelOptions:
         """What goes into `meta.json` and the headers: which model ran, and how."""
         import unirender
         from unirender.diffusion.sampling import sampler_name, steps_of
-        from unirender.files import checkpoint_sha256
-        from unirender.shipped import checkpoint_folder, checkpoint_label
+        from unirender.shipped import checkpoint_folder, checkpoint_label, checkpoint_sha256
 
         steps = steps_of(self.mode, self.steps)
         return {
