@@ -178,8 +178,3 @@ def load(backbone: str) -> Lpips:
         if name == backbone:
             return Lpips(name)
     raise UnirenderError(f"LPIPS: got backbone {backbone!r}, expected one of {', '.join(BACKBONES)}")
-
-
-def load_available() -> tuple[Lpips, ...]:
-    """Every backbone that is on this machine, loaded."""
-    return tuple(load(name) for name in available())
