@@ -95,7 +95,7 @@ FROM_RECORDS = (
     "verdict",
 )
 # Of the shared vocabulary's folder: the command line, and what is said where a file cannot be written.
-OUTSIDE = ("__main__", "cli", "command_line", "commands", "options", "remarks", "shipped", "writing")
+OUTSIDE = ("__main__", "cli", "command_line", "commands", "folder_command", "options", "remarks", "shipped", "writing")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)

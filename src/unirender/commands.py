@@ -4,7 +4,6 @@ They know nothing of the ground truth: what reads the light files is passed in b
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import InputOptions, ModelOptions, OutputOptions, notice, read_input
+from unirender.options import InputOptions, ModelOptions, OutputOptions, notice
 from unirender.remarks import (
     at_white,
     check_looks_option,
@@ -27,9 +26,6 @@ from unirender.remarks import (
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from unirender.pictures import Picture
-    from unirender.pipelines.results import Decomposition
 
 MUCH_COARSE = 0.05  # share of the object, from which a notice is due
 
@@ -58,6 +54,11 @@ class Decompose:
     may lie inside the output folder."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """How a picture is taken apart, as keyword arguments of the pipeline and for `meta.json`."""
+        return {"looks": self.looks, "closed": self.closed, "tile": self.tile}
+
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import folder_beside, new_folder
@@ -67,7 +68,9 @@ class Decompose:
         self.model.check()
         check_looks_option(self.looks, self.model.mode)
         if self.input.picture.is_dir():
-            return self._run_folder()
+            from unirender.folder_command import run_folder
+
+            return run_folder(self)
         if self.frames:
             raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
         picture, camera = self.input.read(self.model)
@@ -79,79 +82,13 @@ class Decompose:
                 scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
             picture = with_parts_remark(picture, self.model.side(pipeline))
-            options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
-            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
+            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **self.options, **sampling)
             meta = {"command": "decompose", "input": self.input.picture, **of_picture(picture)}
-            meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
+            meta = write_decomposition(folder, result, meta | self.options | self.model.provenance(pipeline))
             if scene is not None:
                 write_scene(scene, result.intrinsics, meta)
         print(f"{self.out.output}: roughness {result.roughness:.2f}, metallic {result.metallic:.2f}")
         return 0
-
-    def _run_folder(self) -> int:
-        """Returns the exit status: 1 where a picture failed."""
-        from unirender.files import SUMMARY_FILE
-        from unirender.folders import decompose_folder, list_pictures, write_summary
-        from unirender.frames import temporal_difference
-        from unirender.pipelines.inputs import as_picture
-
-        source, output = self.input.picture, self.out.output
-        if self.export is not None:
-            raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
-        if self.input.mask is not None and not self.input.mask.exists():
-            raise UnirenderError(
-                f"--mask {self.input.mask}: no such file or folder, expected a picture or a folder of them"
-            )
-        pictures = list_pictures(source)
-        pipeline, sampling = self.model.load(), self.model.sampling()
-        options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
-        settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov": self.model.fov}
-        remarks: dict[str, list[str]] = {}
-
-        def read(path: Path, mask: Path | None) -> "Picture":
-            picture, said = read_input(path, mask)
-            try:  # what the network would refuse is refused here, by itself
-                as_picture(picture.image_srgb, picture.mask)
-            except UnirenderError as error:
-                raise UnirenderError(f"{path}: {error}") from error
-            said |= self.model.camera_remarks(picture)
-            said |= parts_left_out(picture.mask, self.model.side(pipeline))
-            for kind, remark in said.items():
-                remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
-            return dataclasses.replace(picture, remarks=said)
-
-        def decompose(batch: list["Picture"]) -> list["Decomposition"]:
-            images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
-            cameras = [self.model.camera(picture) for picture in batch]
-            each: dict[str, Any] = sampling | {"generator": self.model.generators(len(batch))}
-            return pipeline.decompose_batch(images, masks, cameras=cameras, **options, **each)
-
-        found = decompose_folder(
-            pictures,
-            output,
-            read=read,
-            decompose=decompose,
-            settings=settings,
-            masks=self.input.mask,
-            overwrite=self.out.overwrite,
-        )
-        facts = {**settings, "input": source}
-        if self.frames:
-            results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
-            facts["temporal_difference"] = temporal_difference(results)
-        if found.figures or not (output / SUMMARY_FILE).exists():  # where all failed, that of an earlier run stays
-            write_summary(output, found, facts)
-        for first, *others in remarks.values():
-            notice(first + (f" (and {len(others)} more)" if others else ""))
-        for reason in found.failed.values():
-            notice(f"error: {reason}")
-        failed = f", {len(found.failed)} failed" if found.failed else ""
-        print(f"{output}: {len(found.figures)} pictures ({found.kept} of them from before){failed}")
-        if self.frames:
-            changes = facts["temporal_difference"]
-            print(f"mean change between {changes.pop('pairs')} pairs of frames: ", end="")
-            print(", ".join(f"{name} {value:.4f}" for name, value in changes.items()) or "none to compare")
-        return 1 if found.failed else 0
 
 
 @dataclass(frozen=True)
