@@ -106,6 +106,7 @@ class BenchRun:
         from rich.console import Console
 
         from unirender_evaluation import benchmark
+        from unirender_evaluation.bench_config import BenchConfig
         from unirender_evaluation.prediction_check import PredictionError
         from unirender_evaluation.table_formats import print_table
 
@@ -114,7 +115,7 @@ class BenchRun:
 
             check_address(self.cluster)
         console = Console()
-        config = benchmark.BenchConfig(
+        config = BenchConfig(
             suite=self.suite,
             out=self.out,
             checkpoint=self.checkpoint,

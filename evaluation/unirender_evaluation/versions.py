@@ -53,6 +53,7 @@ COMMANDS = (
     "__init__",
     "*_command",
     "*_commands",
+    "bench_config",
     "benchmark",
     "commands",
     "crosscheck*",

@@ -23,7 +23,8 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
-from unirender_evaluation.benchmark import BenchConfig, _work
+from unirender_evaluation.bench_config import BenchConfig
+from unirender_evaluation.benchmark import _work
 from unirender_evaluation.dry_run import planned
 from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
