@@ -173,7 +173,11 @@ class Lpips:
 
 @lru_cache(maxsize=2)
 def load(backbone: str) -> Lpips:
-    """`Lpips(backbone)`, loaded once per process."""
+    """`Lpips(backbone)`, loaded once per process.
+
+    Raises:
+        UnirenderError: there is no such backbone, or its weights are not here.
+    """
     for name in BACKBONES:
         if name == backbone:
             return Lpips(name)

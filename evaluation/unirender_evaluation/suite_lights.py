@@ -100,6 +100,9 @@ def assign_lights(spec: SuiteSpec, names: list[str], objects: int) -> list[tuple
     """(light, turn in columns) of every scene, objects outermost.
 
     All lights are used about equally often, those of one object differ, and every scene has its own turn about +y.
+
+    Raises:
+        UnirenderError: there are fewer lights than an object is to have.
     """
     per_object, count = spec.lights_per_object, objects * spec.lights_per_object
     if len(names) < per_object:

@@ -206,7 +206,11 @@ _made: dict[str, Run] = {}  # at most one run, by the name of its order
 
 
 def cluster_scene(order: Order, scene: str, wanted: frozenset[str]) -> tuple[list[Record], dict[str, bytes]]:
-    """The records of a scene that have the wanted content keys, and the pictures that belong to them, by file name."""
+    """The records of a scene that have the wanted content keys, and the pictures that belong to them, by file name.
+
+    Raises:
+        UnirenderError: this worker's methods, suite or code are others than those of who asks.
+    """
     if order.name not in _made:
         _made.clear()
         _made[order.name] = order.make()

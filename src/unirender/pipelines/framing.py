@@ -90,6 +90,7 @@ class Frame:
 
     @property
     def identity(self) -> bool:
+        """Whether the picture is the square, which then passes through untouched."""
         return self.cut is None and self.height == self.width == self.size
 
     @property
