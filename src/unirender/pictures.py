@@ -1,6 +1,7 @@
 """Pictures and masks from files: PNG, JPG and whatever else Pillow knows, and linear OpenEXR."""
 
 import contextlib
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,8 @@ DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
 ALPHA_TOLERANCE = 1e-3  # of an EXR: half precision and filters step over [0, 1]
 MASK_BEYOND = 0.1  # how far an EXR's mask may step over [0, 1]: more is no filter's ringing
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -78,17 +81,20 @@ def checked_file(path: str | Path) -> Path:
 def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours, as they are stored.
 
-    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone.
+    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone. What is lost in reading it is logged.
 
     Raises:
         UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty, or
             values are more than `MASK_BEYOND` outside [0, 1].
     """
-    return read_mask_file(path, size)[0]
+    mask, remarks = read_mask_file(path, size)
+    for remark in remarks.values():
+        logger.warning("%s: %s", path, remark)
+    return mask
 
 
 def read_mask_file(path: str | Path, size: tuple[int, int]) -> tuple[Float[np.ndarray, "h w 1"], dict[str, str]]:
-    """The same, and remarks by kind on what was lost in reading it.
+    """The same, and by kind what is lost, of which nothing is logged.
 
     Raises:
         UnirenderError: as `read_mask`.

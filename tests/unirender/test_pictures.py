@@ -110,7 +110,9 @@ def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_pat
     assert read_input(tmp_path / "a.png", None)[1]["depth"].startswith("its colours have 16 bits, of which 8 are read")
 
 
-def test_a_file_of_several_pictures_gives_its_first_which_is_told(tmp_path: Path) -> None:
+def test_a_file_of_several_pictures_gives_its_first_which_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     frames = [Image.new("RGB", (9, 8), colour) for colour in ("white", "red", "green")]
     for suffix in ("gif", "png", "tif", "webp"):
         path = tmp_path / f"a.{suffix}"
@@ -119,6 +121,9 @@ def test_a_file_of_several_pictures_gives_its_first_which_is_told(tmp_path: Path
         assert picture.image_srgb.min() > 0.99
         assert remarks["frames"] == "the file holds 3 pictures, of which the first is taken"
         assert remarks["mask_frames"] == "the mask's file holds 3 pictures, of which the first is taken"
+        caplog.clear()
+        read_mask(path, (8, 9))
+        assert [record.getMessage() for record in caplog.records] == [f"{path}: {remarks['mask_frames']}"]
         frames[0].save(path)
         assert not {"frames", "mask_frames"} & set(read_input(path, path)[1])
 
