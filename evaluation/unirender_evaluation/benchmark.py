@@ -36,7 +36,7 @@ from unirender_evaluation.multiview_scenes import multiview_scenes
 from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_csv, write_run
-from unirender_evaluation.report import report_run
+from unirender_evaluation.report_run import report_run
 from unirender_evaluation.results_data import NAME as RESULTS
 from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row

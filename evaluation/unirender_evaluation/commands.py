@@ -255,7 +255,7 @@ class BenchReport:
     def run(self) -> int:
         """Writes `report.html` into the folder."""
         self.check()
-        from unirender_evaluation.report import rebuild
+        from unirender_evaluation.report_run import rebuild
 
         path = rebuild(self.folder, self.suite, asked_variants(self.variant))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
