@@ -8,7 +8,7 @@ resumes.
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import SEPARATOR
 
 KEY_PREFIX = 12
-KEPT = 4  # records of one measurement that wait for a run that asks for them again
+KEPT = 4  # records of one measurement by other code, that one may return to
 
 
 def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any], code: str) -> str:
@@ -36,7 +36,8 @@ class Store:
     """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end.
 
     `records.jsonl` holds what the last run measured; what it did not ask for waits in `unused.jsonl` beside it: it was
-    a part of a larger run, or of other code, to which one may return. Of each measurement the last `KEPT` wait.
+    a part of a larger run, or of other code, to which one may return. Of other code the last `KEPT` records of each
+    measurement wait.
     """
 
     path: Path
@@ -83,25 +84,32 @@ class Store:
 
     def of_other_code(self) -> int:
         """How many records are there that other code of the core has made than this run's."""
-        code = {key[:KEY_PREFIX] for key in self.used}
+        code = self._code()
         return sum(key[:KEY_PREFIX] not in code for key in self.known)
 
     def close(self) -> list[Record]:
         """Sorts this run's records, writes and returns them, and lays the others by."""
         records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
-        write_records(self.unused_path, last_of_each(r for key, r in self.known.items() if key not in self.used))
+        write_records(self.unused_path, self._waiting())
         write_records(self.path, records)
         return records
 
+    def _code(self) -> set[str]:
+        """What the keys of this run's records begin with."""
+        return {key[:KEY_PREFIX] for key in self.used}
 
-def last_of_each(records: Iterable[Record]) -> list[Record]:
-    """The records, but of one method on one sample only the last `KEPT`: others are of code of long ago."""
-    found, kept = Counter[tuple[str, ...]](), []
-    for record in reversed(list(records)):
-        found[record.identity] += 1
-        if found[record.identity] <= KEPT:
+    def _waiting(self) -> list[Record]:
+        """The records that this run did not ask for and that are kept."""
+        code, found, kept = self._code(), Counter[tuple[str, ...]](), []
+        for key, record in reversed(self.known.items()):  # the latest first
+            if key in self.used:
+                continue
+            if key[:KEY_PREFIX] not in code:
+                found[record.identity] += 1
+                if found[record.identity] > KEPT:
+                    continue
             kept.append(record)
-    return kept[::-1]
+        return kept[::-1]
 
 
 @dataclass(frozen=True)

@@ -344,17 +344,27 @@ def test_records_of_other_code_are_kept(suite: Suite, tmp_path: Path) -> None:
     assert Store.open(path).known.keys() == {mine, other}
 
 
-def test_of_one_measurement_the_last_few_wait(suite: Suite, tmp_path: Path) -> None:
-    """However many states of the code a folder has seen."""
-    path = tmp_path / "records.jsonl"
-    keys = [content_key(suite, suite.scenes[0], "what", {}, f"code {i}") for i in range(KEPT + 3)]
-    for key in keys:
-        store = Store.open(path)
-        for sample in ("a", "b"):
-            store.add(Record("inverse", "single-image", "m", sample, "o", {}, f"{key}-{sample}"))
-        store.close()
-    waiting = [record.key for record in map(Record.from_json, (tmp_path / "unused.jsonl").read_text().splitlines())]
-    assert waiting == [f"{key}-{sample}" for key in keys[-1 - KEPT : -1] for sample in ("a", "b")]
+def test_of_other_code_the_last_few_records_of_a_measurement_wait(suite: Suite, tmp_path: Path) -> None:
+    """However many states of the code a folder has seen; those of other settings are the run's own code's, and stay."""
+
+    def waiting_after(codes: list[str], settings: list[int]) -> list[str]:
+        keys = [content_key(suite, suite.scenes[0], "what", {"s": s}, c) for c, s in zip(codes, settings, strict=True)]
+        folder = tmp_path / codes[-1]
+        folder.mkdir()
+        for key in keys:
+            store = Store.open(folder / "records.jsonl")
+            for sample in ("a", "b"):
+                store.add(Record("inverse", "single-image", "m", sample, "o", {}, f"{key}-{sample}"))
+            store.close()
+        assert (folder / "records.jsonl").read_text().count("\n") == 2
+        found = [Record.from_json(line).key for line in (folder / "unused.jsonl").read_text().splitlines()]
+        every = [f"{key}-{sample}" for key in keys[:-1] for sample in ("a", "b")]
+        assert found == every[len(every) - len(found) :], "the last, in order"
+        return found
+
+    count = KEPT + 4
+    assert len(waiting_after([f"code {i}" for i in range(count)], [0] * count)) == 2 * KEPT
+    assert len(waiting_after(["code"] * count, list(range(count)))) == 2 * (count - 1)
 
 
 class Killer:
