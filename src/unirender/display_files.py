@@ -114,7 +114,7 @@ def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     return display_values(in_srgb(image, name), name)
 
 
-def frames(path: Path) -> int:
+def picture_count(path: Path) -> int:
     """How many pictures a file of Pillow's holds: of an animation, pages, or what its format has."""
     try:
         with opened(path) as file:

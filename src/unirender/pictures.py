@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
-from unirender.display_files import FORMATS, frames, srgb_values_and_remarks, stored_values
+from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
 
@@ -114,7 +114,7 @@ def read_mask_file(path: str | Path, size: tuple[int, int]) -> tuple[Float[np.nd
             "white, or write 1 on the object alone"
         )
     remarks = {}
-    if not exr and (count := frames(path)) > 1:
+    if not exr and (count := picture_count(path)) > 1:
         remarks["mask_frames"] = f"the mask's file holds {count} pictures, of which the first is taken"
     if low < -ALPHA_TOLERANCE or high > 1 + ALPHA_TOLERANCE:
         remarks["mask_range"] = f"the mask has values in [{low:.3g}, {high:.3g}], clipped to [0, 1]"
@@ -176,7 +176,7 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
 def _read_display_picture(path: Path) -> Picture:
     pixels, remarks = srgb_values_and_remarks(path, str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
-    if (count := frames(path)) > 1:
+    if (count := picture_count(path)) > 1:
         remarks["frames"] = f"the file holds {count} pictures, of which the first is taken"
     return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name, remarks=remarks)
 
