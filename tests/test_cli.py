@@ -15,13 +15,13 @@ from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light
-from unirender.commands import missing_maps
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
-from unirender.files import checkpoint_sha256, read_result
+from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.shipped import checkpoint_folder
+from unirender.remarks import missing_maps
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
     f"{name}.png"
@@ -270,6 +270,31 @@ def test_an_alpha_channel_that_hides_nothing_is_no_mask(tmp_path: Path, capsys: 
         Image.fromarray(colours).save(tmp_path / f"{alpha}.png")
         assert run("decompose", tmp_path / f"{alpha}.png", "--output", tmp_path / f"out{alpha}") == 0
         assert ("covers the whole frame" in capsys.readouterr().err) == told
+
+
+def test_parts_of_the_mask_that_are_left_out_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By a picture, by a folder of pictures, and by the maps that come of it."""
+    pixels = np.full((200, 200, 4), 150, np.uint8)
+    pixels[..., 3] = 0
+    pixels[60:110, 70:120, 3] = 255
+    pixels[5, 5:7, 3] = 255
+    (tmp_path / "pictures").mkdir()
+    Image.fromarray(pixels).save(tmp_path / "pictures" / "a.png")
+    said = "2 pixels of the mask are taken for stray ones and left out"
+    assert run("decompose", tmp_path / "pictures" / "a.png", "--output", tmp_path / "out") == 0
+    assert capsys.readouterr().err.count(said) == 1
+    assert run("decompose", tmp_path / "pictures", "--output", tmp_path / "folder") == 0
+    assert f"a.png: {said}" in capsys.readouterr().err
+    assert run("render", tmp_path / "out", "--output", tmp_path / "again") == 0
+    assert capsys.readouterr().err.count(said) == 1
+    for folder in ("out", "folder/a.png", "again"):
+        assert said in json.loads((tmp_path / folder / "meta.json").read_text())["remarks"]["parts"]
+    normal = read_result(tmp_path / "out").require("normal")["normal"]
+    assert not normal[5, 5:7].any()
+    pixels[5, 5:12, 3] = 255  # now they count, and nothing is cut out
+    Image.fromarray(pixels).save(tmp_path / "b.png")
+    assert run("decompose", tmp_path / "b.png", "--output", tmp_path / "more") == 0
+    assert "stray" not in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -17,6 +17,7 @@ VOCABULARY = {
         "camera",
         "color",
         "composite",
+        "display_files",
         "errors",
         "exposure",
         "exr",
@@ -29,8 +30,10 @@ VOCABULARY = {
         "pictures",
         "primaries",
         "score",
+        "sixteen_bits",
         "surface_light",
         "symmetries",
+        "whole_files",
         "writing",
     )
 }

@@ -12,12 +12,13 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
-from unirender_evaluation.engine import Job, record_of
+from unirender_evaluation.engine import record_of
 from unirender_evaluation.light_metrics import SHAPE as LIGHT_SHAPE
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
+from unirender_evaluation.store import Job
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
 from unirender_evaluation.truth_check import TruthCheck

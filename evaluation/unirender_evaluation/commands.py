@@ -106,6 +106,7 @@ class BenchRun:
         from rich.console import Console
 
         from unirender_evaluation import benchmark
+        from unirender_evaluation.bench_config import BenchConfig
         from unirender_evaluation.prediction_check import PredictionError
         from unirender_evaluation.table_formats import print_table
 
@@ -114,7 +115,7 @@ class BenchRun:
 
             check_address(self.cluster)
         console = Console()
-        config = benchmark.BenchConfig(
+        config = BenchConfig(
             suite=self.suite,
             out=self.out,
             checkpoint=self.checkpoint,
@@ -254,7 +255,7 @@ class BenchReport:
     def run(self) -> int:
         """Writes `report.html` into the folder."""
         self.check()
-        from unirender_evaluation.report import rebuild
+        from unirender_evaluation.report_run import rebuild
 
         path = rebuild(self.folder, self.suite, asked_variants(self.variant))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")

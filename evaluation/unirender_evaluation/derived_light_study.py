@@ -28,9 +28,9 @@ from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender.surface_light import diffuse_light, lobe_light, specular_light
-from unirender_evaluation.engine import KEY_PREFIX, Store
 from unirender_evaluation.metrics import metric_key, psnr
 from unirender_evaluation.records import Record
+from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.versions import (
     REFERENCE,
     SEPARATOR,

@@ -15,10 +15,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from unirender_evaluation.benchmark import BenchConfig, check_request, prepare, views_jobs
-from unirender_evaluation.engine import Store
+from unirender_evaluation.bench_config import BenchConfig
+from unirender_evaluation.benchmark import check_request, prepare, views_jobs
 from unirender_evaluation.records import Record
 from unirender_evaluation.run_check import stored_check
+from unirender_evaluation.store import Store
 
 
 @dataclass(frozen=True)

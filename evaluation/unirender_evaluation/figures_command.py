@@ -119,7 +119,7 @@ class Figures:
 
     def explain(self, kind: Contract, suite: "Suite", scene: "Scene") -> Path:
         """A figure of the data contract."""
-        from unirender.files import replace_file
+        from unirender.whole_files import replace_file
         from unirender_evaluation import figures_contract as contract
 
         drawn = contract.maps_figure(suite, scene) if kind == "maps" else contract.camera_figure(suite.spec.camera)
@@ -166,10 +166,9 @@ class Figures:
         Raises:
             UnirenderError: a checkpoint or a method is not there.
         """
-        from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
-        from unirender.shipped import checkpoint_folder, shipped_for
+        from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
         from unirender_evaluation.figures_panels import Subject
         from unirender_evaluation.pipeline_method import PipelineMethod
         from unirender_evaluation.plugins import named_plugin

@@ -70,6 +70,9 @@ def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE
         stored: a trace.
         again: another one.
         spp: samples per pixel of each.
+
+    Raises:
+        UnirenderError: the object covers no pixel in either.
     """
     a, b = (maps.require("mask", "albedo", "normal") for maps in (stored, again))
     low, high = (f(a["mask"], b["mask"])[..., 0] for f in (np.minimum, np.maximum))

@@ -6,7 +6,6 @@ come from.
 
 import json
 import sys
-import tarfile
 from collections.abc import Iterator
 from functools import cache
 from importlib import resources
@@ -17,11 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.files import replace_file
+from unirender.exr import channels_rgb
 from unirender.lighting import mean_radiance, resample_environment
+from unirender.whole_files import replace_file
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.metrics import LOG_EPSILON
+from unirender_evaluation.training_statistics import shard_files
 
 FILE = "data/light_statistics.toml"
 SUFFIX = ".environment.exr"
@@ -38,14 +38,9 @@ def light_statistics() -> dict[str, Any]:
 def light_means(folder: Path) -> Iterator[tuple[Float[np.ndarray, "16 3"], float]]:
     """Of every light of a dataset folder the mean of ln(radiance + `LOG_EPSILON`) over each row, and the mean radiance
     over the sphere and the channels."""
-    for shard in sorted(folder.glob("shard-*.tar")):
-        with tarfile.open(shard) as tar:
-            for member in tar.getmembers():
-                stream = tar.extractfile(member) if member.name.endswith(SUFFIX) else None
-                if stream is None:
-                    continue
-                light = resample_environment(channels_rgb(read_exr_bytes(stream.read())[0]), SHAPE)
-                yield np.log(light.astype(np.float64) + LOG_EPSILON).mean(axis=1), float(mean_radiance(light).mean())
+    for _, channels in shard_files(folder, SUFFIX):
+        light = resample_environment(channels_rgb(channels), SHAPE)
+        yield np.log(light.astype(np.float64) + LOG_EPSILON).mean(axis=1), float(mean_radiance(light).mean())
 
 
 def write_statistics(folder: Path, path: Path) -> str:

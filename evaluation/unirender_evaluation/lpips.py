@@ -173,13 +173,12 @@ class Lpips:
 
 @lru_cache(maxsize=2)
 def load(backbone: str) -> Lpips:
-    """`Lpips(backbone)`, loaded once per process."""
+    """`Lpips(backbone)`, loaded once per process.
+
+    Raises:
+        UnirenderError: there is no such backbone, or its weights are not here.
+    """
     for name in BACKBONES:
         if name == backbone:
             return Lpips(name)
     raise UnirenderError(f"LPIPS: got backbone {backbone!r}, expected one of {', '.join(BACKBONES)}")
-
-
-def load_available() -> tuple[Lpips, ...]:
-    """Every backbone that is on this machine, loaded."""
-    return tuple(load(name) for name in available())

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import agree
+from unirender_evaluation.protocol import doubts
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results_data import Results
 from unirender_evaluation.rows import slug
@@ -126,13 +127,18 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
             if row is None:
                 row = _Row(replace(info, stored=info.stored or _stored(file, name)), name)
                 rows.append(row)
-            row.take(info.note, records)
+            row.take(_without(info.note, doubts(info.key, file.records)), records)
     rows = _told_apart(rows)
     methods = tuple(row.info for row in rows)
     merged = [replace(r, method=row.info.key) for row in rows for r in row.records.values()]
     # In the order of a run's own records, on which the draws of intervals depend.
     merged.sort(key=lambda r: (r.table, r.protocol, r.method, r.sample))
     return _merged_run([file.run for file in files], methods), merged
+
+
+def _without(note: str, parts: Sequence[str]) -> str:
+    """A note but for some of its parts: how many pictures are doubted is counted anew over all files."""
+    return "; ".join(part for part in note.split("; ") if part not in parts)
 
 
 def _stored(file: Results, name: str) -> str:
@@ -158,7 +164,8 @@ def _told_apart(rows: Sequence[_Row]) -> list[_Row]:
             key += "-again"
         keys.add(key)
         label = f"{label} ({row.origin})" if labels.count(label) > 1 else label
-        told.append(replace(row, info=replace(row.info, key=key, label=label, note=row.note())))
+        note = "; ".join([*filter(None, [row.note()]), *doubts(row.info.key, row.records.values())])
+        told.append(replace(row, info=replace(row.info, key=key, label=label, note=note)))
     return told
 
 

@@ -69,7 +69,7 @@ class Variant:
                     f"variant {text!r}: got {word!r}, expected one word per axis of {known}, '-' between"
                 )
             axes[found[0]] = word
-        return cls(**axes)  # type: ignore[arg-type]  # each word was looked up among its axis' values
+        return cls(**axes)  # pyright: ignore[reportArgumentType] - each word was looked up among its axis' values
 
 
 DEFAULT_VARIANT = Variant()  # what we believe
@@ -212,7 +212,11 @@ def ssim(
 
 
 def crop_border(values: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n hc wc"]:
-    """Leaves out the border where the SSIM window sticks out of the frame."""
+    """Leaves out the border where the SSIM window sticks out of the frame.
+
+    Raises:
+        UnirenderError: nothing is left.
+    """
     pad = int(SSIM_TRUNCATE * SSIM_SIGMA + 0.5)
     if min(values.shape[-2:]) <= 2 * pad:
         raise UnirenderError(f"SSIM: got {values.shape[-2:]} pixels, expected more than {2 * pad} a side")

@@ -20,11 +20,12 @@ from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import KeyOf
-from unirender_evaluation.engine import Job, Prediction, record_of, score
+from unirender_evaluation.engine import Prediction, record_of, score
 from unirender_evaluation.geometry_check import GeometryTest, compare_geometry
 from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import evenly
+from unirender_evaluation.store import Job
 from unirender_evaluation.suite_objects import scene_object
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.tasks import PROTOCOLS, Task, tasks

@@ -5,9 +5,8 @@ A method has a `name`, a JSON-able `config` (part of the cache key) and
     solve(views, mesh) -> Solution     pictures with cameras, the bare mesh -> the object with textures, and its light
 """
 
-from collections.abc import Mapping
 from dataclasses import asdict, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,17 +24,6 @@ TEXTURE = (2, 2)  # texels of a constant map
 PLAIN_ITERATIONS, PLAIN_TEXTURE = 100, 128
 OPTIMISED, PLAIN, CONSTANT = "NvDiffRec (Mitsuba), multi-view", "plain Mitsuba loop", "constant object"
 NAMES = (OPTIMISED, PLAIN, CONSTANT)
-
-
-class MultiviewMethod(Protocol):
-    """A row of the multi-view table."""
-
-    name: str
-
-    @property
-    def config(self) -> Mapping[str, Any]: ...
-
-    def solve(self, views: Views, mesh: MeshObject) -> Solution: ...
 
 
 class ConstantObject:

@@ -11,7 +11,6 @@ from dataclasses import asdict
 from functools import cache, partial
 
 from unirender_evaluation.bounds import KeyOf, ceiling_info
-from unirender_evaluation.engine import Job
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.multiview_methods import PLAIN_ITERATIONS, ConstantObject, Optimized, PlainLoop
 from unirender_evaluation.multiview_pictures import MultiviewPictures
@@ -21,6 +20,7 @@ from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
 from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL, SECONDS
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
+from unirender_evaluation.store import Job
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE
 

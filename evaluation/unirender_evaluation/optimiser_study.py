@@ -12,10 +12,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.files import replace_file
-from unirender_evaluation.engine import content_key
+from unirender.whole_files import replace_file
 from unirender_evaluation.multiview_scenes import MultiviewScene, multiview_scenes, suite_scene
 from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
+from unirender_evaluation.store import content_key
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import (
     MULTIVIEW,

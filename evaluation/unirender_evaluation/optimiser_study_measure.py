@@ -12,7 +12,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unirender_evaluation.engine import Store
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.multiview_scenes import MultiviewScene
 from unirender_evaluation.multiview_scoring import score_solution
@@ -20,6 +19,7 @@ from unirender_evaluation.multiview_tables import PROTOCOL, SECONDS
 from unirender_evaluation.optimiser_study import Study, work_through
 from unirender_evaluation.optimiser_study_ingredients import Ingredient
 from unirender_evaluation.records import Record
+from unirender_evaluation.store import Store
 from unirender_evaluation.suites import Scene
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.solution import Solution

@@ -34,7 +34,7 @@ class BenchPhysics:
         self.check()
         from rich.progress import track
 
-        from unirender_evaluation.benchmark import BenchConfig, build_rows
+        from unirender_evaluation.bench_config import BenchConfig, build_rows
         from unirender_evaluation.claims import OURS
         from unirender_evaluation.physics_ambiguity import POSTERIOR
         from unirender_evaluation.physics_run import markdown, measure, write

@@ -18,9 +18,9 @@ from PIL import Image as PngImage
 from PIL.PngImagePlugin import PngInfo
 
 from unirender.color import image_srgb
-from unirender.files import replace_file
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import sample_environment
+from unirender.whole_files import replace_file
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import GalleryItem, Mask, Picture, image_picture, map_pictures
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, balls

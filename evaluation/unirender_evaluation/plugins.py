@@ -150,7 +150,7 @@ def _module_of_file(path: Path, what: str) -> ModuleType:
     _search_last(path.parent)  # for its neighbours
     sys.modules[name] = module
     try:
-        _attempt(what, "import it", lambda: spec.loader.exec_module(module))  # type: ignore[union-attr]  # checked above
+        _attempt(what, "import it", lambda: spec.loader.exec_module(module))  # pyright: ignore[reportOptionalMemberAccess] - checked above
     except UnirenderError:
         del sys.modules[name]
         raise

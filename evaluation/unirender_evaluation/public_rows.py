@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UsageError
-from unirender.files import checkpoint_sha256
 from unirender.options import Device, ModelOptions
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.pipeline_method import LazyPipeline, PipelineMethod

@@ -20,9 +20,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation import lpips
-from unirender_evaluation.engine import KEY_PREFIX, Store
 from unirender_evaluation.prediction_check import PredictionError, folder_problems
 from unirender_evaluation.public_answers import asked, questions, read_answer, takes_part
 from unirender_evaluation.public_sets import PublicSet, Sample
@@ -30,6 +29,7 @@ from unirender_evaluation.public_tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.run_folder import writing_run
+from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.tables import Table

@@ -16,10 +16,10 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
+from unirender.display_files import srgb_values, stored_values
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
 from unirender.intrinsics import Intrinsics
-from unirender.pictures import display_colors, display_values, open_picture
+from unirender.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.specs import TableSpec
@@ -168,7 +168,7 @@ def read_display(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
     Raises:
         UnirenderError: no readable picture.
     """
-    values = display_values(open_picture(path), str(path))[..., :3]
+    values = stored_values(path)[..., :3]
     return values if channels == 3 else values.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
 
 
@@ -178,7 +178,7 @@ def read_photograph(path: Path) -> Float[np.ndarray, "h w 3"]:
     Raises:
         UnirenderError: no readable picture.
     """
-    return display_colors(open_picture(path), str(path))[..., :3]
+    return srgb_values(path)[..., :3]
 
 
 def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:

@@ -22,8 +22,7 @@ from pathlib import Path
 from safetensors import safe_open
 
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
-from unirender.shipped import checkpoint_folder, shipped_for, shipped_names, trained_pixels
+from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for, shipped_names, trained_pixels
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.records import Record

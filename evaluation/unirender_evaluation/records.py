@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import naming, replace_file
 
 SCHEMA_VERSION = 1
 
@@ -58,6 +58,11 @@ class Record:
         for metric, value in self.values.items():
             _check_value(f"{self.table}/{self.method}/{self.sample}/{metric}", value)
         object.__setattr__(self, "values", dict(self.values))
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        """Which measurement it is, whatever code has made it."""
+        return self.table, self.protocol, self.method, self.sample, self.subset
 
     def to_json(self) -> str:
         """Returns one line of strict JSON (infinities as strings)."""
@@ -157,7 +162,7 @@ def write_csv(path: Path, records: Iterable[Record]) -> None:
 
 def append_record(path: Path, record: Record) -> None:
     """Appends one record; a reader ignores nothing, so a torn last line is an error that `read_records` names."""
-    with path.open("a", encoding="utf-8") as file:
+    with naming(path), path.open("a", encoding="utf-8") as file:
         file.write(record.to_json() + "\n")
 
 
@@ -185,10 +190,9 @@ def read_records(path: Path, *, torn_tail: Literal["raise", "drop"] = "raise") -
             record = Record.from_json(line)
         except UnirenderError as error:
             raise UnirenderError(f"{path}, line {number}: {error}") from error
-        identity = (record.table, record.protocol, record.method, record.sample, record.subset)
-        if identity in seen:
-            raise UnirenderError(f"{path}, line {number}: {identity} occurs twice; delete one of the two")
-        seen.add(identity)
+        if record.identity in seen:
+            raise UnirenderError(f"{path}, line {number}: {record.identity} occurs twice; delete one of the two")
+        seen.add(record.identity)
         records.append(record)
     return records
 

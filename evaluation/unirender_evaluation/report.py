@@ -3,29 +3,26 @@
 Tables with the published value beside the measured one and the protocol below, the standing of our rows between the
 trivial ones and the noise ceiling, one tick per sample, the run's verdict and paired ones, a gallery that begins with
 the failures, and a table of all samples that opens to every row's numbers.
-This module turns results into view models; `templates/` lays them out. `unirender bench report RUN` writes the page
-of a finished run again.
+This module turns results into view models; `templates/` lays them out.
 """
 
 import json
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.gallery import GalleryItem, hero, shelves, shown_width
 from unirender_evaluation.metrics import Variant
-from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo, read_records, read_run
+from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo
 from unirender_evaluation.report_plots import LEADING, heading, is_headline, strip_plots, tiles
-from unirender_evaluation.report_samples import Place, Sheet, make_sheets, sample_sections
+from unirender_evaluation.report_samples import Place, Sheet, sample_sections
 from unirender_evaluation.specs import TABLES, TableSpec
 from unirender_evaluation.table_counts import cell_counts
 from unirender_evaluation.table_formats import (
@@ -37,16 +34,9 @@ from unirender_evaluation.table_formats import (
     row_label,
     to_json,
 )
-from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import RANKED_KINDS, Cell, Row, Table, build_tables
-
-if TYPE_CHECKING:
-    from unirender_evaluation.suites import Suite
-
-logger = logging.getLogger(__name__)
+from unirender_evaluation.tables import Cell, Row, Table
 
 TEMPLATES = Path(__file__).parent / "templates"
-VERDICT = "verdict.txt"  # in a run's folder
 STATES = ("HOLDS", "FAILS", "open", "stated")  # how a line of it may begin
 DENSE = 8  # columns: from here on the interval stands below its mean
 KIND_NAMES = {
@@ -258,75 +248,3 @@ def _verdicts(specs: Mapping[str, TableSpec], records: Sequence[Record], run: Ru
             if rows:
                 groups.append({"title": heading(spec.title, protocol), "rows": rows})
     return groups
-
-
-def read_results(folder: Path, variants: Sequence[Variant] | None = None) -> tuple[RunInfo, list[Record], list[Table]]:
-    """What a finished run left: its description, its records, and the tables made from them, in these variants.
-
-    Raises:
-        UnirenderError: no run in the folder.
-    """
-    if not (folder / "run.json").is_file():
-        raise UnirenderError(f"{folder}: no run.json, expected the folder that `unirender bench run --out` wrote")
-    run = read_run(folder / "run.json")
-    records = [record for record in read_records(folder / "records.jsonl") if record.values]
-    return run, records, build_tables(records, run, ALL_TABLES, variants)
-
-
-def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] | None = None) -> Path:
-    """Writes `report.html` of a finished run again; nothing is measured. Warns where pictures of it are gone.
-
-    Args:
-        folder: that `unirender bench run --out` wrote.
-        suite: name or TOML file; None = the name that the run recorded.
-        variants: of the tables; None = the usual ones (`tables.build_tables`).
-
-    Raises:
-        UnirenderError: no run in the folder, or the suite is not the one that it scored.
-    """
-    from unirender_evaluation.pictures import Pictures
-    from unirender_evaluation.suites import load_suite  # what runs need, a report alone does not
-
-    run, records, tables = read_results(folder, variants)
-    try:
-        loaded = load_suite(suite or run.suite)
-    except UnirenderError as error:
-        if suite is not None:
-            raise
-        raise UnirenderError(
-            f"{error}; if the run in {folder} scored a suite of your own, give it with --suite"
-        ) from error
-    if loaded.sha256 != run.suite_hash:
-        raise UnirenderError(
-            f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
-            f"{folder} scored; name it with --suite"
-        )
-    answers = [record for record in records if run.method(record.method).kind in RANKED_KINDS]
-    if absent := Pictures(folder / "pictures", loaded, []).absent(answers):
-        logger.warning(
-            "%s: the pictures of %d answers are not there, and the report lacks them; `unirender bench run` as it "
-            "was given makes them again",
-            *(folder / "pictures", len(absent)),
-        )
-    return report_run(folder, loaded, run, records, tables)
-
-
-def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Record], tables: Sequence[Table]) -> Path:
-    """Writes `report.html` of a run, with the gallery from its kept pictures; returns its path."""
-    from unirender_evaluation.multiview_pictures import MultiviewPictures
-    from unirender_evaluation.pictures import Pictures
-    from unirender_evaluation.tasks import scene_ids
-
-    pictures = Pictures(folder / "pictures", suite, scene_ids(suite, run.limit))
-    items = pictures.items(records, leading_row(run))
-    items += MultiviewPictures(folder / "pictures").items(records, suite)
-    sheets = make_sheets(pictures.leading(records, leading_row(run)))
-    verdict = (folder / VERDICT).read_text(encoding="utf-8") if (folder / VERDICT).is_file() else ""
-    return write_report(
-        folder / "report.html", tables, items, run, records, specs=ALL_TABLES, sheets=sheets, verdict=verdict
-    )
-
-
-def leading_row(run: RunInfo) -> str:
-    """Key of the row whose scores choose the gallery's samples: our first, else the first stranger's, else empty."""
-    return next((info.key for kind in ("ours", "external") for info in run.methods if info.kind == kind), "")

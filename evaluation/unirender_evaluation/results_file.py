@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.records import (
     SCHEMA_VERSION,
     Record,

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.claims import MASKED
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant, metric_key
 from unirender_evaluation.published import published_tables
@@ -20,7 +21,6 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
 from unirender_evaluation.table_list import ALL_METRICS
 
-MASKED = Variant("masked", "srgb", "raw")
 NOT_RUN = "not run"
 _MATERIAL = re.compile(r"_m(\d{3})_r(\d{3})$")  # of a sample with one number each; others have maps of their own
 # Metallic and roughness in thirds: the outer ones are where a material shows what it is.

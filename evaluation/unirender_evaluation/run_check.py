@@ -15,10 +15,11 @@ from typing import Any
 
 from rich.progress import Progress
 
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation import bounds
-from unirender_evaluation.engine import Prediction, Store, content_key, record_of, score
+from unirender_evaluation.engine import Prediction, record_of, score
 from unirender_evaluation.records import MethodInfo, Record
+from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
 from unirender_evaluation.truth_check import TruthCheck, check_truth, chosen_scenes

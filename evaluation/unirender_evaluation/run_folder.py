@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
@@ -26,16 +26,18 @@ def writing_run(folder: Path) -> Iterator[None]:
     """For a block that writes a run's folder.
 
     Raises:
-        UnirenderError: the folder is full or not writable any more; other errors come as they are.
+        UnirenderError: a disk is full, or not writable any more; other errors come as they are.
     """
     try:
         yield
     except OSError as error:
-        path = Path(error.filename) if isinstance(error.filename, str) else folder
-        if error.errno not in TO_DO or not path.absolute().is_relative_to(folder.absolute()):
+        named = isinstance(error.filename, str)
+        inside = named and Path(error.filename).absolute().is_relative_to(folder.absolute())
+        if error.errno not in TO_DO or (error.errno == errno.EACCES and not inside):  # that may be a file to be read
             raise
+        what = error.filename if named else f"a file of the run, in {folder} or among the system's temporary files"
         raise UnirenderError(
-            f"cannot write {path}: {error.strerror}; {TO_DO[error.errno]}, the same command continues"
+            f"cannot write {what}: {error.strerror}; {TO_DO[error.errno]}, the same command continues"
         ) from error
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.engine import Store, content_key
 from unirender_evaluation.multiview_scenes import scene_material
 from unirender_evaluation.records import Record
 from unirender_evaluation.sampling_study_calibration import scene_calibration
 from unirender_evaluation.scoring import score_image, score_maps
+from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import Task, picture, tasks
 from unirender_evaluation.truth_render import item_seed

@@ -57,10 +57,9 @@ class BenchSampling:
         self.check()
         from rich.console import Console
 
-        from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
-        from unirender.shipped import checkpoint_folder
+        from unirender.shipped import checkpoint_folder, checkpoint_sha256
         from unirender_evaluation.pipeline_method import LazyPipeline
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.sampling_study import SamplingStudy

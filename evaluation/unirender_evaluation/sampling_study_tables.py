@@ -1,7 +1,6 @@
 """The tables of the sampling study: figures by steps and samples, and calibration by map."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -14,7 +13,7 @@ from unirender_evaluation.sampling_study_calibration import CONFIDENCE, MAPS, Ca
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import CONFIDENCE as INTERVAL
 from unirender_evaluation.statistics import Estimate, mean_estimate
-from unirender_evaluation.table_formats import MISSING, format_estimate, format_number, header
+from unirender_evaluation.table_formats import MISSING, format_estimate, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 
 DIGITS = 3
@@ -183,17 +182,11 @@ def _estimate_text(found: Estimate | None) -> str:
 
 
 def _pooled(pooled: Pooled) -> dict[str, Any]:
-    return asdict(pooled) | {"ratio": _number(pooled.ratio)}
+    return asdict(pooled) | {"ratio": json_number(pooled.ratio)}
 
 
 def _plain(found: Estimate | None) -> Mapping[str, float | str | int | None] | None:
     if found is None:
         return None
     values = {"mean": found.mean, "low": found.low, "high": found.high}
-    return {name: _number(value) for name, value in values.items()} | {"n": found.n, "objects": found.clusters}
-
-
-def _number(value: float) -> float | str | None:
-    if math.isnan(value):
-        return None
-    return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
+    return {name: json_number(value) for name, value in values.items()} | {"n": found.n, "objects": found.clusters}

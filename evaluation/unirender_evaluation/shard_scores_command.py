@@ -55,7 +55,7 @@ class BenchShards:
         self.check()
         from rich.console import Console
 
-        from unirender.files import replace_file
+        from unirender.whole_files import replace_file
         from unirender_evaluation.shard_scores import minus, shard_tables
 
         console = Console()
@@ -76,8 +76,7 @@ class BenchShards:
         from rich.console import Console
         from rich.progress import track
 
-        from unirender.files import checkpoint_sha256
-        from unirender.shipped import checkpoint_folder
+        from unirender.shipped import checkpoint_folder, checkpoint_sha256
         from unirender_evaluation.shard_scores import scored
 
         checkpoint, errors, found = checkpoint_folder(named), Console(stderr=True), []

@@ -130,9 +130,8 @@ class BenchSpeed:
 
         import torch
 
-        from unirender.files import checkpoint_sha256
         from unirender.models.precision import resolve_device, resolve_dtype
-        from unirender.shipped import checkpoint_folder
+        from unirender.shipped import checkpoint_folder, checkpoint_sha256
         from unirender_evaluation.versions import installed_version, versions
 
         device = resolve_device(self.device)

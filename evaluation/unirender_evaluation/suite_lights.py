@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
 from unirender.lighting import resample_environment
+from unirender.whole_files import file_sha256
 from unirender_evaluation.suite_objects import drawn, missing_folder
 from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_reference.mesh_folder import MeshFile
@@ -100,6 +100,9 @@ def assign_lights(spec: SuiteSpec, names: list[str], objects: int) -> list[tuple
     """(light, turn in columns) of every scene, objects outermost.
 
     All lights are used about equally often, those of one object differ, and every scene has its own turn about +y.
+
+    Raises:
+        UnirenderError: there are fewer lights than an object is to have.
     """
     per_object, count = spec.lights_per_object, objects * spec.lights_per_object
     if len(names) < per_object:

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 from unirender_evaluation.suite_spec import Files, SuiteSpec
 from unirender_evaluation.suites import Scene, Suite
 from unirender_reference.mesh_folder import MeshFile, in_split, mesh_folder

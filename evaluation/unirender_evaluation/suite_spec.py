@@ -97,10 +97,12 @@ class SuiteSpec:
 
     @property
     def camera(self) -> Camera:
+        """Of all pictures."""
         return Camera(fov_deg=self.fov_deg)
 
     @property
     def truth_path(self) -> Path:
+        """The tar with what Mitsuba rendered, beside the suite's file."""
         return self.path.parent / self.truth_file
 
     def folder(self, kind: Literal["objects", "lights"]) -> Path | None:
@@ -125,7 +127,11 @@ def is_bundled(path: Path) -> bool:
 
 
 def suite_path(name_or_path: str | Path) -> Path:
-    """A suite's TOML file: a path as it is, a bare name among the package's own."""
+    """A suite's TOML file: a path as it is, a bare name among the package's own.
+
+    Raises:
+        UnirenderError: the package has none of that name.
+    """
     path = Path(name_or_path)
     if path.suffix == ".toml":
         return path
@@ -166,7 +172,11 @@ def read_text(path: Path) -> str:
 
 
 def parse_spec(text: str, path: Path) -> SuiteSpec:
-    """`read_spec` of a text; `path` is where it lies, or is to lie."""
+    """`read_spec` of a text; `path` is where it lies, or is to lie.
+
+    Raises:
+        UnirenderError: as `read_spec`, but for a file that is not there.
+    """
     try:
         flat = _flat(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:

@@ -160,6 +160,11 @@ class Suite:
         return self._hashes[scene.object]
 
     def scene(self, key: str) -> Scene:
+        """The scene of that key.
+
+        Raises:
+            UnirenderError: there is none.
+        """
         for scene in self.scenes:
             if scene.key == key:
                 return scene
@@ -182,9 +187,11 @@ class Suite:
         return self._variance(image_member(scene.key, material))
 
     def diffuse_variance(self, scene: Scene) -> Float[np.ndarray, "h w 3"]:
+        """The same of d."""
         return self._variance(diffuse_member(scene.key))
 
     def specular_variance(self, scene: Scene, roughness: float) -> Float[np.ndarray, "h w 3"]:
+        """The same of s."""
         return self._variance(specular_member(scene.key, roughness))
 
     def ceiling_image(self, scene: Scene, material: Material) -> Float[np.ndarray, "h w 3"] | None:
@@ -205,6 +212,7 @@ class Suite:
         return np.roll(light, scene.turn_columns, axis=1) * np.float32(scene.exposure)
 
     def mask(self, scene: Scene) -> Float[np.ndarray, "h w 1"]:
+        """Coverage, [0, 1]."""
         return self._channels(shared_member(scene.object))["mask.Y"][..., None]
 
     def intrinsics(self, scene: Scene, material: Material) -> Intrinsics:

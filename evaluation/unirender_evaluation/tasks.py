@@ -79,6 +79,7 @@ class Task:
 
     @property
     def identity(self) -> str:
+        """What tells a question from all others of a suite: table, protocol and sample."""
         return f"{self.table}/{self.protocol}/{self.sample}"
 
     @property
@@ -102,31 +103,41 @@ class Task:
 
     @property
     def mask(self) -> Mask:
+        """True coverage [h w 1]."""
         return self.asked.mask
 
     @property
     def inputs(self) -> dict[str, dict[str, Any]]:
+        """Keyword arguments for each capability that is asked for; all that a method sees."""
         return self.asked.inputs
 
     @property
     def truth_image(self) -> Image | None:
+        """The true picture, linear, premultiplied; None where none is asked for."""
         return self.asked.truth_image
 
     @property
     def truth_variance(self) -> Image | None:
+        """Its variance, as a mean of noisy renders."""
         return self.asked.truth_variance
 
     @property
     def truth_twin(self) -> Image | None:
+        """The same picture rendered independently with more samples, where the suite has one."""
         return self.asked.truth_twin
 
     @property
     def truth_maps(self) -> Intrinsics | None:
+        """The true maps; None where none are asked for."""
         return self.asked.truth_maps
 
 
 def edit_quantity(base: Material, target: Material) -> str:
-    """Which column an edit belongs to."""
+    """Which column an edit belongs to.
+
+    Raises:
+        UnirenderError: it changes both metallic and roughness.
+    """
     if base[0] != target[0] and base[1] != target[1]:
         raise UnirenderError(f"edit {base} -> {target} changes metallic and roughness at once: expected one of them")
     return "edit_metallic" if base[0] != target[0] else "edit_roughness"
@@ -142,7 +153,11 @@ def picture(suite: Suite, scene: Scene, material: Material) -> dict[str, Any]:
 
 
 def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
-    """The scenes of a run; a limited run takes them evenly spaced."""
+    """The scenes of a run; a limited run takes them evenly spaced.
+
+    Raises:
+        UsageError: the limit is below 1.
+    """
     scenes = list(suite.scenes)
     if limit is None or limit >= len(scenes):
         return scenes
@@ -152,7 +167,11 @@ def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
 
 
 def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Iterator[Task]:
-    """All questions of one protocol, scene by scene."""
+    """All questions of one protocol, scene by scene.
+
+    Raises:
+        UnirenderError: there is no such protocol.
+    """
     makers = {
         ("rendering", "from-image"): _edits,
         ("rendering", "given"): _renders,

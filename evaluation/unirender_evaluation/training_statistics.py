@@ -18,7 +18,7 @@ import numpy as np
 
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr_bytes
+from unirender.exr import Channels, channels_rgb, read_exr_bytes
 
 FILE = "data/training_statistics.toml"
 
@@ -32,26 +32,36 @@ def training_statistics() -> dict[str, Any]:
 
 
 def object_means(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Coverage-weighted means of (albedo as display values, normal) of every group of a dataset folder."""
+    """Coverage-weighted means [3] of (albedo as display values, normal) of every group of a dataset folder.
+
+    Raises:
+        UnirenderError: a group has no mask.
+    """
+    for name, channels in shard_files(folder, ".shared.exr"):
+        weight = channels.get("mask.Y", channels.get("A"))
+        if weight is None:
+            raise UnirenderError(f"{name} has no mask, expected a dataset of `unirender dataset`")
+        weight = weight[..., None] / weight.sum()
+        albedo = image_srgb(channels_rgb(channels, "albedo"))
+        yield (albedo * weight).sum((0, 1)), (channels_rgb(channels, "normal", "XYZ") * weight).sum((0, 1))
+
+
+def shard_files(folder: Path, suffix: str) -> Iterator[tuple[str, Channels]]:
+    """Each EXR file of a dataset folder whose name ends so: what to call it in messages, and its channels."""
     for shard in sorted(folder.glob("shard-*.tar")):
         with tarfile.open(shard) as tar:
             for member in tar.getmembers():
-                stream = tar.extractfile(member) if member.name.endswith(".shared.exr") else None
-                if stream is None:
-                    continue
-                channels = read_exr_bytes(stream.read())[0]
-                weight = channels.get("mask.Y", channels.get("A"))
-                if weight is None:
-                    raise UnirenderError(
-                        f"{shard}: {member.name} has no mask, expected a dataset of `unirender dataset`"
-                    )
-                weight = weight[..., None] / weight.sum()
-                albedo = image_srgb(channels_rgb(channels, "albedo"))
-                yield (albedo * weight).sum((0, 1)), (channels_rgb(channels, "normal", "XYZ") * weight).sum((0, 1))
+                stream = tar.extractfile(member) if member.name.endswith(suffix) else None
+                if stream is not None:
+                    yield f"{shard}: {member.name}", read_exr_bytes(stream.read())[0]
 
 
 def write_statistics(folder: Path, path: Path) -> str:
-    """Measures a dataset folder and writes the TOML file; returns its text."""
+    """Measures a dataset folder and writes the TOML file; returns its text.
+
+    Raises:
+        UnirenderError: the folder has no shard with groups.
+    """
     means = list(object_means(folder))
     if not means:
         raise UnirenderError(

@@ -18,11 +18,11 @@ from rich.console import Console
 
 from unirender.options import Device
 from unirender_evaluation import training_study_tables as tables
-from unirender_evaluation.engine import Store, content_key
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.optimiser_study import open_folder, write_files
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image
+from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture
 from unirender_evaluation.training_study import BASE_PRESET, Choice

@@ -19,7 +19,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights
@@ -29,6 +29,7 @@ from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
 from unirender_evaluation.worker_pool import WorkerPool
+from unirender_reference.processes import start_worker
 
 CODE = {  # what a rendered part depends on
     "unirender": ("camera.py", "color.py", "exposure.py", "exr.py", "intrinsics.py", "lighting.py"),
@@ -155,7 +156,7 @@ def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Generator[tuple[int, P
     Raises:
         UnirenderError: a worker process died.
     """
-    with WorkerPool(workers, _start_worker) as pool:
+    with WorkerPool(workers, start_worker) as pool:
         numbers = {pool.submit(render_object, job): number for number, job in enumerate(jobs)}
         try:
             for future in as_completed(numbers):
@@ -185,14 +186,6 @@ def _jobs(
         chosen = tuple(map(tuple, materials[i * n : (i + 1) * n]))
         jobs.append(ObjectJob(spec, source, own, environments, chosen, folder))
     return jobs
-
-
-def _start_worker() -> None:
-    from unirender_reference.backend import set_threads
-    from unirender_reference.processes import exit_with_parent
-
-    exit_with_parent()
-    set_threads(1)
 
 
 def _fingerprint(spec: SuiteSpec, text: str, lights: Mapping[str, SuiteLight]) -> str:

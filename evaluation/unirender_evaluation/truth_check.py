@@ -128,6 +128,9 @@ def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
     """`count` scenes at random, of different objects as long as there are enough.
 
     Objects whose mesh file is not here cannot be rendered again and are left out; where that leaves none they are not.
+
+    Raises:
+        UsageError: none are asked for.
     """
     if count < 1:
         raise UsageError(f"truth check: got {count} scenes, expected at least 1")

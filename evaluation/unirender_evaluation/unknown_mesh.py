@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from unirender_evaluation.engine import Store, content_key
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.multiview_scenes import suite_scene
 from unirender_evaluation.multiview_scoring import solution_looks
@@ -18,6 +17,7 @@ from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.multiview_tables import SECONDS
 from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.records import Record
+from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
 from unirender_reference.optimize.config import OptimizeConfig

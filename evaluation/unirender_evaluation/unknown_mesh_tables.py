@@ -1,7 +1,6 @@
 """The tables of the unknown meshes: an object a row, their mean, and the aims."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import CONFIDENCE, mean_estimate
-from unirender_evaluation.table_formats import format_estimate, format_number, header
+from unirender_evaluation.table_formats import format_estimate, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.unknown_mesh_scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
 from unirender_reference.multiview import ELEVATIONS_DEG
@@ -145,18 +144,12 @@ def to_json(records: Sequence[Record], names: Mapping[str, str], run: Mapping[st
         if values:
             found = mean_estimate(values)
             means[key] = {
-                "mean": _plain(found.mean),
-                "low": _plain(found.low),
-                "high": _plain(found.high),
+                "mean": json_number(found.mean),
+                "low": json_number(found.low),
+                "high": json_number(found.high),
                 "n": found.n,
             }
     aims = [{"name": aim.name, "key": aim.column.key(DEFAULT_VARIANT), "bound": aim.bound} for aim in AIMS]
     objects = [{"name": names[record.sample], **json.loads(record.to_json())} for record in records]
     content = {"run": dict(run), "aims": aims, "mean": means, "objects": objects}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _plain(value: float) -> float | str | None:
-    if math.isnan(value):
-        return None
-    return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")

@@ -53,6 +53,7 @@ COMMANDS = (
     "__init__",
     "*_command",
     "*_commands",
+    "bench_config",
     "benchmark",
     "commands",
     "crosscheck*",
@@ -95,7 +96,7 @@ FROM_RECORDS = (
     "verdict",
 )
 # Of the shared vocabulary's folder: the command line, and what is said where a file cannot be written.
-OUTSIDE = ("__main__", "cli", "command_line", "commands", "options", "shipped", "writing")
+OUTSIDE = ("__main__", "cli", "command_line", "commands", "folder_command", "options", "remarks", "shipped", "writing")
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
@@ -264,12 +265,16 @@ def modules_version(*names: str) -> str:
 
 
 def lpips_version(backbones: Sequence[str]) -> str:
-    """sha256 over the weights of the backbones and what computes with them."""
+    """sha256 over the weights of the backbones and what computes with them.
+
+    Raises:
+        UnirenderError: weights are not here.
+    """
     from unirender_evaluation.lpips import weights_path
 
     digest = hashlib.sha256(f"torch {installed_version('torch')}".encode())
     for name in sorted(backbones):
-        path = weights_path(name)  # type: ignore[arg-type]  # the name of a backbone
+        path = weights_path(name)  # pyright: ignore[reportArgumentType] - the name of a backbone
         try:
             weights = path.read_bytes()
         except OSError as error:

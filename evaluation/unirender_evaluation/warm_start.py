@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.engine import Store, content_key
 from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.methods import seen_linear
 from unirender_evaluation.metrics import Metric, metric_key
@@ -31,6 +30,7 @@ from unirender_evaluation.multiview_tables import SECONDS
 from unirender_evaluation.optimized_method import SHADE_SPP
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image, score_maps
+from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suite_objects import known_mesh, scene_object
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture

@@ -26,7 +26,7 @@ def our_method(checkpoint: Path | None) -> Any:
     Args:
         checkpoint: its folder; None: the shipped one.
     """
-    from unirender_evaluation.benchmark import BenchConfig, build_rows
+    from unirender_evaluation.bench_config import BenchConfig, build_rows
     from unirender_evaluation.claims import OURS
 
     rows = build_rows(BenchConfig(methods=("ours",), checkpoint=checkpoint))

@@ -18,14 +18,15 @@ from typing import Any
 from uuid import uuid4
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
-from unirender_evaluation.engine import Job, content_key, method_jobs
+from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
 from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, evenly
+from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions, versions
@@ -205,7 +206,11 @@ _made: dict[str, Run] = {}  # at most one run, by the name of its order
 
 
 def cluster_scene(order: Order, scene: str, wanted: frozenset[str]) -> tuple[list[Record], dict[str, bytes]]:
-    """The records of a scene that have the wanted content keys, and the pictures that belong to them, by file name."""
+    """The records of a scene that have the wanted content keys, and the pictures that belong to them, by file name.
+
+    Raises:
+        UnirenderError: this worker's methods, suite or code are others than those of who asks.
+    """
     if order.name not in _made:
         _made.clear()
         _made[order.name] = order.make()

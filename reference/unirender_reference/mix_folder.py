@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
+from unirender.whole_files import replace_file
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
 from unirender_reference.meshes.load import read_model

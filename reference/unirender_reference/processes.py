@@ -36,6 +36,14 @@ def exit_with_parent() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
+def start_worker() -> None:
+    """An initializer of workers that render: one thread each, and none outlives its parent."""
+    from unirender_reference.backend import set_threads
+
+    exit_with_parent()
+    set_threads(1)
+
+
 class TimeLimitPassed(UnirenderError):
     """Something took longer than it may."""
 

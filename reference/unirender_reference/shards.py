@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 
 MANIFEST = "manifest.json"
 FAILURES = "failures.jsonl"

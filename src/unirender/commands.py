@@ -4,7 +4,6 @@ They know nothing of the ground truth: what reads the light files is passed in b
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,20 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import MANY_CLIPPED, InputOptions, ModelOptions, OutputOptions, notice, read_input, usage
+from unirender.options import InputOptions, ModelOptions, OutputOptions, notice
+from unirender.remarks import (
+    at_white,
+    check_looks_option,
+    check_stops,
+    missing_maps,
+    normals_away,
+    overflow,
+    parts_left_out,
+    with_parts_remark,
+)
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from unirender.intrinsics import Intrinsics
-    from unirender.pictures import Picture
-    from unirender.pipelines.results import Decomposition
-    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-
-MAX_STOPS = 32
 MUCH_COARSE = 0.05  # share of the object, from which a notice is due
-MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
-IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
 
 ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a light file
 
@@ -53,6 +54,11 @@ class Decompose:
     may lie inside the output folder."""
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """How a picture is taken apart, as keyword arguments of the pipeline and for `meta.json`."""
+        return {"looks": self.looks, "closed": self.closed, "tile": self.tile}
+
     def run(self) -> int:
         """Returns the exit status."""
         from unirender.files import folder_beside, new_folder
@@ -60,9 +66,11 @@ class Decompose:
         from unirender.scene_export import write_scene
 
         self.model.check()
-        check_looks(self.looks, self.model.mode)
+        check_looks_option(self.looks, self.model.mode)
         if self.input.picture.is_dir():
-            return self._run_folder()
+            from unirender.folder_command import run_folder
+
+            return run_folder(self)
         if self.frames:
             raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
         picture, camera = self.input.read(self.model)
@@ -73,78 +81,14 @@ class Decompose:
                 beside = folder_beside(self.export, self.out.output, folder, overwrite=self.out.overwrite)
                 scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
-            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **options, **sampling)
+            picture = with_parts_remark(picture, self.model.side(pipeline))
+            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **self.options, **sampling)
             meta = {"command": "decompose", "input": self.input.picture, **of_picture(picture)}
-            meta = write_decomposition(folder, result, meta | options | self.model.provenance(pipeline))
+            meta = write_decomposition(folder, result, meta | self.options | self.model.provenance(pipeline))
             if scene is not None:
                 write_scene(scene, result.intrinsics, meta)
         print(f"{self.out.output}: roughness {result.roughness:.2f}, metallic {result.metallic:.2f}")
         return 0
-
-    def _run_folder(self) -> int:
-        """Returns the exit status: 1 where a picture failed."""
-        from unirender.files import SUMMARY_FILE
-        from unirender.folders import decompose_folder, list_pictures, write_summary
-        from unirender.frames import temporal_difference
-        from unirender.pipelines.inputs import as_picture
-
-        source, output = self.input.picture, self.out.output
-        if self.export is not None:
-            raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
-        if self.input.mask is not None and not self.input.mask.exists():
-            raise UnirenderError(
-                f"--mask {self.input.mask}: no such file or folder, expected a picture or a folder of them"
-            )
-        pictures = list_pictures(source)
-        pipeline, sampling = self.model.load(), self.model.sampling()
-        options = {"looks": self.looks, "closed": self.closed, "tile": self.tile}
-        settings = {"command": "decompose", **options, **self.model.provenance(pipeline), "fov": self.model.fov}
-        remarks: dict[str, list[str]] = {}
-
-        def read(path: Path, mask: Path | None) -> "Picture":
-            picture, said = read_input(path, mask)
-            try:  # what the network would refuse is refused here, by itself
-                as_picture(picture.image_srgb, picture.mask)
-            except UnirenderError as error:
-                raise UnirenderError(f"{path}: {error}") from error
-            said |= self.model.camera_remarks(picture)
-            for kind, remark in said.items():
-                remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
-            return dataclasses.replace(picture, remarks=said)
-
-        def decompose(batch: list["Picture"]) -> list["Decomposition"]:
-            images, masks = [picture.image_srgb for picture in batch], [picture.mask for picture in batch]
-            cameras = [self.model.camera(picture) for picture in batch]
-            each: dict[str, Any] = sampling | {"generator": self.model.generators(len(batch))}
-            return pipeline.decompose_batch(images, masks, cameras=cameras, **options, **each)
-
-        found = decompose_folder(
-            pictures,
-            output,
-            read=read,
-            decompose=decompose,
-            settings=settings,
-            masks=self.input.mask,
-            overwrite=self.out.overwrite,
-        )
-        facts = {**settings, "input": source}
-        if self.frames:
-            results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
-            facts["temporal_difference"] = temporal_difference(results)
-        if found.figures or not (output / SUMMARY_FILE).exists():  # where all failed, that of an earlier run stays
-            write_summary(output, found, facts)
-        for first, *others in remarks.values():
-            notice(first + (f" (and {len(others)} more)" if others else ""))
-        for reason in found.failed.values():
-            notice(f"error: {reason}")
-        failed = f", {len(found.failed)} failed" if found.failed else ""
-        print(f"{output}: {len(found.figures)} pictures ({found.kept} of them from before){failed}")
-        if self.frames:
-            changes = facts["temporal_difference"]
-            print(f"mean change between {changes.pop('pairs')} pairs of frames: ", end="")
-            print(", ".join(f"{name} {value:.4f}" for name, value in changes.items()) or "none to compare")
-        return 1 if found.failed else 0
 
 
 @dataclass(frozen=True)
@@ -171,7 +115,7 @@ class Render:
         from unirender.pipelines.inputs import ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
-        check_exposure(self.exposure)
+        check_stops(self.exposure)
         if self.exposure is not None and self.environment is None:
             raise UsageError(f"--exposure {self.exposure:g} is of a new light: expected --environment beside it")
         intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
@@ -189,6 +133,9 @@ class Render:
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
             pipeline = self.model.load()
+            meta["remarks"] = parts_left_out(intrinsics.mask, self.model.side(pipeline))
+            for remark in meta["remarks"].values():
+                notice(remark)
             added = () if self.environment is None else of_light  # they are there, as direct light
             ready = ready_to_render(intrinsics, self.shadows, added)  # here, so that it is done once
             image = pipeline.render(ready, derived=told_derived(of_light, self.shadows), **self.model.sampling())
@@ -225,7 +172,7 @@ class Edit:
         from unirender.folders import of_picture
 
         self.model.check()
-        check_looks(self.looks, self.model.mode)
+        check_looks_option(self.looks, self.model.mode)
         change = {"roughness": self.roughness, "metallic": self.metallic}
         if set(change.values()) == {None}:
             raise UsageError("edit: nothing to change, expected --roughness or --metallic (or both)")
@@ -236,6 +183,7 @@ class Edit:
         options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
+            picture = with_parts_remark(picture, self.model.side(pipeline))
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
             meta = {"command": "edit", "input": self.input.picture, **of_picture(picture), **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
@@ -279,14 +227,15 @@ class Relight:
         from unirender.folders import of_picture
 
         self.model.check()
-        check_looks(self.looks, self.model.mode)
-        check_exposure(self.exposure)
+        check_looks_option(self.looks, self.model.mode)
+        check_stops(self.exposure)
         picture, camera = self.input.read(self.model)
         options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
         options |= {"shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
             pipeline, sampling = self.model.load(), self.model.sampling()
+            picture = with_parts_remark(picture, self.model.side(pipeline))
             result = pipeline.relight(
                 picture.image_srgb,
                 light,
@@ -302,94 +251,3 @@ class Relight:
             write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
         print(f"{self.out.output}")
         return 0
-
-
-def check_exposure(stops: float | None) -> None:
-    """Looks at a number of stops.
-
-    Raises:
-        UsageError: it is none that a light could be changed by.
-    """
-    if stops is not None and not abs(stops) <= MAX_STOPS:
-        raise UsageError(f"--exposure {stops}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
-
-
-def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[str, Any]:
-    """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
-    found = pipeline.overflow(intrinsics)
-    return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
-
-
-def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
-    """For `meta.json`: which maps a rendering gets from elsewhere than what is given; a notice where nobody asked.
-
-    Args:
-        intrinsics: as they are given.
-        new_light: whether a light beside them takes the place of their specular, diffuse and environment.
-    """
-    from unirender.pipelines.inputs import DERIVABLE, to_derive, with_mask
-
-    derived = DERIVABLE if new_light else tuple(name for name in DERIVABLE if name in to_derive(intrinsics))
-    lit = (*DERIVABLE, "environment") if new_light else derived
-    imagined = [name for name in IMAGINED if name not in (*intrinsics.present, *lit)]
-    facts: dict[str, Any] = {"imagined": imagined, "derived": list(derived)}
-    said = [f"the network imagines {', '.join(imagined)}"] if imagined else []
-    if derived and not new_light:
-        said.append(f"{', '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
-    if intrinsics.mask is None:
-        whole = bool(with_mask(intrinsics).require("mask")["mask"].all())
-        facts["mask_from"] = "frame" if whole else "normal"
-        said.append("the mask is the whole frame" if whole else "the mask is where the normal is not 0")
-    if said:
-        notice(f"maps that are missing: {'; '.join(said)}")
-    return facts
-
-
-def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
-    """For `meta.json`: the share of the covered normals that face away from the camera; a notice where there are many.
-
-    Args:
-        intrinsics: with a mask.
-    """
-    from unirender.pipelines.inputs import facing_away
-
-    if intrinsics.normal is None:  # what needs it says so
-        return {}
-    share = facing_away(intrinsics)
-    if share > MANY_AWAY:
-        notice(
-            f"{share:.0%} of the object's normals face away from the camera: expected camera axes, +z towards the "
-            "viewer; maps of other axes have to be turned"
-        )
-    return {"facing_away": share}
-
-
-def check_looks(looks: int, mode: str) -> None:
-    """Looks at `--looks`.
-
-    Raises:
-        UsageError: it is no such number, or several samples are asked for.
-    """
-    if looks != 1:
-        from unirender.pipelines import looks as of_pictures
-
-        with usage():
-            of_pictures.check_looks(looks, mode)
-
-
-def at_white(image_linear: "np.ndarray", mask: "np.ndarray | None") -> dict[str, Any]:
-    """For `meta.json`: the share of a rendering's pixels at display white, where the network's range ends; a notice
-    where there are many.
-
-    Args:
-        image_linear: premultiplied.
-        mask: its coverage.
-    """
-    from unirender.color import image_srgb, unpremultiply
-    from unirender.pictures import Picture
-
-    straight = image_linear if mask is None else unpremultiply(image_linear, mask)
-    share = Picture(image_srgb(straight), mask, "").clipped
-    if share > MANY_CLIPPED:
-        notice(f"{share:.0%} of the object's pixels come out at display white, where what the network renders ends")
-    return {"at_white": share}

@@ -13,7 +13,6 @@ import logging
 import os
 import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -37,12 +36,12 @@ from unirender.exr import (
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.whole_files import move_into_place
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 SUMMARY_FILE = "summary.json"  # of a folder of results
 
 FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
-ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
 
 LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
 
@@ -88,7 +87,7 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
         yield temporary
         os.chmod(temporary, 0o755)
         try:
-            _move_into_place(temporary, path)
+            move_into_place(temporary, path)
         except OSError as error:
             raise UnirenderError(f"{shown}: cannot be replaced ({error.strerror}); choose another folder") from error
     except BaseException:
@@ -122,64 +121,6 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
     folder = temporary / inner.relative_to(outer)
     folder.mkdir(parents=True)
     yield folder
-
-
-def _move_into_place(temporary: Path, path: Path) -> None:
-    """Renames a folder to `path`, in place of the folder that may be there; where that fails, all is as before."""
-    if not path.is_dir():
-        os.rename(temporary, path)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
-    try:
-        os.rename(path, aside / "old")
-    except BaseException:
-        aside.rmdir()
-        raise
-    try:
-        os.rename(temporary, path)
-    except BaseException:
-        os.rename(aside / "old", path)
-        aside.rmdir()
-        raise
-    shutil.rmtree(aside)
-
-
-def replace_file(path: Path, content: str | bytes) -> Path:
-    """Writes a file, text as UTF-8, and its folder where there is none; returns the path.
-
-    It is written aside, synced and renamed: whoever reads `path`, after a crash or while others write it too, finds the
-    old content or the new.
-
-    Raises:
-        OSError: it cannot be written; what was there stays.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
-    temporary = Path(name)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content if isinstance(content, bytes) else content.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)  # mkstemp gives it to its owner alone
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    return path
-
-
-def file_sha256(path: str | Path) -> str:
-    """sha256 of a file's bytes, hexadecimal.
-
-    Raises:
-        UnirenderError: it cannot be read.
-    """
-    try:
-        with Path(path).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
 
 
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
@@ -244,21 +185,6 @@ def header_attributes(meta: Mapping[str, Any], camera: Camera | None) -> dict[st
     attributes = {key: str(value) for key, value in meta.items() if isinstance(value, str | int | float)}
     attributes |= {key: value.resolve().name for key, value in meta.items() if isinstance(value, Path)}
     return attributes if camera is None else attributes | {CAMERA_ATTRIBUTE: camera.describe()}
-
-
-def checkpoint_sha256(folder: Path) -> str:
-    """sha256 over the weights and configurations of a checkpoint folder, not over the account of its training.
-
-    Raises:
-        UnirenderError: there are none.
-    """
-    digest = hashlib.sha256()
-    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name not in ACCOUNTS)
-    if not files:
-        raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
-    for path in files:
-        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
-    return digest.hexdigest()
 
 
 def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool = True) -> Intrinsics:

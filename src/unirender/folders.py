@@ -21,12 +21,12 @@ from unirender.files import (
     META_FILE,
     SUMMARY_FILE,
     new_folder,
-    replace_file,
     write_png,
     write_result,
 )
 from unirender.intrinsics import MAPS
 from unirender.pictures import Picture
+from unirender.whole_files import replace_file
 
 if TYPE_CHECKING:
     from unirender.pipelines.results import Decomposition

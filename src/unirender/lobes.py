@@ -242,4 +242,9 @@ class MipPyramid:
 
 @functools.lru_cache(maxsize=4)
 def texel_directions(shape: tuple[int, int]) -> Float[np.ndarray, "3 m"]:
+    """Unit directions of a lat-long map's texels, row by row.
+
+    Args:
+        shape: its rows and columns.
+    """
     return np.ascontiguousarray(environment_directions(*shape).reshape(-1, 3).T)

@@ -111,6 +111,10 @@ class ModelOptions:
         pipeline.set_progress_bar_config(disable=not self.progress or not sys.stderr.isatty())
         return pipeline
 
+    def side(self, pipeline: "UniRenderPipeline") -> int:
+        """Of the square at which the network runs, pixels."""
+        return self.size or pipeline.size
+
     @property
     def mode(self) -> str:
         """`mean`, or `sample` where several samples or steps are asked for."""
@@ -153,8 +157,7 @@ class ModelOptions:
         """What goes into `meta.json` and the headers: which model ran, and how."""
         import unirender
         from unirender.diffusion.sampling import sampler_name, steps_of
-        from unirender.files import checkpoint_sha256
-        from unirender.shipped import checkpoint_folder, checkpoint_label
+        from unirender.shipped import checkpoint_folder, checkpoint_label, checkpoint_sha256
 
         steps = steps_of(self.mode, self.steps)
         return {
@@ -165,7 +168,7 @@ class ModelOptions:
             "seed": self.seed,
             "steps": steps,
             "sampler": (self.sampler or sampler_name(pipeline.scheduler)) if steps > 1 else None,
-            "size": self.size or pipeline.size,
+            "size": self.side(pipeline),
             "samples": self.samples,
             "device": str(pipeline.device),
             "dtype": str(pipeline.dtype).removeprefix("torch."),
@@ -220,13 +223,14 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     """
     import numpy as np
 
-    from unirender.pictures import read_mask, read_picture
+    from unirender.pictures import read_mask_file, read_picture
 
     picture = read_picture(path)
     remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
     if mask is not None:
-        coverage = read_mask(mask, (height, width))
+        coverage, lost = read_mask_file(mask, (height, width))
+        remarks |= lost
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() == 1:
             remarks["mask"] = "the mask covers the whole frame, which is taken as the object"

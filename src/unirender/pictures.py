@@ -1,29 +1,26 @@
 """Pictures and masks from files: PNG, JPG and whatever else Pillow knows, and linear OpenEXR."""
 
 import contextlib
-import warnings
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, ImageOps, UnidentifiedImageError
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
+from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
-from unirender.icc import in_srgb
 
-FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
-MAX_PIXELS = 100_000_000
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
-DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
-
-SIXTEEN_BITS = "its channels have 16 bits, of which 8 are read: save linear radiance as EXR to keep them"
 ALPHA_TOLERANCE = 1e-3  # of an EXR: half precision and filters step over [0, 1]
+MASK_BEYOND = 0.1  # how far an EXR's mask may step over [0, 1]: more is no filter's ringing
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -84,23 +81,44 @@ def checked_file(path: str | Path) -> Path:
 def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours, as they are stored.
 
-    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone.
+    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone. What is lost in reading it is logged.
 
     Raises:
-        UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty.
+        UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty, or
+            values are more than `MASK_BEYOND` outside [0, 1].
+    """
+    mask, remarks = read_mask_file(path, size)
+    for remark in remarks.values():
+        logger.warning("%s: %s", path, remark)
+    return mask
+
+
+def read_mask_file(path: str | Path, size: tuple[int, int]) -> tuple[Float[np.ndarray, "h w 1"], dict[str, str]]:
+    """The same, and by kind what is lost, of which nothing is logged.
+
+    Raises:
+        UnirenderError: as `read_mask`.
     """
     path = checked_file(path)
-    mask = (
-        _read_exr_mask(path)
-        if path.suffix.lower() == ".exr"
-        else coverage(display_values(open_picture(path), str(path)))
-    )
+    exr = path.suffix.lower() == ".exr"
+    mask = _read_exr_mask(path) if exr else coverage(stored_values(path))
     if mask.shape[:2] != size:
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
             "like the picture"
         )
-    return check_mask(mask, str(path))
+    low, high = float(mask.min()), float(mask.max())
+    if low < -MASK_BEYOND or high > 1 + MASK_BEYOND:
+        raise UnirenderError(
+            f"{path}: the mask has values in [{low:.3g}, {high:.3g}], expected coverage in [0, 1]; divide it by its "
+            "white, or write 1 on the object alone"
+        )
+    remarks = {}
+    if not exr and (count := picture_count(path)) > 1:
+        remarks["mask_frames"] = f"the mask's file holds {count} pictures, of which the first is taken"
+    if low < -ALPHA_TOLERANCE or high > 1 + ALPHA_TOLERANCE:
+        remarks["mask_range"] = f"the mask has values in [{low:.3g}, {high:.3g}], clipped to [0, 1]"
+    return check_mask(mask, str(path)), remarks
 
 
 def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray, "h w 1"]:
@@ -115,67 +133,6 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
             "expected white (or opaque) pixels on the object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
-
-
-def open_picture(path: str | Path) -> Image.Image:
-    """A picture file in a format of Pillow's, decoded and turned as its EXIF orientation says.
-
-    Raises:
-        UnirenderError: no readable picture, or one of more than `MAX_PIXELS`.
-    """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as file:
-                width, height = file.size
-                if width * height > MAX_PIXELS:
-                    raise UnirenderError(
-                        f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
-                    )
-                file.load()
-                return ImageOps.exif_transpose(file)
-    except UnirenderError:
-        raise
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
-
-
-def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
-    """The pixels of a PIL picture of any mode as display values in [0, 1], not premultiplied: RGB, or RGBA where the
-    picture has an alpha channel. 16-bit grey keeps its 16 bits (Pillow's own conversion saturates it).
-
-    Args:
-        image: the picture; its EXIF orientation is not looked at.
-        name: what to call it in messages.
-
-    Raises:
-        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; or
-            one of L*a*b*.
-    """
-    if image.mode.startswith("I;16") or image.mode in ("I", "F"):
-        values = np.asarray(image, dtype=np.float32)
-        if image.mode == "I" and 0 < values.max(initial=0) <= DISPLAY_MAX_8_BIT:
-            raise UnirenderError(
-                f"{name}: a picture of mode I whose values end at {values.max():g} may be 8-bit or very dark 16-bit "
-                'grey; convert it to mode "L", or to "I;16" if display white is 65535'
-            )
-        if image.mode == "F" or values.min(initial=0) < 0 or values.max(initial=0) > DISPLAY_MAX_16_BIT:
-            raise UnirenderError(
-                f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
-                "grey; save linear radiance as EXR"
-            )
-        return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
-    if image.mode == "LAB":
-        raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
-    if image.mode in ("RGBa", "La"):  # premultiplied
-        image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
-    mode = "RGBA" if image.has_transparency_data else "RGB"
-    return np.asarray(image.convert(mode), dtype=np.float32) / 255
-
-
-def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
-    """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`unirender.icc`)."""
-    return display_values(in_srgb(image, name), name)
 
 
 def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
@@ -217,16 +174,11 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
 
 
 def _read_display_picture(path: Path) -> Picture:
-    pixels = display_colors(open_picture(path), str(path))
+    pixels, remarks = srgb_values_and_remarks(path, str(path))
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
-    remarks = {"depth": SIXTEEN_BITS} if _has_sixteen_bit_colors(path) else {}
+    if (count := picture_count(path)) > 1:
+        remarks["frames"] = f"the file holds {count} pictures, of which the first is taken"
     return Picture(np.ascontiguousarray(pixels[..., :3]), mask, path.name, remarks=remarks)
-
-
-def _has_sixteen_bit_colors(path: Path) -> bool:
-    """Whether Pillow drops half of the bits of a picture's channels, by how it would decode them."""
-    with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning), Image.open(path) as file:
-        return not file.mode.startswith("I") and any(";16" in str(tile.args) for tile in file.tile)
 
 
 def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:

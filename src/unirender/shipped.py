@@ -1,10 +1,14 @@
-"""The checkpoints that come with the package, by name. Light to import."""
+"""Folders of checkpoints: those that come with the package, by name, and the hash of one. Light to import."""
 
+import hashlib
 import json
 from pathlib import Path
 
+from unirender.errors import UnirenderError
+
 CHECKPOINTS = Path(__file__).parent / "checkpoints"  # a pipeline folder each
 DEFAULT = "tiny"
+ACCOUNTS = ("training.json", "validation.json")  # files beside the weights that say how they came about
 
 
 def shipped_names() -> tuple[str, ...]:
@@ -44,3 +48,18 @@ def checkpoint_label(checkpoint: str | Path | None = None) -> str:
     """What an account of a run calls a checkpoint: its folder's name, or `tiny (shipped)`."""
     folder = checkpoint_folder(checkpoint)
     return f"{folder.name} (shipped)" if folder.parent == CHECKPOINTS else folder.resolve().name
+
+
+def checkpoint_sha256(folder: Path) -> str:
+    """sha256 over the weights and configurations of a checkpoint folder, not over the account of its training.
+
+    Raises:
+        UnirenderError: there are none.
+    """
+    digest = hashlib.sha256()
+    files = sorted(p for p in folder.rglob("*") if p.suffix in (".safetensors", ".json") and p.name not in ACCOUNTS)
+    if not files:
+        raise UnirenderError(f"no checkpoint in {folder}: expected .safetensors and .json files")
+    for path in files:
+        digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.hexdigest()

@@ -13,11 +13,12 @@ from rich.progress import Progress
 from tiny_suites import make_suite, write_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.benchmark import BenchConfig, _work, build_rows, prepare
+from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.benchmark import _work, prepare
 from unirender_evaluation.bounds import CEILING_KEY
 from unirender_evaluation.commands import BenchRun
-from unirender_evaluation.engine import Job, Store
 from unirender_evaluation.records import Record
+from unirender_evaluation.store import Job, Store
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.versions import Versions

@@ -13,11 +13,11 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
 from unirender.intrinsics import Intrinsics
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
-from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.metrics import ALL_VARIANTS

@@ -11,7 +11,8 @@ from tiny_suites import write_suite
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
-from unirender_evaluation.benchmark import BenchConfig, build_rows, run
+from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.benchmark import run
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.truth import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder

@@ -23,9 +23,10 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
-from unirender_evaluation.benchmark import BenchConfig, _work
+from unirender_evaluation.bench_config import BenchConfig
+from unirender_evaluation.benchmark import _work
 from unirender_evaluation.dry_run import planned
-from unirender_evaluation.engine import KEY_PREFIX, Job, Prediction, Store, content_key, method_jobs, score
+from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods import Composite, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
@@ -33,6 +34,7 @@ from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
+from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
@@ -340,6 +342,29 @@ def test_records_of_other_code_are_kept(suite: Suite, tmp_path: Path) -> None:
         assert store.of_other_code() == others
         assert [record.key for record in store.close()] == [key]
     assert Store.open(path).known.keys() == {mine, other}
+
+
+def test_of_other_code_the_last_few_records_of_a_measurement_wait(suite: Suite, tmp_path: Path) -> None:
+    """However many states of the code a folder has seen; those of other settings are the run's own code's, and stay."""
+
+    def waiting_after(codes: list[str], settings: list[int]) -> list[str]:
+        keys = [content_key(suite, suite.scenes[0], "what", {"s": s}, c) for c, s in zip(codes, settings, strict=True)]
+        folder = tmp_path / codes[-1]
+        folder.mkdir()
+        for key in keys:
+            store = Store.open(folder / "records.jsonl")
+            for sample in ("a", "b"):
+                store.add(Record("inverse", "single-image", "m", sample, "o", {}, f"{key}-{sample}"))
+            store.close()
+        assert (folder / "records.jsonl").read_text().count("\n") == 2
+        found = [Record.from_json(line).key for line in (folder / "unused.jsonl").read_text().splitlines()]
+        every = [f"{key}-{sample}" for key in keys[:-1] for sample in ("a", "b")]
+        assert found == every[len(every) - len(found) :], "the last, in order"
+        return found
+
+    count = KEPT + 4
+    assert len(waiting_after([f"code {i}" for i in range(count)], [0] * count)) == 2 * KEPT
+    assert len(waiting_after(["code"] * count, list(range(count)))) == 2 * (count - 1)
 
 
 class Killer:

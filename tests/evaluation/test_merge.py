@@ -8,7 +8,8 @@ from small_results import METHODS, small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.merge import check_comparable, differences, merge, obstacles
-from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.metrics import OWN_MASK, metric_key
+from unirender_evaluation.protocol import doubts
 from unirender_evaluation.results_data import Results
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.tables import Table, build_tables
@@ -115,6 +116,25 @@ def test_what_both_files_say_of_each_scenes_pictures_stays() -> None:
     assert merge(halves)[0].method("ours-mean").note == said
     other = noted(f"3 scenes only; {said.replace('2', '1')}", EVERY[1:], "b.json")
     assert merge([halves[0], other])[0].method("ours-mean").note == ""
+
+
+def test_doubts_are_counted_over_all_files() -> None:
+    """A file's note counts its own pictures alone."""
+
+    def half(name: str, missed: int) -> Results:
+        file = noted("", (name,), f"{name}.json")
+        records, masks = [], iter([0.0] * missed + [1.0] * 9)
+        for r in file.records:
+            asked = (r.method, r.table) == ("ours-mean", "inverse")
+            records.append(replace(r, values={**r.values, OWN_MASK: next(masks)}) if asked else r)
+        infos = (replace(METHODS[0], note="; ".join(["fast", *doubts("ours-mean", records)])), *METHODS[1:])
+        return replace(file, run=replace(file.run, methods=infos), records=tuple(records))
+
+    one, two = half("ball-0", 1), half("ball-1", 2)
+    counts = [sum(OWN_MASK in r.values for r in file.records) for file in (one, two)]
+    said = "fast; its own mask misses the object on {} of {} pictures (is it 0?)"
+    assert one.run.method("ours-mean").note == said.format(1, counts[0])
+    assert merge([one, two])[0].method("ours-mean").note == said.format(3, sum(counts))
 
 
 def test_a_value_that_only_one_file_has_is_kept() -> None:

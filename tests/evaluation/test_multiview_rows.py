@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from multiview_pieces import SMALL
 
-from unirender_evaluation.engine import Job, Store, content_key
 from unirender_evaluation.multiview_methods import ConstantObject
 from unirender_evaluation.multiview_pictures import MultiviewPictures
 from unirender_evaluation.multiview_rows import TRIVIAL_USES, multiview_jobs
@@ -19,6 +18,7 @@ from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.report import write_report
 from unirender_evaluation.rows import Row, make_row
+from unirender_evaluation.store import Job, Store, content_key
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.table_formats import to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex

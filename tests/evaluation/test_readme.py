@@ -10,8 +10,7 @@ import pytest
 from safetensors.numpy import save_file
 
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
-from unirender.shipped import checkpoint_folder
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import readme
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run

@@ -32,8 +32,9 @@ from unirender_evaluation.gallery import (
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
-from unirender_evaluation.report import leading_row, rebuild, report_run, write_report
+from unirender_evaluation.report import write_report
 from unirender_evaluation.report_plots import Scale, heading, strip_plots, tiles
+from unirender_evaluation.report_run import leading_row, rebuild, report_run
 from unirender_evaluation.report_samples import make_sheets
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_tables

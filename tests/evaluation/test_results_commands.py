@@ -10,7 +10,7 @@ from small_results import HASH, small_document, small_results, written
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
-from unirender_evaluation.benchmark import GROUPS
+from unirender_evaluation.bench_config import GROUPS
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
 from unirender_evaluation.results_compare import Rank, chosen_pairs, compare_pair, rank
 from unirender_evaluation.results_listing import LISTINGS, METHOD_GROUPS

@@ -14,8 +14,8 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender_evaluation.bounds import REFERENCE_KEY
-from unirender_evaluation.engine import Store
 from unirender_evaluation.run_check import CheckRequest, draw_seed, read_check, reference_row, run_check
+from unirender_evaluation.store import Store
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_check import chosen_scenes
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions

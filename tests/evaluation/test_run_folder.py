@@ -1,6 +1,7 @@
 """What a run's folder says beside its results: which answers are missing, and why a file cannot be written."""
 
 import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.methods import UneditedInput
+from unirender_evaluation.records import Record, append_record, write_records
 from unirender_evaluation.rows import make_row, prediction_rows
 from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
 
@@ -39,10 +41,32 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     [(errno.ENOSPC, "free space"), (errno.EDQUOT, "free space"), (errno.EROFS, "make it writable")],
 )
 def test_a_full_disk_is_said(tmp_path: Path, number: int, to_do: str) -> None:
-    for named, shown in ((None, tmp_path), (str(tmp_path / "run.json"), tmp_path / "run.json")):
+    unnamed = f"a file of the run, in {tmp_path} or among the system's temporary files"
+    for named, shown in ((None, unnamed), *((name, name) for name in (str(tmp_path / "run.json"), "/elsewhere/file"))):
         said = f"cannot write {shown}: reason; {to_do}, the same command continues"
         with pytest.raises(UnirenderError, match=said), writing_run(tmp_path):
             raise OSError(number, "reason", named)
+
+
+def test_a_disk_that_is_full_while_a_file_is_written_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system names none where a write fails."""
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    record = Record("inverse", "single-image", "m", "s", "o", {}, "key")
+    monkeypatch.setattr(os, "fsync", full)
+    appended, replaced = tmp_path / "records.jsonl", tmp_path / "unused.jsonl"
+    appended.symlink_to("/dev/full")
+    for path, write in (
+        (appended, lambda: append_record(appended, record)),
+        (replaced, lambda: write_records(replaced, [record])),
+    ):
+        said = f"cannot write {path}: No space left on device; free space"
+        with pytest.raises(UnirenderError, match=said), writing_run(tmp_path):
+            write()
 
 
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:

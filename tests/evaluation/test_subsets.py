@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tiny_suites import make_suite
 
-from unirender_evaluation.benchmark import BenchConfig, build_rows
+from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.physics_rows import physics_scenes

@@ -15,7 +15,7 @@ from tiny_suites import write_suite
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 from unirender_evaluation import results_check, suite_home
 from unirender_evaluation.lpips import SMALLEST
 from unirender_evaluation.results_listing import suites as listed_suites

@@ -13,7 +13,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 from unirender_evaluation.ceiling import similarity_ceiling
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.suite_definition import recorded

@@ -7,7 +7,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender_evaluation import lpips
-from unirender_evaluation.benchmark import BenchConfig, build_rows
+from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.versions import (
     LPIPS,
     MODEL,

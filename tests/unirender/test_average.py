@@ -13,9 +13,9 @@ from tiny_stable_diffusion import tiny_vae
 
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import checkpoint_sha256
 from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.shipped import checkpoint_sha256
 from unirender.training.average import Average, averaged_facts
 from unirender.training.card import CARD_FILE
 from unirender.training.export import TRAINING_FILE, read_history

@@ -11,10 +11,9 @@ import yaml
 from synthetic_shards import write_dataset
 from tiny_models import TRAIN
 
-from unirender.files import checkpoint_sha256
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.shipped import checkpoint_folder, shipped_names
+from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_names
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.export import export_pipeline
 from unirender.training.source import ShardSource

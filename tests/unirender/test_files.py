@@ -12,8 +12,10 @@ import pytest
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import image_channels, intrinsics_channels, read_exr, write_environment, write_exr
-from unirender.files import checkpoint_sha256, new_folder, read_result, replace_file, write_result
+from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
+from unirender.shipped import checkpoint_sha256
+from unirender.whole_files import replace_file
 
 RNG = np.random.default_rng(0)
 

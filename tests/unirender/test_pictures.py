@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from icc_profiles import SRGB_D50, matrix_profile
 from PIL import Image, ImageCms
+from sixteen_bit_files import write_png16, write_tiff16
 
 from unirender.color import srgb_encode
+from unirender.display_files import MAX_PIXELS, display_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.options import read_input
-from unirender.pictures import MAX_PIXELS, display_values, read_mask, read_picture
+from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
 RNG = np.random.default_rng(0)
@@ -55,20 +58,94 @@ def test_sixteen_bit_grey(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_picture(tmp_path / "a.png").image_srgb[0, :, 1], [0, 0.5, 1], atol=1e-4)
 
 
-@pytest.mark.parametrize(("kind", "channels"), [(0, 1), (2, 3), (4, 2), (6, 4)])
-def test_sixteen_bit_colours_lose_half_of_them_which_is_told(kind: int, channels: int, tmp_path: Path) -> None:
-    rows = np.full((8, 1 + 9 * channels * 2), 156, np.uint8)
-    rows[:, 0] = 0  # each row begins with its filter
-    parts = {
-        b"IHDR": struct.pack(">IIBBBBB", 9, 8, 16, kind, 0, 0, 0),
-        b"IDAT": zlib.compress(rows.tobytes()),
-        b"IEND": b"",
-    }
-    chunks = [struct.pack(">I", len(v)) + k + v + struct.pack(">I", zlib.crc32(k + v)) for k, v in parts.items()]
-    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_sixteen_bits_of_a_png_are_read_in_full(channels: int, tmp_path: Path) -> None:
+    values = RNG.integers(0, 65536, (8, 9, channels))
+    values[0, 0, -1] = 65535  # an alpha channel covers something
+    write_png16(tmp_path / "a.png", values)
     picture, remarks = read_input(tmp_path / "a.png", None)
-    np.testing.assert_allclose(picture.image_srgb, 156 / 255, atol=2e-3)
-    assert ("depth" in remarks) == (channels > 1)
+    colours = values[..., :3] if channels > 2 else values[..., [0, 0, 0]]
+    np.testing.assert_allclose(picture.image_srgb, colours / 65535, rtol=0, atol=1e-7)
+    assert "depth" not in remarks
+    mask = read_mask(tmp_path / "a.png", (8, 9))[..., 0]
+    expected = values[..., -1] if channels in (2, 4) else values.mean(axis=-1)
+    np.testing.assert_allclose(mask, expected / 65535, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("channels", "extra"), [(3, None), (4, 0), (4, 1), (4, 2)])
+def test_sixteen_bits_of_a_tiff_are_read_in_full(channels: int, extra: int | None, order: str, tmp_path: Path) -> None:
+    """Of a fourth channel a tag says that it means nothing (0), or is alpha, premultiplied (1) or not (2)."""
+    values = RNG.integers(0, 65536, (8, 9, channels))
+    values[0, 0] = 65535
+    stored = values.copy()
+    if extra == 1:
+        stored[..., :3] = (values[..., :3] * (values[..., 3:] / 65535)).round()
+    for compressed in (False, True):
+        write_tiff16(tmp_path / "a.tif", stored, order, extra=extra, compressed=compressed)
+        picture, remarks = read_input(tmp_path / "a.tif", None)
+        visible = values[..., 3] > 6000 if extra == 1 else np.ones((8, 9), bool)  # of dim ones rounding leaves less
+        found = picture.image_srgb[visible]
+        np.testing.assert_allclose(found, values[visible][:, :3] / 65535, rtol=0, atol=1e-4 if extra == 1 else 1e-7)
+        assert "depth" not in remarks
+        if extra:
+            assert picture.mask is not None
+            np.testing.assert_allclose(picture.mask, values[..., 3:] / 65535, rtol=0, atol=1e-7)
+
+
+def test_sixteen_bits_are_turned_as_exif_says_and_a_transparent_colour_is_alpha(tmp_path: Path) -> None:
+    values = RNG.integers(0, 65536, (8, 9, 3))
+    write_tiff16(tmp_path / "a.tif", values, "<", orientation=6)
+    np.testing.assert_allclose(read_picture(tmp_path / "a.tif").image_srgb, np.rot90(values, -1) / 65535, atol=1e-7)
+    values[2, 3] = (1, 2, 3)
+    write_png16(tmp_path / "a.png", values, chunks={b"tRNS": struct.pack(">HHH", 1, 2, 3)})
+    mask = read_picture(tmp_path / "a.png").mask
+    assert mask is not None
+    np.testing.assert_array_equal(np.argwhere(mask[..., 0] == 0), [[2, 3]])
+
+
+def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_path: Path) -> None:
+    profile = zlib.compress(matrix_profile(SRGB_D50, 1.0))
+    write_png16(tmp_path / "a.png", np.full((8, 9, 3), 40000), chunks={b"iCCP": b"a\0\0" + profile})
+    assert read_input(tmp_path / "a.png", None)[1]["depth"].startswith("its colours have 16 bits, of which 8 are read")
+
+
+def test_a_file_of_several_pictures_gives_its_first_which_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = [Image.new("RGB", (9, 8), colour) for colour in ("white", "red", "green")]
+    for suffix in ("gif", "png", "tif", "webp"):
+        path = tmp_path / f"a.{suffix}"
+        frames[0].save(path, save_all=True, append_images=frames[1:])
+        picture, remarks = read_input(path, path)
+        assert picture.image_srgb.min() > 0.99
+        assert remarks["frames"] == "the file holds 3 pictures, of which the first is taken"
+        assert remarks["mask_frames"] == "the mask's file holds 3 pictures, of which the first is taken"
+        caplog.clear()
+        read_mask(path, (8, 9))
+        assert [record.getMessage() for record in caplog.records] == [f"{path}: {remarks['mask_frames']}"]
+        frames[0].save(path)
+        assert not {"frames", "mask_frames"} & set(read_input(path, path)[1])
+
+
+def test_a_mask_outside_of_0_to_1_is_told_or_refused(tmp_path: Path) -> None:
+    Image.new("RGB", (9, 8), "white").save(tmp_path / "a.png")
+    mask = np.zeros((8, 9), np.float32)
+    for most, least in ((1.05, -0.02), (1.0, 0.0)):
+        mask[2:6], mask[0] = most, least
+        write_exr(tmp_path / "m.exr", {"Y": mask})
+        picture, remarks = read_input(tmp_path / "a.png", tmp_path / "m.exr")
+        told = "the mask has values in [-0.02, 1.05], clipped to [0, 1]" if most > 1 else None
+        assert remarks.get("mask_range") == told
+        assert picture.mask is not None
+        assert (picture.mask.min(), picture.mask.max()) == (0, 1)
+    for wrong in (255.0, 3.0, -1.0):  # of 8 bits, an object's number, a depth
+        mask[3] = wrong
+        write_exr(tmp_path / "m.exr", {"Y": mask})
+        with pytest.raises(
+            UnirenderError, match=r"the mask has values in \[.*\], expected coverage in \[0, 1\]; divide"
+        ):
+            read_input(tmp_path / "a.png", tmp_path / "m.exr")
 
 
 def test_exif_orientation_is_applied(tmp_path: Path) -> None:

@@ -5,10 +5,16 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
 from unirender.options import ModelOptions
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.shipped import CHECKPOINTS, checkpoint_folder, checkpoint_label, shipped_for, shipped_names
+from unirender.shipped import (
+    CHECKPOINTS,
+    checkpoint_folder,
+    checkpoint_label,
+    checkpoint_sha256,
+    shipped_for,
+    shipped_names,
+)
 
 
 def test_every_shipped_checkpoint_is_found_by_its_name() -> None:

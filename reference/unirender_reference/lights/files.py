@@ -26,10 +26,11 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.color import srgb_decode
+from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
 from unirender.lighting import resample_environment
-from unirender.pictures import check_finite, display_colors, negative_share, open_picture
+from unirender.pictures import check_finite, negative_share
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
@@ -137,7 +138,7 @@ def _box_resize(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     """Display values of a picture, upright; an alpha channel is dropped."""
-    return np.ascontiguousarray(display_colors(open_picture(path), f"light {path}")[..., :3])
+    return np.ascontiguousarray(srgb_values(path, f"light {path}")[..., :3])
 
 
 def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:

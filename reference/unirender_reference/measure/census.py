@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from unirender_reference import backend
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
-from unirender_reference.processes import exit_with_parent
+from unirender_reference.processes import start_worker
 from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, Renderer
 from unirender_reference.shapes import MeshObject, make_object
 
@@ -149,7 +149,7 @@ def run_census(renders: int, resolution: int, spp: int, seed: int, workers: int)
     if renders % RENDERS_PER_OBJECT:
         counts.append(renders % RENDERS_PER_OBJECT)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
         futures = [
             pool.submit(census_of_object, seed * 1_000_000 + index, count, resolution, spp)
             for index, count in enumerate(counts)
@@ -191,11 +191,6 @@ def _places(renderer: Renderer) -> np.ndarray:
     pole = (np.abs(geometry.normal[..., 1]) > POLE) | (reflected_up > POLE)
     conditions = [geometry.mask[..., 0] < 1, pole, cosine < GRAZING]
     return np.select(conditions, ["edge", "pole", "grazing"], "inside")
-
-
-def _start_worker() -> None:
-    exit_with_parent()
-    backend.set_threads(1)
 
 
 def timed(censuses: Iterator[ObjectCensus]) -> tuple[list[ObjectCensus], float]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
+from unirender_reference.processes import start_worker
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -162,7 +163,7 @@ class NoiseFloor:
             for i in range(MOST_SKIPPED * self.images)
         )
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
             under_way: deque[Future[FloorRow]] = deque()
             measured = 0
             for job in jobs:
@@ -219,11 +220,3 @@ def summary(measured: list[FloorRow], floor_db: float) -> tuple[list[str], int]:
         f"{'BIASED' if biased else 'unbiased'} (mean difference within {BIAS_DB:g} dB and its standard error)"
     )
     return lines, int(short or biased)
-
-
-def _start_worker() -> None:
-    from unirender_reference.backend import set_threads
-    from unirender_reference.processes import exit_with_parent
-
-    exit_with_parent()
-    set_threads(1)

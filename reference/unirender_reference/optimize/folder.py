@@ -145,6 +145,8 @@ def read_picture_file(
     if path.suffix.lower() == ".exr":
         return *_linear_picture(path), True
     picture = read_picture(path)
+    for remark in picture.remarks.values():
+        _log.warning("%s: %s", path, remark)
     return picture.image_srgb, picture.mask, False
 
 

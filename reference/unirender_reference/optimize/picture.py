@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
+from unirender.display_files import stored_values
 from unirender.errors import UnirenderError
 from unirender.files import read_result
-from unirender.pictures import display_values, open_picture, read_mask
+from unirender.pictures import read_mask
 from unirender_reference.optimize.folder import read_picture_file, reduced
 from unirender_reference.optimize.state import rounded
 from unirender_reference.optimize.views import Step, View, Views
@@ -126,7 +127,7 @@ def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
         if normal is None:
             raise UnirenderError(f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z")
         return normal
-    return 2 * display_values(open_picture(path), str(path))[..., :3] - 1
+    return 2 * stored_values(path)[..., :3] - 1
 
 
 def unit_normals(

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 from unirender_reference.optimize.coverage import coverage_of, mask_iou
 from unirender_reference.optimize.export import SOLUTION_FILE, write_record, write_solution
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.files import file_sha256
+from unirender.whole_files import file_sha256
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine

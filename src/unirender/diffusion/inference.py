@@ -137,7 +137,11 @@ def extras_by_camera(
     camera: Cameras,
     derived: Bool[Tensor, "b 6"] | None = None,
 ) -> Extras:
-    """The extra inputs of rows that are seen through one camera, or each through its own."""
+    """The extra inputs of rows that are seen through one camera, or each through its own.
+
+    Raises:
+        ValueError: another number of cameras than rows.
+    """
     if camera is None or isinstance(camera, Camera):
         return conditioning.extras(mask, given, maps, camera, derived)
     if len(camera) != len(mask):

@@ -180,6 +180,9 @@ def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = Non
         shape: of the noise; its first number is that of rows.
         like: a tensor of the right dtype and device.
         generator: one for all rows, or several, each for an equal share of the rows, in order.
+
+    Raises:
+        ValueError: the rows cannot be shared equally.
     """
     generators = generator if isinstance(generator, Sequence) else [generator]
     if not generators or shape[0] % len(generators):

@@ -106,7 +106,11 @@ class Packing:
         }
 
     def spread(self, light: Float[Tensor, "b 3 eh ew"], size: tuple[int, int]) -> Float[Tensor, "b 3 H W"]:
-        """The light on the image's grid by repetition, which `gather` undoes to rounding."""
+        """The light on the image's grid by repetition, which `gather` undoes to rounding.
+
+        Raises:
+            UnirenderError: the light has another size than `environment_size`, or the grid is no multiple of it.
+        """
         rows, columns = self.environment_size
         if tuple(light.shape[-2:]) != (rows, columns):
             raise UnirenderError(

@@ -233,7 +233,11 @@ class DualStreamModel(ModelMixin, ConfigMixin):
     def context(
         self, attributes: Tensor | Encoded, image: Tensor | Encoded, light: Float[Tensor, "b 4 eh ew"] | None
     ) -> Float[Tensor, "b tokens width"]:
-        """What the cross-attention of both streams sees: the stored prompt, and the light through its own encoder."""
+        """What the cross-attention of both streams sees: the stored prompt, and the light through its own encoder.
+
+        Raises:
+            ValueError: a light is given to a model without such an encoder, or is missing.
+        """
         if isinstance(attributes, Encoded):
             return attributes.context
         if isinstance(image, Encoded):
@@ -267,7 +271,11 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         adapter: nn.Module | None,
         added: Added | None = None,
     ) -> Encoded:
-        """Runs one encoder and the mid block: (b, c, h, w) -> feature pyramid."""
+        """Runs one encoder and the mid block: (b, c, h, w) -> feature pyramid.
+
+        Raises:
+            ValueError: extra inputs are given to a model without them, or are missing.
+        """
         if (extra is None) != (adapter is None):
             raise ValueError(
                 f"extra inputs {'missing' if extra is None else 'given'}, but the model was built otherwise"
@@ -314,6 +322,15 @@ def unet_config(widths: Sequence[int], layers: int, attention: Sequence[int], he
 
     The mid block is diffusers' default, which attends over all its pixels: the environment, which is not aligned with
     the picture's, reaches every one of them there, whichever levels have attention besides.
+
+    Args:
+        widths: channels of each level, the finest first.
+        layers: of each level.
+        attention: numbers of the levels that attend.
+        head_dim: channels of an attention head; or for each level how many heads it has.
+
+    Raises:
+        ValueError: a level that attends, or the lowest, has a width that is no multiple of `head_dim`.
     """
     levels = range(len(widths))
     attending = {*attention, len(widths) - 1}  # the mid block has the lowest level's width and heads

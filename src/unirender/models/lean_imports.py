@@ -51,7 +51,7 @@ def _hidden(*names: str) -> Iterator[None]:
     """Inside it, importing those modules fails as if they were not installed, but for those imported already."""
     hidden = [name for name in names if name not in sys.modules]
     for name in hidden:
-        sys.modules[name] = None  # type: ignore[assignment] - Python's way to say that a module cannot be imported
+        sys.modules[name] = None  # pyright: ignore[reportArgumentType] - Python's way to say that a module cannot be imported
     try:
         yield
     finally:

@@ -84,7 +84,11 @@ class PictureFeatures(nn.Module):
 
     @torch.no_grad()
     def stages(self, picture: Float[Tensor, "n 3 H W"]) -> list[Tensor]:
-        """The taken stages' last activations, with a root mean square of about 1 over the channels of each pixel."""
+        """The taken stages' last activations, with a root mean square of about 1 over the channels of each pixel.
+
+        Raises:
+            ValueError: the kernels have not been loaded.
+        """
         if not self.get_buffer("kernel_0").any():
             raise ValueError("picture features: the kernels of VGG-16 are missing; load them with load_vgg")
         mean, deviation = (picture.new_tensor(values)[:, None, None] for values in (MEAN, DEVIATION))

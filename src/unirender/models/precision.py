@@ -5,14 +5,10 @@ On a CPU bf16 helps only with AVX-512 BF16 or AMX; on an AVX2-only CPU it is 15 
 
 import platform
 from pathlib import Path
-from typing import Literal
 
 import torch
 
 from unirender.errors import UnirenderError
-
-DtypeName = Literal["auto", "float32", "bfloat16", "float16"]
-DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
 

@@ -14,10 +14,9 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
 from unirender.camera import Camera
-from unirender.intrinsics import Intrinsics
+from unirender.intrinsics import SHORTEST_NORMAL, Intrinsics
 from unirender.lighting import resample_environment
 
-MIN_NORMAL = 1e-3  # length below which a mean of normals has no direction
 MIN_COVERAGE = 1e-3  # below it a resampled pixel carries no colour
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
@@ -91,6 +90,7 @@ class Frame:
 
     @property
     def identity(self) -> bool:
+        """Whether the picture is the square, which then passes through untouched."""
         return self.cut is None and self.height == self.width == self.size
 
     @property
@@ -225,6 +225,6 @@ def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h
 
 
 def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Normals of length 1; 0 stays 0."""
+    """Normals of length 1, also of those that `unirender.intrinsics.unit_normals` takes for unit ones; 0 stays 0."""
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.where(length > MIN_NORMAL, normal / np.maximum(length, MIN_NORMAL), 0).astype(np.float32)
+    return np.where(length > SHORTEST_NORMAL, normal / np.maximum(length, SHORTEST_NORMAL), 0).astype(np.float32)

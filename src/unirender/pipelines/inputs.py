@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.display_files import display_colors, display_values
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, as_numbers
 from unirender.lighting import as_light
-from unirender.pictures import coverage, display_colors, display_values
+from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import constant_map

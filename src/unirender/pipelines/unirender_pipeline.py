@@ -1,39 +1,28 @@
 """`UniRenderPipeline`: decompose, render, edit and relight with one dual-stream model.
 
-It is a diffusers pipeline (`from_pretrained`, `save_pretrained`, `to`, `torch_dtype`, progress bars) whose public
-arrays are numpy. A *picture* is straight display values like a PNG's, with its mask beside it; a *linear image* that
-comes back is premultiplied. Any size: pictures are brought to the model's square and results back
+Its public arrays are numpy. A *picture* is straight display values like a PNG's, with its mask beside it; a *linear
+image* that comes back is premultiplied. Any size: pictures are brought to the model's square and results back
 (`unirender.pipelines.framing`); `size` runs the network at another multiple of `size_multiple`, `tile` adds the detail
 of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` component, or named in a call.
 """
 
-import logging
-import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
-from numbers import Integral
-from pathlib import Path
-from typing import Any, ClassVar, overload
+from typing import Any, overload
 
 import numpy as np
 import torch
-from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
-from diffusers.pipelines.pipeline_utils import DiffusionPipeline
-from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
-from unirender.diffusion.sampling import Generators, check_scheduler, make_sampler
+from unirender.diffusion.sampling import Generators
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.models.codec import make_codec
-from unirender.models.conditioning import Conditioning
-from unirender.models.dual_stream import DualStreamModel
-from unirender.pipelines.calibration import Lines, check_lines
 from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.decomposing import View, decompose_views
+from unirender.pipelines.dual_stream_pipeline import DualStreamPipeline
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.inputs import (
@@ -45,69 +34,16 @@ from unirender.pipelines.inputs import (
     ready_to_render,
     told_derived,
 )
-from unirender.pipelines.loading import check_complete, find_pipeline, reading
-from unirender.pipelines.network import Network, Overflow
+from unirender.pipelines.network import Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
 from unirender.pipelines.settings import Sampling, check_settings, list_cameras, same_noise
 
 Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
 
-logger = logging.getLogger(__name__)
 
-
-class UniRenderPipeline(DiffusionPipeline):
-    """One dual-stream model in both directions.
-
-    Args:
-        dual_stream: the network.
-        scheduler: with zero terminal SNR and `prediction_type="sample"`, without noise of its own: DDIM or UniPC.
-        vae: for models with the KL codec.
-        material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
-        calibration: lines by which predicted roughness and metallic are read (`unirender.pipelines.calibration`).
-    """
-
-    model_cpu_offload_seq = "dual_stream"
-    _optional_components: ClassVar[list[str]] = ["vae"]
-
-    def __init__(
-        self,
-        dual_stream: DualStreamModel,
-        scheduler: SchedulerMixin,
-        vae: AutoencoderKL | None = None,
-        material: str = "scalar",
-        calibration: Lines | None = None,
-    ) -> None:
-        super().__init__()
-        self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
-        self.register_to_config(material=material, calibration=check_lines(calibration))
-        self.dual_stream: DualStreamModel
-        self.scheduler: SchedulerMixin
-        codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
-        self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
-        self.size = dual_stream.config["sample_size"] * codec.factor
-        self._reported: set[str] = set()  # maps whose overflow was logged
-
-    @classmethod
-    def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
-        cls, pretrained_model_name_or_path: str | Path | None = None, **kwargs: Any
-    ) -> "UniRenderPipeline":
-        """Loads a pipeline folder, or a shipped checkpoint by its name (`tiny` without one). Weights become float32
-        without `torch_dtype`.
-
-        Raises:
-            UnirenderError: no such folder, no pipeline in it, or it cannot be read.
-        """
-        path = find_pipeline(pretrained_model_name_or_path)
-        old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
-        kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
-        with reading(path):
-            pipeline = super().from_pretrained(str(path), **kwargs)
-            if "dual_stream" not in kwargs:
-                check_complete(pipeline.dual_stream, path / "dual_stream")
-        # Faster on a CPU, most so in batches.
-        pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
-        return pipeline
+class UniRenderPipeline(DualStreamPipeline):
+    """One dual-stream model in both directions; its arguments are those of `DualStreamPipeline`."""
 
     @overload
     def __call__(self, image: list | tuple, mask: Any = None, **kwargs: Any) -> list[Decomposition]: ...
@@ -317,8 +253,8 @@ class UniRenderPipeline(DiffusionPipeline):
             roughness: new value or map, [0, 1]; None: unchanged.
             metallic: new value or map, [0, 1]; None: unchanged.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
-            decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, tile,
-                material and closed are its own.
+            decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
+                tile, material and closed are its own.
             **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
                 and closed, as for `decompose`.
 
@@ -431,45 +367,3 @@ class UniRenderPipeline(DiffusionPipeline):
         if not anchored:
             return after
         return anchor(srgb_decode(picture) * cover, render_any_size(network, [before], second)[0], after)
-
-    @property
-    def size_multiple(self) -> int:
-        """What the side of the network's square must be a multiple of: so that the codec and the levels of the U-Nets
-        halve it without a rest, and the light's rows and columns fall on whole pixels.
-        """
-        levels = len(self.dual_stream.config["block_out_channels"])
-        return math.lcm(self.conditioning.codec.factor * 2 ** (levels - 1), *self.conditioning.packing.environment_size)
-
-    def check_size(self, size: int) -> None:
-        """Looks at a side of the network's square.
-
-        Raises:
-            UnirenderError: it is no multiple of `size_multiple`.
-        """
-        if not isinstance(size, Integral) or size < 1 or size % self.size_multiple:
-            raise UnirenderError(f"size: got {size}, expected a multiple of {self.size_multiple}, like {self.size}")
-
-    def _network(self, mode: str = "mean", sampler: str | None = None, size: int | None = None) -> Network:
-        """The network as a call asks for it.
-
-        Raises:
-            UnirenderError: no such sampler or size; a sampler in mode `mean`, which takes one step; or a scheduler
-                that several steps cannot be taken with.
-        """
-        if sampler is not None and mode == "mean":
-            raise UnirenderError(f"sampler {sampler}: mode mean takes one step and no sampler; use mode 'sample'")
-        if size is not None:
-            self.check_size(size)
-        scheduler = self.scheduler if sampler is None else make_sampler(sampler, self.scheduler)
-        if mode == "sample":
-            check_scheduler(scheduler)
-        return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)
-
-    def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
-        return self.progress_bar(steps)  # pyright: ignore[reportReturnType, reportCallIssue, reportArgumentType] - tqdm
-
-    def _report_overflow(self, overflow: dict[str, Overflow]) -> None:
-        for name, over in overflow.items():
-            if name not in self._reported:
-                self._reported.add(name)
-                logger.warning("%s: %s; they are kept, but what it makes of them is a guess", name, over)

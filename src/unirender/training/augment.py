@@ -43,6 +43,9 @@ def mix_lights(maps: Maps, weights: Float[np.ndarray, "l 3"]) -> Maps:
     Args:
         maps: the `LIGHT_MAPS` present have a leading axis over the same L lights; all others pass through.
         weights: non-negative, per light and colour channel.
+
+    Raises:
+        UnirenderError: weights of another shape, negative or not finite; or not one for each light.
     """
     if weights.ndim != 2 or weights.shape[1] != 3 or (weights < 0).any() or not np.isfinite(weights).all():
         raise UnirenderError(
@@ -69,6 +72,9 @@ def interpolate_metallic(
     """The picture at any metallic in [0, 1] from those at 0, 0.5 and 1 (Lagrange; exact for a quadratic).
 
     Monte Carlo noise can make a value slightly negative; it is not clipped, which would bias the mean.
+
+    Raises:
+        UnirenderError: not three pictures, or a value outside [0, 1].
     """
     if len(nodes) != len(METALLIC_NODES) or not 0.0 <= metallic <= 1.0:
         raise UnirenderError(

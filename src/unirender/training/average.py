@@ -167,8 +167,7 @@ def _name_of_run(run: Mapping[str, Any]) -> str:
 
 def _label(folder: Path) -> str:
     """A checkpoint's name and the beginning of its sha256; that of a run's pipeline is the run's."""
-    from unirender.files import checkpoint_sha256
-    from unirender.shipped import CHECKPOINTS
+    from unirender.shipped import CHECKPOINTS, checkpoint_sha256
     from unirender.training.card import OF_A_RUN
 
     own = folder.resolve()

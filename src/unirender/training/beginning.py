@@ -7,7 +7,7 @@ began with chance. States of earlier versions do not say: None.
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender.files import checkpoint_sha256
+from unirender.shipped import checkpoint_sha256
 
 Beginning = dict[str, str]
 KNOWN_BY = ("path", "sha256")

@@ -28,9 +28,9 @@ from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.files import file_sha256
 from unirender.paths import cache_dir, cached_folder
 from unirender.training.packing import SCALAR_CHANNELS, Group, Packer, Pair
+from unirender.whole_files import file_sha256
 
 PACK_VERSION = 2  # part of the cache's path: raise it when what is packed, or refused, changes
 END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends

@@ -88,7 +88,7 @@ class Muon(torch.optim.Optimizer):
         self.pool = pool
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]  # one overload
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore[reportIncompatibleMethodOverride] - one overload
         """One step of every parameter that has a gradient."""
         loss = None
         if closure is not None:

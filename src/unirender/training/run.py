@@ -17,6 +17,10 @@ from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:
+    from unirender.training.device_data import DeviceSource
+    from unirender.training.memory import TrainingBytes
+    from unirender.training.source import ShardSource
+    from unirender.training.trainer import Trainer
     from unirender.training.validation import Validate
 
 Batches = Literal["auto", "cpu", "device"]
@@ -181,13 +185,11 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
 
     from unirender.models.precision import resolve_device, resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
-    from unirender.training.device_data import DeviceSource, fits
     from unirender.training.export import export_pipeline
     from unirender.training.groups import list_shards
     from unirender.training.live import live_report
     from unirender.training.memory import training_bytes
     from unirender.training.processes import join_processes
-    from unirender.training.source import ShardSource
     from unirender.training.start import read_start
     from unirender.training.trackers import make_trackers, tracking
     from unirender.training.trainer import RunConfig, Trainer
@@ -223,27 +225,10 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     del start  # Stable Diffusion's U-Net is no longer needed
     if options.gradient_checkpointing:
         trainer.model.enable_gradient_checkpointing()
-    source = ShardSource(
-        options.data,
-        config.batch_size,
-        config.seed,
-        augmentation=config.augmentation,
-        size=config.model.resolution,
-        rows=trainer.split.own,
-        group_size=config.group_size,
-    )
     memory = training_bytes(trainer.model, config.optimizer.kind)
-    on_device = options.batches == "device" or (options.batches == "auto" and fits(source.open(), device, memory))
-    source.open()
-    if on_device:
-        source = DeviceSource(source, device)
-    parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
-    place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""
+    source = make_source(options, config, trainer, memory)
     say = functools.partial(Console().print, soft_wrap=True, highlight=False, markup=False)
-    at_once = trainer.split.at_once
-    passes = "one pass at a time" if at_once == 1 else f"{at_once} passes side by side"
-    made = f", batches made on {device}" if on_device else ""
-    say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}{made}")
+    say(f"{out}: {described(trainer, source)}")
     if processes.is_main:
         say(f"memory: {memory}")
     with contextlib.closing(source):
@@ -255,3 +240,44 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
     processes.close()
     return pipeline
+
+
+def make_source(
+    options: Train, config: TrainConfig, trainer: "Trainer", memory: "TrainingBytes"
+) -> "ShardSource | DeviceSource":
+    """Where the batches come from, opened: the CPU; or the training's device, where that is asked for or has the place.
+
+    Args:
+        options: data folder, and where batches are made.
+        config: of the training.
+        trainer: whose rows of each batch they are.
+        memory: that the training needs beside the data.
+    """
+    from unirender.training.device_data import DeviceSource, fits
+    from unirender.training.source import ShardSource
+
+    source = ShardSource(
+        options.data,
+        config.batch_size,
+        config.seed,
+        augmentation=config.augmentation,
+        size=config.model.resolution,
+        rows=trainer.split.own,
+        group_size=config.group_size,
+    )
+    packed = source.open()
+    if options.batches == "device" or (options.batches == "auto" and fits(packed, trainer.device, memory)):
+        return DeviceSource(source, trainer.device)
+    return source
+
+
+def described(trainer: "Trainer", source: "ShardSource | DeviceSource") -> str:
+    """What trains, and where, in a line."""
+    from unirender.training.device_data import DeviceSource
+
+    processes, at_once = trainer.processes, trainer.split.at_once
+    place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""
+    parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
+    passes = "one pass at a time" if at_once == 1 else f"{at_once} passes side by side"
+    made = f", batches made on {trainer.device}" if isinstance(source, DeviceSource) else ""
+    return f"{place}{parameters:.2f} M parameters, {trainer.device}, {trainer.dtype}, {passes}{made}"

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from unirender.files import replace_file
 from unirender.training.live import Report
 from unirender.training.processes import Processes
+from unirender.whole_files import replace_file
 from unirender.writing import writing
 
 LOG_FILE = "log.jsonl"

@@ -25,7 +25,6 @@ from torch import nn
 from unirender.command_line import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
 from unirender.training.beginning import Beginning, check_beginning
@@ -44,6 +43,7 @@ from unirender.training.source import BatchSource, NamesGroups
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
+from unirender.whole_files import replace_file
 from unirender.writing import writing
 
 MOST_NAMED = 5  # maps and groups of a batch in a message

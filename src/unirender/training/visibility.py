@@ -191,9 +191,9 @@ class _Run:
         """Saves the state and the averaged weights, and what they score."""
         from safetensors.torch import save
 
-        from unirender.files import replace_file
         from unirender.models.visibility import VisibilityNet
         from unirender.training.checkpoint import save_state
+        from unirender.whole_files import replace_file
 
         parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
         state = {name: part.state_dict() for name, part in parts.items()}

@@ -23,13 +23,13 @@ from jaxtyping import Bool, Float, Float16, UInt8
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.files import file_sha256
 from unirender.lobes import texel_directions
 from unirender.models.visibility import AZIMUTHS, BANDS, bin_weights
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.training.derived import one_thread
 from unirender.training.groups import list_shards, read_groups
+from unirender.whole_files import file_sha256
 
 VERSION = 1  # part of the cache's path: raise it when the masks or the bins change
 DIRECTIONS = (16, 32)  # of the traced rays: texels of a lat-long map

@@ -342,6 +342,14 @@ def test_a_black_linear_picture_is_refused(tmp_path: Path):
     assert read_picture_input(tmp_path / "dim.exr").hdr
 
 
+def test_what_is_dropped_of_a_file_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    frames = [Image.new("RGB", (9, 8), colour) for colour in ("grey", "red")]
+    frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
+    picture = read_picture_input(tmp_path / "a.png", fov_deg=36.0)
+    np.testing.assert_allclose(picture.image, 128 / 255)
+    assert f"{tmp_path / 'a.png'}: the file holds 2 pictures, of which the first is taken" in caplog.messages
+
+
 @pytest.mark.parametrize("kind", ["folder", "picture"])
 def test_a_full_disk_is_one_sentence(
     kind: str, data: Path, solution: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

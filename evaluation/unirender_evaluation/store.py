@@ -1,0 +1,133 @@
+"""The records of a run by their content keys: what is done is never done again.
+
+A key is the sha256 of (scene truth, task, method configuration, versions of the parts that the row uses): a second run,
+or one more method, computes only what has no record. Records are appended as they are made, so that a killed run
+resumes.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from unirender_evaluation.records import Record, append_record, write_records
+from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.versions import SEPARATOR
+
+KEY_PREFIX = 12
+KEPT = 4  # records of one measurement by other code, that one may return to
+
+
+def content_key(suite: Suite, scene: Scene, what: str, config: Mapping[str, Any], code: str) -> str:
+    """What a record depends on: the scene's truth, the question, the method's configuration, the code (`Versions.of`).
+
+    The first `KEY_PREFIX` digits are the core's alone, so that records of another core can be told.
+    """
+    text = json.dumps([suite.scene_hash(scene), what, config, code], sort_keys=True, default=str)
+    core = hashlib.sha256(code.partition(SEPARATOR)[0].encode()).hexdigest()
+    return core[:KEY_PREFIX] + hashlib.sha256(text.encode()).hexdigest()[KEY_PREFIX:]
+
+
+@dataclass
+class Store:
+    """The run folder's records: what is there by content key, appended as it is made, rewritten in order at the end.
+
+    `records.jsonl` holds what the last run measured; what it did not ask for waits in `unused.jsonl` beside it: it was
+    a part of a larger run, or of other code, to which one may return. Of other code the last `KEPT` records of each
+    measurement wait.
+    """
+
+    path: Path
+    known: dict[str, Record] = field(default_factory=dict)
+    used: dict[str, Record] = field(default_factory=dict)
+
+    @property
+    def unused_path(self) -> Path:
+        """Where the records that the last run did not ask for are."""
+        return self.path.with_name("unused.jsonl")
+
+    @classmethod
+    def open(cls, path: Path, mend: bool = True) -> "Store":
+        """Reads what earlier runs left, in both files.
+
+        Args:
+            path: of `records.jsonl`.
+            mend: cuts off half a line that a killed run left; without, nothing is written.
+        """
+        store = cls(path)
+        for file in (store.unused_path, path):
+            text = file.read_text(encoding="utf-8") if file.exists() else ""
+            complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
+            store.known |= {record.key: record for record in map(Record.from_json, complete.splitlines())}
+            if mend and complete != text:
+                file.write_text(complete, encoding="utf-8")
+        return store
+
+    def has(self, key: str) -> bool:
+        """Whether a record is there; marks it as part of this run."""
+        if key in self.known:
+            self.used[key] = self.known[key]
+        return key in self.used
+
+    def add(self, record: Record) -> None:
+        """Stores a record, unless it is there (its picture was made again)."""
+        if record.key not in self.used:
+            append_record(self.path, record)
+        self.used[record.key] = record
+
+    def lay_by(self, record: Record) -> None:
+        """Stores a record for later runs that this one did not ask for."""
+        self.known[record.key] = record
+
+    def of_other_code(self) -> int:
+        """How many records are there that other code of the core has made than this run's."""
+        code = self._code()
+        return sum(key[:KEY_PREFIX] not in code for key in self.known)
+
+    def close(self) -> list[Record]:
+        """Sorts this run's records, writes and returns them, and lays the others by."""
+        records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
+        write_records(self.unused_path, self._waiting())
+        write_records(self.path, records)
+        return records
+
+    def _code(self) -> set[str]:
+        """What the keys of this run's records begin with."""
+        return {key[:KEY_PREFIX] for key in self.used}
+
+    def _waiting(self) -> list[Record]:
+        """The records that this run did not ask for and that are kept."""
+        code, found, kept = self._code(), Counter[tuple[str, ...]](), []
+        for key, record in reversed(self.known.items()):  # the latest first
+            if key in self.used:
+                continue
+            if key[:KEY_PREFIX] not in code:
+                found[record.identity] += 1
+                if found[record.identity] > KEPT:
+                    continue
+            kept.append(record)
+        return kept[::-1]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One record that a run wants.
+
+    Attributes:
+        key: its content key.
+        label: for the progress bar.
+        make: computes it.
+        kept: whether the picture that belongs to it is there (or none is wanted).
+    """
+
+    key: str
+    label: str
+    make: Callable[[], Record]
+    kept: bool = True
+
+    def is_done(self, has: Callable[[str], bool]) -> bool:
+        """Whether nothing is to do; `has` says whether a record is there."""
+        return has(self.key) and self.kept

@@ -1,0 +1,123 @@
+"""Picture files of Pillow's and PIL pictures as display values in [0, 1]: colours in sRGB, data as it is stored."""
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from unirender.errors import UnirenderError
+from unirender.icc import in_srgb
+from unirender.sixteen_bits import has_sixteen_bits, opened, sixteen_bit_values
+
+FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
+MAX_PIXELS = 100_000_000
+DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
+SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read, since they are converted: save it in sRGB to keep them"
+
+
+def open_picture(path: str | Path) -> Image.Image:
+    """A picture file in a format of Pillow's, decoded and turned as its EXIF orientation says.
+
+    Raises:
+        UnirenderError: no readable picture, or one of more than `MAX_PIXELS`.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as file:
+                width, height = file.size
+                if width * height > MAX_PIXELS:
+                    raise UnirenderError(
+                        f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
+                    )
+                file.load()
+                return ImageOps.exif_transpose(file)
+    except UnirenderError:
+        raise
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+        raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
+
+
+def stored_values(path: str | Path) -> Float[np.ndarray, "h w c"]:
+    """Display values in [0, 1] of a file of Pillow's, of data and not of colours: RGB, or RGBA, with all their bits.
+
+    Raises:
+        UnirenderError: as `open_picture` and `display_values`.
+    """
+    image = open_picture(path)
+    full = sixteen_bit_values(Path(path), upright=True)
+    return display_values(image, str(path)) if full is None else full
+
+
+def srgb_values(path: str | Path, name: str | None = None) -> Float[np.ndarray, "h w c"]:
+    """The same of a file of colours: in sRGB, whatever its ICC profile says; what is converted keeps 8 bits of 16.
+
+    Args:
+        path: of the file.
+        name: what to call it in messages; None: the path.
+
+    Raises:
+        UnirenderError: as `stored_values`, or for its ICC profile (`unirender.icc`).
+    """
+    return srgb_values_and_remarks(Path(path), name or str(path))[0]
+
+
+def srgb_values_and_remarks(path: Path, name: str) -> tuple[Float[np.ndarray, "h w c"], dict[str, str]]:
+    """The same, and remarks by kind on what was lost in reading it."""
+    image = open_picture(path)
+    srgb = in_srgb(image, name)
+    full = sixteen_bit_values(path, upright=True) if srgb is image else None
+    if full is not None:
+        return full, {}
+    with opened(path) as file:
+        cut = has_sixteen_bits(file)
+    return display_values(srgb, name), {"depth": SIXTEEN_BITS} if cut else {}
+
+
+def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
+    """The pixels of a PIL picture of any mode as display values in [0, 1], not premultiplied: RGB, or RGBA where the
+    picture has an alpha channel. 16-bit grey keeps its 16 bits (Pillow's own conversion saturates it).
+
+    Args:
+        image: the picture; its EXIF orientation is not looked at.
+        name: what to call it in messages.
+
+    Raises:
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; or
+            one of L*a*b*.
+    """
+    if image.mode.startswith("I;16") or image.mode in ("I", "F"):
+        values = np.asarray(image, dtype=np.float32)
+        if image.mode == "I" and 0 < values.max(initial=0) <= DISPLAY_MAX_8_BIT:
+            raise UnirenderError(
+                f"{name}: a picture of mode I whose values end at {values.max():g} may be 8-bit or very dark 16-bit "
+                'grey; convert it to mode "L", or to "I;16" if display white is 65535'
+            )
+        if image.mode == "F" or values.min(initial=0) < 0 or values.max(initial=0) > DISPLAY_MAX_16_BIT:
+            raise UnirenderError(
+                f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
+                "grey; save linear radiance as EXR"
+            )
+        return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+    if image.mode == "LAB":
+        raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
+    if image.mode in ("RGBa", "La"):  # premultiplied
+        image = image.convert("RGBA" if image.mode == "RGBa" else "LA")
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    return np.asarray(image.convert(mode), dtype=np.float32) / 255
+
+
+def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
+    """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`unirender.icc`)."""
+    return display_values(in_srgb(image, name), name)
+
+
+def picture_count(path: Path) -> int:
+    """How many pictures a file of Pillow's holds: of an animation, pages, or what its format has."""
+    try:
+        with opened(path) as file:
+            return getattr(file, "n_frames", 1)
+    except Exception:  # half a dozen kinds, of what is broken behind the first picture
+        return 1

@@ -1,0 +1,121 @@
+"""`unirender decompose` of a folder of pictures: what it reads, and what it says of all of them together."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from unirender.errors import UnirenderError
+from unirender.files import SUMMARY_FILE
+from unirender.folders import FolderResult, decompose_folder, list_pictures, write_summary
+from unirender.frames import temporal_difference
+from unirender.options import notice, read_input
+from unirender.pictures import Picture
+from unirender.pipelines.inputs import as_picture
+from unirender.pipelines.results import Decomposition
+from unirender.remarks import parts_left_out
+
+if TYPE_CHECKING:
+    from unirender.commands import Decompose
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+
+@dataclass
+class Reader:
+    """Reads the pictures of a folder one by one, and remembers the remarks on them.
+
+    Attributes:
+        command: whose options say how.
+        side: of the network's square, pixels.
+        remarks: by kind, those so far, each with its picture's name.
+    """
+
+    command: "Decompose"
+    side: int
+    remarks: dict[str, list[str]] = field(default_factory=dict)
+
+    def __call__(self, path: Path, mask: Path | None) -> Picture:
+        """A picture with its mask and its remarks.
+
+        Raises:
+            UnirenderError: it cannot be read, or the network would refuse it.
+        """
+        picture, said = read_input(path, mask)
+        try:
+            as_picture(picture.image_srgb, picture.mask)
+        except UnirenderError as error:
+            raise UnirenderError(f"{path}: {error}") from error
+        said |= self.command.model.camera_remarks(picture) | parts_left_out(picture.mask, self.side)
+        for kind, remark in said.items():
+            self.remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
+        return dataclasses.replace(picture, remarks=said)
+
+    def notices(self) -> None:
+        """Says each kind of remark once."""
+        for first, *others in self.remarks.values():
+            notice(first + (f" (and {len(others)} more)" if others else ""))
+
+
+def run_folder(command: "Decompose") -> int:
+    """Returns the exit status: 1 where a picture failed.
+
+    Raises:
+        UnirenderError: an option does not go with a folder, there are no pictures, or nothing can be written.
+    """
+    source, output, masks = command.input.picture, command.out.output, command.input.mask
+    if command.export is not None:
+        raise UnirenderError(f"{source}: is a folder, expected one picture for --export")
+    if masks is not None and not masks.exists():
+        raise UnirenderError(f"--mask {masks}: no such file or folder, expected a picture or a folder of them")
+    pictures = list_pictures(source)
+    pipeline = command.model.load()
+    read = Reader(command, command.model.side(pipeline))
+    settings = {"command": "decompose", **command.options, **command.model.provenance(pipeline)}
+    settings["fov"] = command.model.fov
+    found = decompose_folder(
+        pictures,
+        output,
+        read=read,
+        decompose=lambda batch: decompose_batch(command, pipeline, batch),
+        settings=settings,
+        masks=masks,
+        overwrite=command.out.overwrite,
+    )
+    facts = {**settings, "input": source}
+    if command.frames:
+        results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
+        facts["temporal_difference"] = temporal_difference(results)
+    if found.figures or not (output / SUMMARY_FILE).exists():  # where all failed, that of an earlier run stays
+        write_summary(output, found, facts)
+    read.notices()
+    say_result(output, found, facts.get("temporal_difference"))
+    return 1 if found.failed else 0
+
+
+def decompose_batch(command: "Decompose", pipeline: "UniRenderPipeline", batch: list[Picture]) -> list[Decomposition]:
+    """A few pictures at once, each with the noise that it would have alone."""
+    how: dict[str, Any] = command.model.sampling() | {"generator": command.model.generators(len(batch))}
+    return pipeline.decompose_batch(
+        [picture.image_srgb for picture in batch],
+        [picture.mask for picture in batch],
+        cameras=[command.model.camera(picture) for picture in batch],
+        **command.options,
+        **how,
+    )
+
+
+def say_result(output: Path, found: FolderResult, changes: dict[str, float] | None) -> None:
+    """Prints how many pictures are done, and why others are not.
+
+    Args:
+        output: the folder of the results.
+        found: what became of the pictures.
+        changes: of a film, from one frame to the next.
+    """
+    for reason in found.failed.values():
+        notice(f"error: {reason}")
+    failed = f", {len(found.failed)} failed" if found.failed else ""
+    print(f"{output}: {len(found.figures)} pictures ({found.kept} of them from before){failed}")
+    if changes is not None:
+        shown = ", ".join(f"{name} {value:.4f}" for name, value in changes.items() if name != "pairs")
+        print(f"mean change between {changes['pairs']} pairs of frames: {shown or 'none to compare'}")

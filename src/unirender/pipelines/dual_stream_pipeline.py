@@ -1,0 +1,125 @@
+"""A dual-stream model as a diffusers pipeline: its components, how they are read, and the network that a call asks for.
+
+`from_pretrained`, `save_pretrained`, `to`, `torch_dtype` and progress bars are those that users of diffusers know.
+"""
+
+import logging
+import math
+from collections.abc import Iterable
+from numbers import Integral
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline
+from diffusers.schedulers.scheduling_utils import SchedulerMixin
+
+from unirender.diffusion.sampling import check_scheduler, make_sampler
+from unirender.errors import UnirenderError
+from unirender.models.codec import make_codec
+from unirender.models.conditioning import Conditioning
+from unirender.models.dual_stream import DualStreamModel
+from unirender.pipelines.calibration import Lines, check_lines
+from unirender.pipelines.loading import check_complete, find_pipeline, reading
+from unirender.pipelines.network import Network, Overflow
+
+P = TypeVar("P", bound="DualStreamPipeline")
+
+logger = logging.getLogger(__name__)
+
+
+class DualStreamPipeline(DiffusionPipeline):
+    """The components of a model.
+
+    Args:
+        dual_stream: the network.
+        scheduler: with zero terminal SNR and `prediction_type="sample"`, without noise of its own: DDIM or UniPC.
+        vae: for models with the KL codec.
+        material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
+        calibration: lines by which predicted roughness and metallic are read (`unirender.pipelines.calibration`).
+    """
+
+    model_cpu_offload_seq = "dual_stream"
+    _optional_components: ClassVar[list[str]] = ["vae"]
+
+    def __init__(
+        self,
+        dual_stream: DualStreamModel,
+        scheduler: SchedulerMixin,
+        vae: AutoencoderKL | None = None,
+        material: str = "scalar",
+        calibration: Lines | None = None,
+    ) -> None:
+        super().__init__()
+        self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
+        self.register_to_config(material=material, calibration=check_lines(calibration))
+        self.dual_stream: DualStreamModel
+        self.scheduler: SchedulerMixin
+        codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
+        self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
+        self.size = dual_stream.config["sample_size"] * codec.factor
+        self._reported: set[str] = set()  # maps whose overflow was logged
+
+    @classmethod
+    def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
+        cls: type[P], pretrained_model_name_or_path: str | Path | None = None, **kwargs: Any
+    ) -> P:
+        """Loads a pipeline folder, or a shipped checkpoint by its name (`tiny` without one). Weights become float32
+        without `torch_dtype`.
+
+        Raises:
+            UnirenderError: no such folder, no pipeline in it, or it cannot be read.
+        """
+        path = find_pipeline(pretrained_model_name_or_path)
+        old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
+        kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
+        with reading(path):
+            pipeline = super().from_pretrained(str(path), **kwargs)
+            if "dual_stream" not in kwargs:
+                check_complete(pipeline.dual_stream, path / "dual_stream")
+        # Faster on a CPU, most so in batches.
+        pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
+        return pipeline
+
+    @property
+    def size_multiple(self) -> int:
+        """What the side of the network's square must be a multiple of: so that the codec and the levels of the U-Nets
+        halve it without a rest, and the light's rows and columns fall on whole pixels.
+        """
+        levels = len(self.dual_stream.config["block_out_channels"])
+        return math.lcm(self.conditioning.codec.factor * 2 ** (levels - 1), *self.conditioning.packing.environment_size)
+
+    def check_size(self, size: int) -> None:
+        """Looks at a side of the network's square.
+
+        Raises:
+            UnirenderError: it is no multiple of `size_multiple`.
+        """
+        if not isinstance(size, Integral) or size < 1 or size % self.size_multiple:
+            raise UnirenderError(f"size: got {size}, expected a multiple of {self.size_multiple}, like {self.size}")
+
+    def _network(self, mode: str = "mean", sampler: str | None = None, size: int | None = None) -> Network:
+        """The network as a call asks for it.
+
+        Raises:
+            UnirenderError: no such sampler or size; a sampler in mode `mean`, which takes one step; or a scheduler
+                that several steps cannot be taken with.
+        """
+        if sampler is not None and mode == "mean":
+            raise UnirenderError(f"sampler {sampler}: mode mean takes one step and no sampler; use mode 'sample'")
+        if size is not None:
+            self.check_size(size)
+        scheduler = self.scheduler if sampler is None else make_sampler(sampler, self.scheduler)
+        if mode == "sample":
+            check_scheduler(scheduler)
+        return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)
+
+    def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
+        return self.progress_bar(steps)  # pyright: ignore[reportAttributeAccessIssue] - diffusers' own
+
+    def _report_overflow(self, overflow: dict[str, Overflow]) -> None:
+        for name, over in overflow.items():
+            if name not in self._reported:
+                self._reported.add(name)
+                logger.warning("%s: %s; they are kept, but what it makes of them is a guess", name, over)

@@ -1,0 +1,139 @@
+"""What the model's commands refuse among their options, and what they say of pictures and maps: a notice to the user,
+a fact for `meta.json`, or both. Light to import.
+"""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from unirender.errors import UsageError
+from unirender.options import MANY_CLIPPED, notice, usage
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from unirender.intrinsics import Intrinsics
+    from unirender.pictures import Picture
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+MAX_STOPS = 32
+MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
+IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
+
+
+def check_stops(stops: float | None) -> None:
+    """Looks at a number of stops.
+
+    Raises:
+        UsageError: it is none that a light could be changed by.
+    """
+    if stops is not None and not abs(stops) <= MAX_STOPS:
+        raise UsageError(f"--exposure {stops}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
+
+
+def check_looks_option(looks: int, mode: str) -> None:
+    """Looks at `--looks`.
+
+    Raises:
+        UsageError: it is no such number, or several samples are asked for.
+    """
+    if looks != 1:
+        from unirender.pipelines.looks import check_looks
+
+        with usage():
+            check_looks(looks, mode)
+
+
+def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
+    """A remark, by kind, where parts of a mask are so small that a network looks only at what is beside them.
+
+    Args:
+        mask: coverage [h w 1].
+        side: of the network's square, pixels.
+    """
+    from unirender.pipelines.framing import FAINT, STRAY, Frame
+
+    if mask is None:
+        return {}
+    beside = int(((mask > FAINT) & (Frame.around(mask, side).seen(mask) == 0)).sum())
+    if not beside:
+        return {}
+    return {
+        "parts": f"{beside} pixels of the mask are taken for stray ones and left out: parts away from the object, "
+        f"together less than {STRAY:.1%} of it; to have their maps, give them a mask of their own"
+    }
+
+
+def with_parts_remark(picture: "Picture", side: int) -> "Picture":
+    """A picture with that remark among its others, and a notice of it."""
+    found = parts_left_out(picture.mask, side)
+    for remark in found.values():
+        notice(remark)
+    return dataclasses.replace(picture, remarks={**picture.remarks, **found})
+
+
+def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[str, Any]:
+    """For `meta.json`: which HDR maps exceed the brightest that the network was taught, and by how many values."""
+    found = pipeline.overflow(intrinsics)
+    return {"above_x_max": {name: dataclasses.asdict(over) for name, over in found.items()}}
+
+
+def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
+    """For `meta.json`: which maps a rendering gets from elsewhere than what is given; a notice where nobody asked.
+
+    Args:
+        intrinsics: as they are given.
+        new_light: whether a light beside them takes the place of their specular, diffuse and environment.
+    """
+    from unirender.pipelines.inputs import DERIVABLE, to_derive, with_mask
+
+    derived = DERIVABLE if new_light else tuple(name for name in DERIVABLE if name in to_derive(intrinsics))
+    lit = (*DERIVABLE, "environment") if new_light else derived
+    imagined = [name for name in IMAGINED if name not in (*intrinsics.present, *lit)]
+    facts: dict[str, Any] = {"imagined": imagined, "derived": list(derived)}
+    said = [f"the network imagines {', '.join(imagined)}"] if imagined else []
+    if derived and not new_light:
+        said.append(f"{', '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
+    if intrinsics.mask is None:
+        whole = bool(with_mask(intrinsics).require("mask")["mask"].all())
+        facts["mask_from"] = "frame" if whole else "normal"
+        said.append("the mask is the whole frame" if whole else "the mask is where the normal is not 0")
+    if said:
+        notice(f"maps that are missing: {'; '.join(said)}")
+    return facts
+
+
+def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
+    """For `meta.json`: the share of the covered normals that face away from the camera; a notice where there are many.
+
+    Args:
+        intrinsics: with a mask.
+    """
+    from unirender.pipelines.inputs import facing_away
+
+    if intrinsics.normal is None:  # what needs it says so
+        return {}
+    share = facing_away(intrinsics)
+    if share > MANY_AWAY:
+        notice(
+            f"{share:.0%} of the object's normals face away from the camera: expected camera axes, +z towards the "
+            "viewer; maps of other axes have to be turned"
+        )
+    return {"facing_away": share}
+
+
+def at_white(image_linear: "np.ndarray", mask: "np.ndarray | None") -> dict[str, Any]:
+    """For `meta.json`: the share of a rendering's pixels at display white, where the network's range ends; a notice
+    where there are many.
+
+    Args:
+        image_linear: premultiplied.
+        mask: its coverage.
+    """
+    from unirender.color import image_srgb, unpremultiply
+    from unirender.pictures import Picture
+
+    straight = image_linear if mask is None else unpremultiply(image_linear, mask)
+    share = Picture(image_srgb(straight), mask, "").clipped
+    if share > MANY_CLIPPED:
+        notice(f"{share:.0%} of the object's pixels come out at display white, where what the network renders ends")
+    return {"at_white": share}

@@ -1,0 +1,85 @@
+"""Pictures of 16 bits a channel in colour, or of grey with alpha: in full.
+
+Pillow has no mode for such pixels and drops their low bytes. Its decoder unpacks them a second time here, as if their
+bytes were in the other order, and then keeps what it dropped before.
+"""
+
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image, ImageOps
+
+OTHER_ORDER = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # N: this machine's own
+UNPACKED = {"RGB": "RGB", "RGBX": "RGBX", "RGBA": "RGBA", "RGBa": "RGBA"}  # as Pillow names them -> bytes as they are
+GREY_AND_ALPHA = "LA"  # four bytes a pixel: the grey's, then the alpha's
+
+
+def sixteen_bit_values(path: Path, *, upright: bool = False) -> Float[np.ndarray, "h w c"] | None:
+    """Values in [0, 1], not premultiplied: three channels, or four where the picture has alpha or a transparent colour.
+
+    Args:
+        path: of a PNG, a TIFF or another picture that Pillow reads.
+        upright: turn it as its EXIF orientation says.
+
+    Returns:
+        The values; None where Pillow itself keeps all bits of the pixels, or where they are CMYK.
+
+    Raises:
+        OSError, ValueError or SyntaxError: the picture is broken, as Pillow says it.
+    """
+    with opened(path) as picture:
+        name = has_sixteen_bits(picture)
+        key = picture.info.get("transparency")
+    pixels, _, order = (name or "").partition(";16")
+    if pixels == GREY_AND_ALPHA:
+        both = _bytes(path, "RGBA", upright)
+        high, low = both[..., [0, 0, 0, 2]], both[..., [1, 1, 1, 3]]
+    elif pixels in UNPACKED:
+        high, low = (_bytes(path, f"{UNPACKED[pixels]};16{each}", upright) for each in (order, OTHER_ORDER[order]))
+    else:
+        return None
+    values = (high.astype(np.float32) * 256 + low) / 65535.0
+    if pixels == "RGBa":
+        values[..., :3] = np.divide(values[..., :3], values[..., 3:], where=values[..., 3:] > 0, out=values[..., :3])
+        return np.minimum(values, 1)
+    if isinstance(key, tuple) and pixels == "RGB":
+        opaque = (np.round(values * 65535) != key).any(axis=-1, keepdims=True)
+        return np.concatenate([values, opaque.astype(np.float32)], axis=-1)
+    return values
+
+
+def has_sixteen_bits(picture: Image.Image) -> str:
+    """How Pillow names pixels of which it would drop half of the bits; empty where it drops none.
+
+    Args:
+        picture: opened, and not decoded yet.
+    """
+    for tile in getattr(picture, "tile", ()):
+        name = _name(tile.args)
+        if ";16" in name and not picture.mode.startswith("I"):
+            return name
+    return ""
+
+
+def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:
+    """The pixels' bytes `[h w c]`, unpacked as Pillow does with pixels of that name."""
+    with opened(path) as picture:
+        picture.tile = [  # pyright: ignore[reportAttributeAccessIssue] - of a picture from a file
+            tile._replace(args=name if isinstance(tile.args, str) else (name, *tile.args[1:])) for tile in picture.tile
+        ]
+        return np.asarray(ImageOps.exif_transpose(picture) if upright else picture)
+
+
+def opened(path: Path) -> Any:
+    """A picture file, not decoded yet; of its size nothing is said."""
+    with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
+        return Image.open(path)
+
+
+def _name(arguments: Any) -> str:
+    """A tile's name of its pixels: Pillow's decoders take it alone, or first of several arguments."""
+    return str(arguments if isinstance(arguments, str) else arguments[0] if arguments else "")

@@ -1,0 +1,80 @@
+"""Files and folders that are there whole or not at all, whatever stops the process that writes them."""
+
+import contextlib
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from unirender.errors import UnirenderError
+
+
+def replace_file(path: Path, content: str | bytes) -> Path:
+    """Writes a file, text as UTF-8, and its folder where there is none; returns the path.
+
+    It is written aside, synced and renamed: whoever reads `path`, after a crash or while others write it too, finds the
+    old content or the new.
+
+    Raises:
+        OSError: it cannot be written; what was there stays.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
+    temporary = Path(name)
+    try:
+        with naming(path), os.fdopen(handle, "wb") as file:
+            file.write(content if isinstance(content, bytes) else content.encode())
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)  # mkstemp gives it to its owner alone
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    return path
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """For a block that writes a file: an error that names none, as a full disk's does, gets its name."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+def file_sha256(path: str | Path) -> str:
+    """sha256 of a file's bytes, hexadecimal.
+
+    Raises:
+        UnirenderError: it cannot be read.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}); restore the file") from error
+
+
+def move_into_place(temporary: Path, path: Path) -> None:
+    """Renames a folder to `path`, in place of the folder that may be there; where that fails, all is as before."""
+    if not path.is_dir():
+        os.rename(temporary, path)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+    try:
+        os.rename(path, aside / "old")
+    except BaseException:
+        aside.rmdir()
+        raise
+    try:
+        os.rename(temporary, path)
+    except BaseException:
+        os.rename(aside / "old", path)
+        aside.rmdir()
+        raise
+    shutil.rmtree(aside)
