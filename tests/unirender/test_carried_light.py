@@ -49,8 +49,8 @@ def relit(before: Intrinsics, environment: np.ndarray) -> tuple[Intrinsics, Intr
 def error(one: Intrinsics, other: Intrinsics) -> float:
     """Root mean square of log d and log s over the object."""
     inside = one.require("mask")["mask"][..., 0] > 0
-    logs = [[np.log(maps.require(name)[name][inside] + 0.02) for name in NAMES] for maps in (one, other)]
-    return float(np.sqrt(np.mean(np.square(np.subtract(*logs)))))
+    logs = (np.stack([np.log(maps.require(name)[name][inside] + 0.02) for name in NAMES]) for maps in (one, other))
+    return float(np.sqrt(np.mean(np.square(next(logs) - next(logs)))))
 
 
 def test_under_its_own_light_an_object_gets_its_own_light_back() -> None:

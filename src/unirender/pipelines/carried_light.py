@@ -18,7 +18,7 @@ from collections.abc import Collection
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import uniform_filter1d
 
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_light
@@ -89,6 +89,6 @@ def _smoothed(
     if side <= 1:
         return values
     weighted = np.concatenate([values * mask, mask], axis=-1).astype(np.float32)
-    for _ in range(2):
-        weighted = uniform_filter(weighted, (side, side, 1), mode="constant")
+    for axis in (0, 1, 0, 1):
+        weighted = uniform_filter1d(weighted, side, axis=axis, mode="constant")
     return np.where(mask > 0, weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-6), 0)
