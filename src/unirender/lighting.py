@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_radiance, check_radiance
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
 LEAST_ROWS, LEAST_COLUMNS = 3, 2  # of a light to render by: Mitsuba resamples smaller ones
+POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
+MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
 MOST_ALIASING = 0.005  # share of a texel's energy, away from the poles, that may come of how two grids lie together
 
 
@@ -101,6 +104,37 @@ def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, 
     check_radiance("environment", environment)
     weights = texel_solid_angles(*environment.shape[:2])
     return (np.einsum("hw,hwc->c", weights, environment, dtype=np.float64) / (4 * np.pi)).astype(np.float32)
+
+
+def drawable(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """The same light on a grid from which Mitsuba draws all of it: itself, or with a row between each two."""
+    return middle_rows(environment) if has_bright_pole(environment) else environment
+
+
+def has_bright_pole(environment: Float[np.ndarray, "h w 3"]) -> bool:
+    """Whether Mitsuba would miss light of the first or the last row.
+
+    It draws directions by luminance times sin(theta) of the texels, which is 0 all over these rows: their light is met
+    where the rows beside them draw it. Where those are dark, most samples miss it and a few count for all. A sample
+    that meets a texel counts about as often too much as the texel is brighter than the one beside it (the contrast);
+    the texels' mean contrast, by their share of the light's power, is therefore the variance that they bring.
+    """
+    brightness = luminance(environment).astype(np.float64)
+    power = brightness * texel_solid_angles(*environment.shape[:2])
+    noise, total = 0.0, max(float(power.sum()), 1e-300)
+    for pole, beside in ((0, 1), (-1, -2)):
+        least = np.maximum(brightness[beside], brightness[pole] / MOST_CONTRAST)
+        contrast = np.divide(brightness[pole], least, out=np.zeros_like(least), where=least > 0)
+        noise += float((power[pole] * contrast).sum()) / total
+    return noise > POLE_NOISE
+
+
+def middle_rows(rows: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """Bilinear radiance on a grid with a row between each two: the same light, whose poles have bright neighbours."""
+    finer = np.empty((2 * len(rows) - 1, *rows.shape[1:]), rows.dtype)
+    finer[::2] = rows
+    finer[1::2] = (rows[:-1] + rows[1:]) / 2
+    return finer
 
 
 def resample_environment(
