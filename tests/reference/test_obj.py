@@ -200,14 +200,15 @@ def test_faces_smooth_across_what_some_of_them_lack(tmp_path, lacking):
     assert normals(True) == pytest.approx(normals(False), abs=1e-5)
 
 
-@pytest.mark.parametrize("written", ["\r", "\r\n", "tab", "bom"])
+@pytest.mark.parametrize("written", ["\r", "\r\n", "\r and others", "tab", "bom"])
 def test_line_ends_tabs_and_a_byte_order_mark(tmp_path, written):
     """Keywords behind a byte order mark or before a tab were passed over, and files with CR alone were one line."""
 
     def spelled(text: str) -> bytes:
         if written == "tab":
             text = "".join(line.replace(" ", "\t", 1) for line in text.splitlines(keepends=True))
-        text = text.replace("\n", written) if written[0] == "\r" else text
+        ends = {"\r": ["\r"], "\r\n": ["\r\n"], "\r and others": ["\r", "\r\n", "\n"]}.get(written, ["\n"])
+        text = "".join(line + ends[i % len(ends)] for i, line in enumerate(text.splitlines()))
         return (codecs.BOM_UTF8 if written == "bom" else b"") + text.encode()
 
     (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))

@@ -133,7 +133,7 @@ class MtlMaterials:
             return self._folder.read(file, "texture")
         except UnirenderError as error:
             option, *more = file.split()
-            if not option.startswith("-") or not more:
+            if not re.match("-[a-zA-Z]", option) or not more:
                 raise
             raise UnirenderError(
                 f"texture {file[:80]!r}: got the option {option!r}, which is not known here, expected one of "

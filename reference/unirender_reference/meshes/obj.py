@@ -6,6 +6,7 @@ ones (`normals`).
 
 import codecs
 import io
+import re
 from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -111,11 +112,11 @@ class _Lines:
 
 
 def _each_line(file: BinaryIO) -> Iterator[bytes]:
-    """Lines that end in LF, CR LF or, where the file has no LF, CR; one of too many bytes is cut off."""
+    """Lines that end in LF, CR LF or CR, also in turn; one of too many bytes is cut off."""
     head = file.read(MAX_LINE_BYTES)
     file.seek(len(codecs.BOM_UTF8) if head.startswith(codecs.BOM_UTF8) else 0)
-    if b"\r" in head and b"\n" not in head:
-        text = io.TextIOWrapper(file, "latin-1", newline="\r")
+    if re.search(rb"\r[^\n]", head):
+        text = io.TextIOWrapper(file, "latin-1", newline="")
         return (line.encode("latin-1") for line in iter(lambda: text.readline(MAX_LINE_BYTES + 1), ""))
     return iter(lambda: file.readline(MAX_LINE_BYTES + 1), b"")
 
