@@ -7,6 +7,7 @@ the +z axis and looks along -z. An environment in camera axes is therefore Mitsu
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.intrinsics import as_radiance
+from unirender.intrinsics import as_numbers, as_radiance
 from unirender.lighting import drawable
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
@@ -23,6 +24,7 @@ from unirender_reference.shapes import MeshObject
 LIGHT = "light"
 OBJECT = "object"
 NEAR_CLIP, FAR_CLIP = 0.01, 1e4  # the second is Mitsuba's own
+ROTATION_TOLERANCE = 1e-3  # of a pose
 MOST_RADIANCE = 1e12  # the sun's luminance is 1.6e9 cd/m^2; squares of far more leave the range of float32
 
 
@@ -50,14 +52,34 @@ def sensor_dict(camera: Camera, height: int, width: int) -> dict[str, Any]:
     }
 
 
+def check_pose(pose: Any, name: str = "pose") -> None:
+    """Looks at a pose that somebody handed in.
+
+    Raises:
+        UnirenderError: it is no (4, 4) matrix of a rotation and a position.
+    """
+    matrix = as_numbers(name, pose).astype(np.float64)
+    turn = matrix[:3, :3] if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((3, 3))
+    if np.abs(turn.T @ turn - np.eye(3)).max() >= ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+        raise UnirenderError(
+            f"{name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without scale or "
+            "mirroring"
+        )
+
+
 def sensor_at(pose: Float[np.ndarray, "4 4"], camera: Camera, height: int, width: int) -> dict[str, Any]:
-    """The contract's sensor, moved to a pose: (4, 4) camera to world."""
+    """The contract's sensor, moved to a pose: (4, 4) camera to world.
+
+    Raises:
+        UnirenderError: as `check_pose`.
+    """
+    check_pose(pose)
     mi = mitsuba()
     turned = np.array(pose, np.float64)
     turned[:3, [0, 2]] *= -1  # Mitsuba's camera looks along its +z, with +x to the left
     sensor = sensor_dict(camera, height, width)
     sensor.pop("far_clip", None)
-    return {**sensor, **clips(float(np.linalg.norm(pose[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
+    return {**sensor, **clips(float(np.linalg.norm(turned[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
 
 
 def clips(distance: float) -> dict[str, float]:
@@ -224,8 +246,8 @@ class EditableScene:
                 raise UnirenderError(
                     f"{key}: got None, the object's own map, but {self._obj.name} has none; expected a value in [0, 1]"
                 )
-            if value is not None and not 0.0 <= value <= 1.0:
-                raise UnirenderError(f"{key}: got {value}, expected a value in [0, 1]")
+            if value is not None and not (isinstance(value, Real) and 0.0 <= value <= 1.0):
+                raise UnirenderError(f"{key}: got {value!r:.60}, expected a number in [0, 1]")
         mapped = frozenset(key for key, value in values.items() if value is None)
         found = self._surfaces.get((surface, mapped))
         if found is None:

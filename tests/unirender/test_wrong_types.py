@@ -20,7 +20,7 @@ from unirender.lighting import rotate_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.surface_light import diffuse_light
 from unirender_reference.lights import make_light
-from unirender_reference.render import SceneSpec
+from unirender_reference.render import Renderer, SceneSpec
 from unirender_reference.shade import shade, shade_gradients
 from unirender_reference.shapes import make_object
 
@@ -31,6 +31,8 @@ mask[4:-4, 4:-4] = 1
 image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
+renderer = Renderer(make_object(1, 'train'), resolution=8)
+renderer.image(light, 0.5, 0.5, 16)
 maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
 photograph = Image.fromarray(bytes_8)
 for case in %r:
@@ -62,6 +64,13 @@ CASES = {
     "Intrinsics(diffuse=bytes_8)": "diffuse: got ndarray of uint8 values, expected linear radiance as floats; read a",
     "diffuse_light(maps.normal, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "rotate_environment(bytes_8, np.eye(3))": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "renderer.image(None, 0.5, 0.5, 16)": "environment: got shape (), expected a lat-long map",
+    "renderer.diffuse(bytes_8, 16)": "environment: got ndarray of uint8 values, expected linear radiance as floats",
+    "renderer.specular(light, '0.5', 16)": "roughness: got '0.5', expected a number in [0, 1]",
+    "renderer.image(light, 0.5, 0.5, 64.0)": "spp: got 64.0, expected a whole number of samples",
+    "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
+    "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
+    "Renderer(make_object(1, 'train'), resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
     "shade(maps, photograph)": "environment: got Image of uint8 values, expected linear radiance as floats; read a",
     "shade_gradients(maps, image, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "shade(maps, light[:2])": "environment: got shape (2, 32, 3), expected a lat-long map [height, width, 3]",

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender_reference.scene import check_pose
 
-ROTATION_TOLERANCE = 1e-3
 RANGE_TOLERANCE = 1e-3
 SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
 BLACK = 0.5 / 255  # display values of 8 bits below are 0
@@ -51,14 +51,7 @@ class View:
             raise UnirenderError(f"{self.name}: the image has negative, infinite or NaN values; expected values >= 0")
         if not (self.mask.min() >= 0 and self.mask.max() <= 1):
             raise UnirenderError(f"{self.name}: the mask leaves [0, 1]; expected coverage")
-        rotation = self.pose[:3, :3].astype(np.float64)
-        if self.pose.shape != (4, 4) or not (
-            np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
-        ):
-            raise UnirenderError(
-                f"{self.name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without "
-                "scale or mirroring"
-            )
+        check_pose(self.pose, self.name)
 
 
 @dataclass(frozen=True)
