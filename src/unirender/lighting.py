@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
 LEAST_ROWS, LEAST_COLUMNS = 3, 2  # of a light to render by: Mitsuba resamples smaller ones
+UNIT_TOLERANCE = 0.05  # of squared lengths: 0.7 for half of the root of 2 is near enough
 POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
 MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
 MOST_ALIASING = 0.005  # share of a texel's energy, away from the poles, that may come of how two grids lie together
@@ -69,10 +70,19 @@ def texel_solid_angles(height: int, width: int) -> Float[np.ndarray, "h w"]:
 def sample_environment(
     environment: Float[np.ndarray, "h w 3"], directions: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Bilinear radiance in the given unit directions, as Mitsuba interpolates it."""
-    check_radiance("environment", environment)
+    """Bilinear radiance in the given unit directions, as Mitsuba interpolates it.
+
+    Raises:
+        UnirenderError: the map has another shape, or a direction is not unit.
+    """
+    check_map(environment)
     height, width = environment.shape[:2]
-    _check_shape((height, width))
+    squared = np.einsum("...c,...c->...", directions, directions)
+    if not (np.abs(squared - 1) < UNIT_TOLERANCE).all():
+        raise UnirenderError(
+            f"directions: got lengths from {np.sqrt(squared.min()):.3g} to {np.sqrt(squared.max()):.3g}, expected unit "
+            "vectors; normalise them"
+        )
     row = np.arccos(np.clip(directions[..., 1], -1, 1)) * ((height - 1) / np.pi)
     column = np.arctan2(directions[..., 0], -directions[..., 2]) * (width / (2 * np.pi)) - 0.5
     row_0 = np.clip(np.floor(row).astype(np.int64), 0, height - 2)
@@ -87,11 +97,22 @@ def sample_environment(
 def rotate_environment(
     environment: Float[np.ndarray, "h w 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The light turned by `rotation`: the new radiance from R x is the old one from x. Bilinear resampling."""
+    """The light turned by `rotation`: the new radiance from R x is the old one from x. Bilinear resampling.
+
+    Turns about +y keep the energy of every light. Others may lose or double what is smaller than a few texels.
+
+    Raises:
+        UnirenderError: the map has another shape, or the matrix is no rotation.
+    """
+    check_map(environment)
+    rotation = np.asarray(rotation, dtype=np.float32)
+    unmoved = rotation @ rotation.T if rotation.shape == (3, 3) else np.zeros((3, 3))
+    if not (np.abs(unmoved - np.eye(3)) < UNIT_TOLERANCE).all() or np.linalg.det(rotation) < 0:
+        raise UnirenderError(f"rotation: got {rotation.tolist()}, expected the 3 x 3 matrix of a rotation")
     directions = environment_directions(*environment.shape[:2])
     # At the pole of row 0 a direction has no azimuth: texels keep that of their column, as the last row's by rounding.
     directions[0] += np.float32(POLE_STEP) * directions[1] * np.array([1, 0, 1], dtype=np.float32)
-    return sample_environment(environment, directions @ np.asarray(rotation, dtype=np.float32))
+    return sample_environment(environment, directions @ rotation)
 
 
 def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.ndarray, "*n h w 3"]:
@@ -101,7 +122,7 @@ def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.n
 
 def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
     """Average over the sphere, by solid angle."""
-    check_radiance("environment", environment)
+    check_map(environment)
     weights = texel_solid_angles(*environment.shape[:2])
     return (np.einsum("hw,hwc->c", weights, environment, dtype=np.float64) / (4 * np.pi)).astype(np.float32)
 
@@ -145,7 +166,7 @@ def resample_environment(
     Where it grows by a factor that is no whole number, texels of the old map would be met by more or fewer of the new
     one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
     """
-    check_radiance("environment", environment)
+    check_map(environment)
     height, width = environment.shape[:2]
     rows, columns = resampling_operators((height, width), shape)
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
@@ -210,6 +231,19 @@ def weighted_means(weights: "csr_array", measure: Float[np.ndarray, " m"]) -> "c
 
     total = weights.T @ measure
     return csr_array(diags_array(1 / total) @ weights.T @ diags_array(measure))
+
+
+def check_map(environment: Any) -> None:
+    """Looks at a lat-long map that somebody handed in.
+
+    Raises:
+        UnirenderError: it is one of whole numbers, or of a wrong shape.
+    """
+    check_radiance("environment", environment)
+    shape = np.shape(environment)
+    if len(shape) != 3 or shape[-1] != 3:
+        raise UnirenderError(f"environment: got shape {shape}, expected a lat-long map [height, width, 3]")
+    _check_shape(shape[:2])
 
 
 def _check_shape(shape: tuple[int, ...]) -> None:

@@ -16,9 +16,9 @@ from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from PIL import Image
-from unirender.lighting import rotate_environment
+from unirender.lighting import rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.surface_light import diffuse_light
+from unirender.surface_light import diffuse_light, specular_light
 from unirender_reference.lights import make_light
 from unirender_reference.render import Renderer, SceneSpec
 from unirender_reference.shade import shade, shade_gradients
@@ -63,6 +63,12 @@ CASES = {
     "Intrinsics(environment=bytes_8.tolist())": "environment: got list of int64 values, expected linear radiance as",
     "Intrinsics(diffuse=bytes_8)": "diffuse: got ndarray of uint8 values, expected linear radiance as floats; read a",
     "diffuse_light(maps.normal, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "diffuse_light(maps.normal, np.ones((16, 32, 4)))": "environment: got shape (16, 32, 4), expected a lat-long map",
+    "specular_light(maps.normal, 2.0, light)": "roughness: got values in [2, 2], expected [0, 1]",
+    "specular_light(maps.normal, maps.roughness[..., 0], light)": "roughness: got shape (16, 24), expected one number",
+    "rotate_environment(light, 2 * np.eye(3))": "rotation: got [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]],",
+    "rotate_environment(light, np.eye(4))": "rotation: got [[1.0, 0.0, 0.0, 0.0], ",
+    "sample_environment(light, 2 * maps.normal)": "directions: got lengths from 0 to 2, expected unit vectors",
     "rotate_environment(bytes_8, np.eye(3))": "environment: got ndarray of uint8 values, expected linear radiance as",
     "renderer.image(None, 0.5, 0.5, 16)": "environment: got shape (), expected a lat-long map",
     "renderer.diffuse(bytes_8, 16)": "environment: got ndarray of uint8 values, expected linear radiance as floats",
