@@ -28,7 +28,7 @@ from PIL import Image
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
-from unirender.lighting import resample_environment
+from unirender.lighting import LEAST_ROWS, resample_environment
 from unirender.pictures import check_finite, display_colors, negative_share, open_picture
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
@@ -56,7 +56,7 @@ def load_light(
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
             None: by suffix (HDR formats are lat-long, others are photographs).
         shape: rows and columns of the result; None: the file's own for lat-long maps (bit for bit where it is on the
-            contract's grid), 128 x 256 for photographs.
+            contract's grid; of a map of 2 x 4 pixels 3 rows, which rendering needs), 128 x 256 for photographs.
         normalise: scale to mean luminance 1; False keeps the radiance of the file (of a photograph: white is `PEAK`).
 
     Returns:
@@ -89,7 +89,7 @@ def load_light(
             provenance["rule"] = "lat-long on the contract's grid"
             environment = pixels if shape in (None, (h, w)) else resample_environment(pixels, shape)
         else:
-            environment = area_resampled(pixels, shape or (h, w))
+            environment = area_resampled(pixels, shape or (max(h, LEAST_ROWS), w))
     if negative := negative_share(environment, f"light {path}"):
         provenance["negative_share"] = f"{negative:.2e}"
     environment = np.maximum(environment, 0)
