@@ -247,7 +247,7 @@ class EditableScene:
                     f"{key}: got None, the object's own map, but {self._obj.name} has none; expected a value in [0, 1]"
                 )
             if value is not None and not (isinstance(value, Real) and 0.0 <= value <= 1.0):
-                raise UnirenderError(f"{key}: got {value!r:.60}, expected a number in [0, 1]")
+                raise UnirenderError(f"{key}: got {value!r:.60}, expected a value in [0, 1]")
         mapped = frozenset(key for key, value in values.items() if value is None)
         found = self._surfaces.get((surface, mapped))
         if found is None:

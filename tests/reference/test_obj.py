@@ -62,6 +62,22 @@ def test_pbr_keywords(tmp_path):
     assert obj.normal_map[1:-1, 1:-1] == pytest.approx(tilt, abs=1e-5)
 
 
+def test_normals_of_a_map_that_point_into_the_surface_count_as_flat(tmp_path):
+    """Under an even light such a surface reflected twice the light that there is."""
+    pixels = np.full((4, 4, 3), (128, 128, 255), np.uint8)
+    pixels[:, 2:] = 0  # black around a chart
+    pixels[0, 0] = 255, 128, 127  # along the surface, rounded
+    (tmp_path / "bumps.png").write_bytes(png(pixels))
+    obj = write(tmp_path, "norm bumps.png")
+    assert obj.provenance["ignored"] == "normals into the surface"
+    assert obj.normal_map is not None
+    assert obj.normal_map[..., 2].min() == pytest.approx(-1 / 255, abs=1e-3)
+    assert (obj.normal_map[..., 2] > 0.99).mean() > 0.8
+    pixels[:, 2:] = 128, 128, 255
+    (tmp_path / "bumps.png").write_bytes(png(pixels))
+    assert write(tmp_path, "norm bumps.png").provenance["ignored"] == ""
+
+
 def test_pbr_values_and_their_defaults(tmp_path):
     obj = write(tmp_path, "Kd 1 1 1\nPr 0.25")
     assert obj.roughness == pytest.approx(np.full((2, 2), 0.25))

@@ -72,7 +72,7 @@ CASES = {
     "rotate_environment(bytes_8, np.eye(3))": "environment: got ndarray of uint8 values, expected linear radiance as",
     "renderer.image(None, 0.5, 0.5, 16)": "environment: got shape (), expected a lat-long map",
     "renderer.diffuse(bytes_8, 16)": "environment: got ndarray of uint8 values, expected linear radiance as floats",
-    "renderer.specular(light, '0.5', 16)": "roughness: got '0.5', expected a number in [0, 1]",
+    "renderer.specular(light, '0.5', 16)": "roughness: got '0.5', expected a value in [0, 1]",
     "renderer.image(light, 0.5, 0.5, 64.0)": "spp: got 64.0, expected a whole number of samples",
     "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
     "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",

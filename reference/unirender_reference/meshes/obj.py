@@ -168,7 +168,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
     materials = MtlMaterials(folder, entries, used)
     pieces = []
     made: dict[tuple[str | None, bool, bool], Material] = {}
-    ignored = set(materials.ignored)
+    ignored = set[str]()
     for number, group in zip(present // 8, np.split(order, starts[1:]), strict=True):
         name = names[number]
         faces = _looked_up(points_of[group], len(points), "vertex")
@@ -199,7 +199,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
         )
     if any(name is not None and name not in entries for name in used):
         ignored.add("undefined materials")
-    return Model(_smoothed(pieces, present // 8), frozenset(ignored))
+    return Model(_smoothed(pieces, present // 8), frozenset(ignored | materials.ignored))
 
 
 def _smoothed(pieces: list[Piece], owners: Int[np.ndarray, " k"]) -> list[Piece]:
