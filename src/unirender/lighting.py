@@ -12,6 +12,7 @@ receives from a map is in `unirender.surface_light`.
 """
 
 import functools
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"
 
 def texel_solid_angles(height: int, width: int) -> Float[np.ndarray, "h w"]:
     """Integral of each texel's bilinear weight over the sphere, in steradians; they sum to 4 pi."""
-    _check_shape((height, width))
+    check_shape((height, width))
     step = np.pi / (height - 1)
     rows = np.sin(np.pi * np.arange(height) / (height - 1)) * 2 * (1 - np.cos(step)) / step
     rows[0] = rows[-1] = 1 - np.sin(step) / step
@@ -167,8 +168,9 @@ def resample_environment(
     one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
     """
     check_map(environment)
+    check_shape(shape)
     height, width = environment.shape[:2]
-    rows, columns = resampling_operators((height, width), shape)
+    rows, columns = resampling_operators((height, width), tuple(shape))
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
     new = (columns @ mixed.reshape(width, -1)).reshape(shape[1], shape[0], 3).transpose(1, 0, 2)
     return np.ascontiguousarray(new, dtype=np.float32)
@@ -184,8 +186,8 @@ def resampling_operators(source: tuple[int, int], target: tuple[int, int]) -> tu
     from scipy.sparse import csr_array
 
     (h, w), (h2, w2) = source, target
-    _check_shape(source)
-    _check_shape(target)
+    check_shape(source)
+    check_shape(target)
     if _is_integrated((h2 - 1) / (h - 1)):
         count = 64 * max(h, h2)
         theta = (np.arange(count) + 0.5) * np.pi / count  # midpoint rule over the polar angle
@@ -243,9 +245,15 @@ def check_map(environment: Any) -> None:
     shape = np.shape(environment)
     if len(shape) != 3 or shape[-1] != 3:
         raise UnirenderError(f"environment: got shape {shape}, expected a lat-long map [height, width, 3]")
-    _check_shape(shape[:2])
+    check_shape(shape[:2])
 
 
-def _check_shape(shape: tuple[int, ...]) -> None:
-    if len(shape) != 2 or shape[0] < 2 or shape[1] < 2:
+def check_shape(shape: Any) -> None:
+    """Looks at the rows and columns of a map.
+
+    Raises:
+        UnirenderError: these are no two whole numbers of at least 2.
+    """
+    sides = shape if isinstance(shape, tuple | list) else ()
+    if len(sides) != 2 or not all(isinstance(side, Integral) and int(side) >= 2 for side in sides):
         raise UnirenderError(f"environment: got size {shape}, expected a lat-long map of at least 2 x 2 texels")

@@ -3,6 +3,7 @@
 import re
 import struct
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import OpenEXR
@@ -131,6 +132,15 @@ def test_the_smallest_map_can_be_rendered_by(tmp_path):
     assert mean_radiance(environment) == pytest.approx([4, 4, 4], rel=0.01)
     assert (environment[0] > environment[1]).all()
     assert (environment[1] > environment[2]).all()
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 4)])
+def test_a_shape_that_is_none_is_refused(tmp_path, shape):
+    """Of no rows or of one, memory was written beside the arrays, and the process died."""
+    write_exr(tmp_path / "a.exr", image_channels(np.ones((8, 16, 3), np.float32)), half=False)
+    for made in (lights.load_light, partial(lights.load_light, photograph=True)):
+        with pytest.raises(UnirenderError, match="expected a lat-long map of at least 2 x 2 texels"):
+            made(tmp_path / "a.exr", shape=shape)
 
 
 def test_exr_and_rgbe_maps_agree(tmp_path):

@@ -10,16 +10,18 @@ import sys
 import pytest
 
 SCRIPT = """
+from dataclasses import replace
 import numpy as np
 import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from PIL import Image
-from unirender.lighting import rotate_environment, sample_environment
+from unirender.lighting import resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.surface_light import diffuse_light, specular_light
-from unirender_reference.lights import make_light
+from unirender_reference.lights import Light, make_light
+from unirender_reference.optimize.views import View
 from unirender_reference.render import Renderer, SceneSpec
 from unirender_reference.shade import shade, shade_gradients
 from unirender_reference.shapes import make_object
@@ -77,6 +79,14 @@ CASES = {
     "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
     "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
     "Renderer(make_object(1, 'train'), resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
+    "make_light('a', 'train')": "make_light: got seed 'a', split 'train'; expected seed >= 0",
+    "Light('a', light.tolist())": "light: got name 'a' and an environment of type list, expected a text and a",
+    "replace(renderer.obj, albedo=0.5)": "train-000001: got albedo 0.5, expected a numpy array",
+    "replace(renderer.obj, normals=None)": "train-000001: got normals None, expected a numpy array",
+    "renderer.obj.turned(np.eye(4))": "train-000001: got [[1.0, 0.0, 0.0, 0.0], ",
+    "View(image, mask, 36, np.eye(4))": "view: got camera 36, expected a unirender.camera.Camera",
+    "View([1], mask, Camera(), np.eye(4))": "view: got image (1,), mask (16, 24, 1); expected (h, w, 3) and (h, w, 1)",
+    "resample_environment(light, 16)": "environment: got size 16, expected a lat-long map of at least 2 x 2 texels",
     "shade(maps, photograph)": "environment: got Image of uint8 values, expected linear radiance as floats; read a",
     "shade_gradients(maps, image, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "shade(maps, light[:2])": "environment: got shape (2, 32, 3), expected a lat-long map [height, width, 3]",

@@ -28,7 +28,7 @@ from PIL import Image
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
-from unirender.lighting import LEAST_ROWS, resample_environment
+from unirender.lighting import LEAST_ROWS, check_shape, resample_environment
 from unirender.pictures import check_finite, display_colors, negative_share, open_picture
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
@@ -65,11 +65,14 @@ def load_light(
         total is in the provenance.
 
     Raises:
-        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map.
+        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map; or
+            the shape is none of a map.
     """
     path = Path(path)
     if not path.is_file():
         raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
+    if shape is not None:
+        check_shape(shape)
     hdr = path.suffix.lower() in HDR_SUFFIXES
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     check_finite(pixels, f"light {path}")

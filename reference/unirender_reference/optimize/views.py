@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender.intrinsics import as_numbers
 from unirender_reference.scene import check_pose
 
 RANGE_TOLERANCE = 1e-3
@@ -38,10 +39,11 @@ class View:
     clipped: Bool[np.ndarray, "h w 3"] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.camera, Camera):
+            raise UnirenderError(f"{self.name}: got camera {self.camera!r:.40}, expected a unirender.camera.Camera")
         for label in ("image", "mask", "pose"):
-            object.__setattr__(self, label, np.asarray(getattr(self, label), np.float32))
-        height, width = self.image.shape[:2]
-        if self.image.shape != (height, width, 3) or self.mask.shape != (height, width, 1):
+            object.__setattr__(self, label, as_numbers(f"{self.name}: {label}", getattr(self, label)))
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.mask.shape != (*self.image.shape[:2], 1):
             raise UnirenderError(
                 f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
             )
