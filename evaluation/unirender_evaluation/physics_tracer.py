@@ -108,7 +108,7 @@ class PathTracer:
     def _mirror(self, renderer: Any, _: float, roughness: float, environment: np.ndarray) -> Image:
         from unirender_reference.passes import TRUTH_BATCHES, mean_estimate, render_passes
 
-        scene = renderer.scene.show("mirror", {"roughness": roughness}, environment)
+        scene = renderer.lit("mirror", {"roughness": roughness}, environment)
         passes = render_passes(scene, MIRROR_DEPTH, self.spp, self._seed, TRUTH_BATCHES, renderer.counters)
         return mean_estimate(*passes, TRUTH_BATCHES).mean[..., :3]
 

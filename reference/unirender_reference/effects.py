@@ -70,7 +70,7 @@ def render_effects(
     """
     if depth < DIRECT_DEPTH:
         raise UnirenderError(f"depth: got {depth}, expected at least {DIRECT_DEPTH}, one bounce")
-    scene = renderer.scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
+    scene = renderer.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
     integrators = {
         "unshadowed": python_integrator(_unshadowed),
         "shadow": python_integrator(_shadow),
@@ -95,7 +95,7 @@ def render_unshadowed(
     """The unshadowed light of one of the contract's surfaces, divided by coverage: of `mirror` it is s without shadows,
     of `white` it is d without; arguments as `Renderer.specular`."""
     parameters = {"roughness": roughness} if "roughness" in surface_parameters(surface) else {}
-    scene = renderer.scene.show(surface, parameters, environment)
+    scene = renderer.lit(surface, parameters, environment)
     own = derive_seed(seed, "unshadowed", surface)
     passes = integrator_passes(scene, python_integrator(_unshadowed), spp, own, batches, renderer.counters)
     return ratio_estimate(*passes, batches)

@@ -131,7 +131,7 @@ def render_lobes(
     for name in LOBES:
         color = COLOR_TERMS[name] if weighting == "object" else ONE
         mapped = METALLIC_TERMS[name] if weighting == "object" and metallic is None else ONE
-        scene = renderer.scene.show(name, {"roughness": roughness}, environment)
+        scene = renderer.lit(name, {"roughness": roughness}, environment)
         integrator = _weighted_direct(surface, color, mapped)
         own = derive_seed(seed, "lobe", name)
         lobes[name] = _lobe(*integrator_passes(scene, integrator, spp, own, batches, renderer.counters), batches)

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from unirender.exr import exr_bytes, image_channels, intrinsics_channels
+from unirender.errors import UnirenderError
+from unirender.exr import HALF_MAX, exr_bytes, image_channels, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender_reference.dataset_config import GRID, MOST_SPP, DatasetConfig
 from unirender_reference.lights import Light
@@ -186,7 +187,17 @@ class GroupMembers:
         self._encode(name, kind, mean, own)
 
     def _encode(self, name: str, kind: str, mean: Float[np.ndarray, "h w c"], attributes: Attributes) -> None:
-        """Adds a buffer as a member: an image as it is, s and d where the object is."""
+        """Adds a buffer as a member: an image as it is, s and d where the object is.
+
+        Raises:
+            UnirenderError: it has a value that files of half precision do not hold.
+        """
+        if (peak := float(mean.max())) > HALF_MAX:
+            scene = f"{self.renderer.obj.name} under the light {attributes['light']}"
+            raise UnirenderError(
+                f"dataset: {name} of {scene} reaches {peak:.3g}, half precision ends at {HALF_MAX:g}; give fewer rows "
+                "as --light-height, which spreads a sun over more of the sky, or take the file out of --lights"
+            )
         own = dict(attributes)
         if self.config.denoise:
             from unirender_reference.denoise import denoise, marking

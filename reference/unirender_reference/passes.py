@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -244,6 +245,8 @@ def pass_count(spp: int, batches: int, most: int) -> int:
         UnirenderError: fewer samples than batches, or more than `MOST_SPLITS` times as many passes as `batches` and
             `most` ask for (67 samples in one batch are 67 passes of one sample).
     """
+    if not isinstance(spp, Integral):
+        raise UnirenderError(f"spp: got {spp!r:.60}, expected a whole number of samples, at least 1")
     if spp < 1 or batches < 1 or batches > spp:
         raise UnirenderError(f"spp: got {spp} in {batches} batches, expected at least one sample in each")
     if (count := _grid_passes(spp, batches, most)) is not None:

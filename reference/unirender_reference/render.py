@@ -9,6 +9,8 @@ variance: `passes`. What belongs to the surface (base colour, normal, ...): `geo
 
 import functools
 from collections.abc import Mapping, Sequence
+from numbers import Integral
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +18,11 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import as_light
 from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
 from unirender_reference.geometry import geometry_buffers
+from unirender_reference.materials import Surface
 from unirender_reference.passes import (
     TRUTH_BATCHES,
     Counters,
@@ -65,8 +69,8 @@ class Renderer:
     """
 
     def __init__(self, obj: MeshObject, camera: Camera | None = None, resolution: int = 64) -> None:
-        if resolution < 1:
-            raise UnirenderError(f"resolution: got {resolution}, expected at least 1 pixel")
+        if not isinstance(resolution, Integral) or resolution < 1:
+            raise UnirenderError(f"resolution: got {resolution!r:.60}, expected a whole number of pixels, at least 1")
         self.obj = obj
         self.camera = camera or Camera()
         self.resolution = resolution
@@ -95,6 +99,10 @@ class Renderer:
         """The coverage that the gauge uses: always the same samples, traced once."""
         return self._exposure_mask
 
+    def lit(self, surface: Surface, values: Mapping[str, float | None], environment: Float[np.ndarray, "h w 3"]) -> Any:
+        """The Mitsuba scene with a surface and its material under a light; arguments as `EditableScene.show`."""
+        return self.scene.show(surface, values, as_light(environment))
+
     def image(
         self,
         environment: Float[np.ndarray, "h w 3"],
@@ -116,8 +124,11 @@ class Renderer:
             depth: 2 is direct light, 4 three bounces.
             batches: passes that the variance is taken from.
             pose: camera to world (`multiview`); None: the contract's camera.
+
+        Raises:
+            UnirenderError: an argument is of another type or out of range, or a pixel stays NaN.
         """
-        scene = self.scene.show("principled", {"roughness": roughness, "metallic": metallic}, environment)
+        scene = self.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
         sensor = None if pose is None else sensor_at(pose, self.camera, self.resolution, self.resolution)
         own = derive_seed(seed, "image")
         return mean_estimate(*render_passes(scene, depth, spp, own, batches, self.counters, sensor), batches)
@@ -141,7 +152,7 @@ class Renderer:
         self, environment: Float[np.ndarray, "h w 3"], spp: int, seed: int = 0, batches: int = TRUTH_BATCHES
     ) -> Estimate:
         """d: the white Lambertian surface, direct light, divided by coverage."""
-        scene = self.scene.show("white", {}, environment)
+        scene = self.lit("white", {}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "diffuse"), batches, self.counters)
         return ratio_estimate(*passes, batches)
 
@@ -154,7 +165,7 @@ class Renderer:
         batches: int = TRUTH_BATCHES,
     ) -> Estimate:
         """s: the mirror-tinted reflector of the same roughness (None: map), direct light, divided by coverage."""
-        scene = self.scene.show("mirror", {"roughness": roughness}, environment)
+        scene = self.lit("mirror", {"roughness": roughness}, environment)
         passes = render_passes(scene, DIRECT_DEPTH, spp, derive_seed(seed, "specular"), batches, self.counters)
         return ratio_estimate(*passes, batches)
 

@@ -7,16 +7,16 @@ the +z axis and looks along -z. An environment in camera axes is therefore Mitsu
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.color import luminance
 from unirender.errors import UnirenderError
-from unirender.intrinsics import as_radiance
-from unirender.lighting import texel_solid_angles
+from unirender.intrinsics import as_numbers, as_radiance
+from unirender.lighting import drawable
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.shapes import MeshObject
@@ -24,8 +24,7 @@ from unirender_reference.shapes import MeshObject
 LIGHT = "light"
 OBJECT = "object"
 NEAR_CLIP, FAR_CLIP = 0.01, 1e4  # the second is Mitsuba's own
-POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
-MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
+ROTATION_TOLERANCE = 1e-3  # of a pose
 MOST_RADIANCE = 1e12  # the sun's luminance is 1.6e9 cd/m^2; squares of far more leave the range of float32
 
 
@@ -53,14 +52,34 @@ def sensor_dict(camera: Camera, height: int, width: int) -> dict[str, Any]:
     }
 
 
+def check_pose(pose: Any, name: str = "pose") -> None:
+    """Looks at a pose that somebody handed in.
+
+    Raises:
+        UnirenderError: it is no (4, 4) matrix of a rotation and a position.
+    """
+    matrix = as_numbers(name, pose).astype(np.float64)
+    turn = matrix[:3, :3] if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((3, 3))
+    if np.abs(turn.T @ turn - np.eye(3)).max() >= ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+        raise UnirenderError(
+            f"{name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without scale or "
+            "mirroring"
+        )
+
+
 def sensor_at(pose: Float[np.ndarray, "4 4"], camera: Camera, height: int, width: int) -> dict[str, Any]:
-    """The contract's sensor, moved to a pose: (4, 4) camera to world."""
+    """The contract's sensor, moved to a pose: (4, 4) camera to world.
+
+    Raises:
+        UnirenderError: as `check_pose`.
+    """
+    check_pose(pose)
     mi = mitsuba()
     turned = np.array(pose, np.float64)
     turned[:3, [0, 2]] *= -1  # Mitsuba's camera looks along its +z, with +x to the left
     sensor = sensor_dict(camera, height, width)
     sensor.pop("far_clip", None)
-    return {**sensor, **clips(float(np.linalg.norm(pose[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
+    return {**sensor, **clips(float(np.linalg.norm(turned[:3, 3]))), "to_world": mi.ScalarTransform4f(turned)}
 
 
 def clips(distance: float) -> dict[str, float]:
@@ -104,7 +123,7 @@ def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
 
 
 def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
-    """The environment, checked, as Mitsuba can sample it: itself, or with a row between each two (`middle_rows`).
+    """The environment, checked, as Mitsuba can sample it: itself, or with a row between each two (`lighting.drawable`).
 
     Raises:
         UnirenderError: it is too small, black, negative, not finite or above `MOST_RADIANCE`.
@@ -121,33 +140,7 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
         )
     if environment.max() <= 0:
         raise UnirenderError("environment: all texels are black, expected some light")
-    return middle_rows(environment) if has_bright_pole(environment) else environment
-
-
-def has_bright_pole(environment: Float[np.ndarray, "h w 3"]) -> bool:
-    """Whether Mitsuba would miss light of the first or the last row.
-
-    It draws directions by luminance times sin(theta) of the texels, which is 0 all over these rows: their light is met
-    where the rows beside them draw it. Where those are dark, most samples miss it and a few count for all. A sample
-    that meets a texel counts about as often too much as the texel is brighter than the one beside it (the contrast);
-    the texels' mean contrast, by their share of the light's power, is therefore the variance that they bring.
-    """
-    brightness = luminance(environment).astype(np.float64)
-    power = brightness * texel_solid_angles(*environment.shape[:2])
-    noise = 0.0
-    for pole, beside in ((0, 1), (-1, -2)):
-        least = np.maximum(brightness[beside], brightness[pole] / MOST_CONTRAST)
-        contrast = np.divide(brightness[pole], least, out=np.zeros_like(least), where=least > 0)
-        noise += float((power[pole] * contrast).sum() / power.sum())
-    return noise > POLE_NOISE
-
-
-def middle_rows(rows: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
-    """Bilinear radiance on a grid with a row between each two: the same light, whose poles have bright neighbours."""
-    finer = np.empty((2 * len(rows) - 1, *rows.shape[1:]), rows.dtype)
-    finer[::2] = rows
-    finer[1::2] = (rows[:-1] + rows[1:]) / 2
-    return finer
+    return drawable(environment)
 
 
 def object_scene(
@@ -253,8 +246,8 @@ class EditableScene:
                 raise UnirenderError(
                     f"{key}: got None, the object's own map, but {self._obj.name} has none; expected a value in [0, 1]"
                 )
-            if value is not None and not 0.0 <= value <= 1.0:
-                raise UnirenderError(f"{key}: got {value}, expected a value in [0, 1]")
+            if value is not None and not (isinstance(value, Real) and 0.0 <= value <= 1.0):
+                raise UnirenderError(f"{key}: got {value!r:.60}, expected a value in [0, 1]")
         mapped = frozenset(key for key, value in values.items() if value is None)
         found = self._surfaces.get((surface, mapped))
         if found is None:

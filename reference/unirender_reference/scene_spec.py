@@ -39,6 +39,8 @@ class SceneSpec:
             if not isinstance(value := getattr(self, name), kind):
                 expected = getattr(kind, "__name__", "a number, or None for the object's own map")
                 raise UnirenderError(f"scene: got {name} {value!r:.60}, expected {expected}")
+        if self.exposure_seed < 0:
+            raise UnirenderError(f"scene: got exposure_seed {self.exposure_seed}, expected a seed of at least 0")
 
 
 @dataclass(frozen=True)

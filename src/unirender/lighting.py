@@ -12,11 +12,13 @@ receives from a map is in `unirender.surface_light`.
 """
 
 import functools
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_radiance, check_radiance
 
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
 
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
 LEAST_ROWS, LEAST_COLUMNS = 3, 2  # of a light to render by: Mitsuba resamples smaller ones
+UNIT_TOLERANCE = 0.05  # of squared lengths: 0.7 for half of the root of 2 is near enough
+POLE_NOISE = 3.0  # relative variance of a light sample up to which the poles of a light may stay as they are
+MOST_CONTRAST = 1e3  # that counts between a texel at a pole and the one beside it
 MOST_ALIASING = 0.005  # share of a texel's energy, away from the poles, that may come of how two grids lie together
 
 
@@ -56,7 +61,7 @@ def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"
 
 def texel_solid_angles(height: int, width: int) -> Float[np.ndarray, "h w"]:
     """Integral of each texel's bilinear weight over the sphere, in steradians; they sum to 4 pi."""
-    _check_shape((height, width))
+    check_shape((height, width))
     step = np.pi / (height - 1)
     rows = np.sin(np.pi * np.arange(height) / (height - 1)) * 2 * (1 - np.cos(step)) / step
     rows[0] = rows[-1] = 1 - np.sin(step) / step
@@ -66,10 +71,19 @@ def texel_solid_angles(height: int, width: int) -> Float[np.ndarray, "h w"]:
 def sample_environment(
     environment: Float[np.ndarray, "h w 3"], directions: Float[np.ndarray, "*n 3"]
 ) -> Float[np.ndarray, "*n 3"]:
-    """Bilinear radiance in the given unit directions, as Mitsuba interpolates it."""
-    check_radiance("environment", environment)
+    """Bilinear radiance in the given unit directions, as Mitsuba interpolates it.
+
+    Raises:
+        UnirenderError: the map has another shape, or a direction is not unit.
+    """
+    check_map(environment)
     height, width = environment.shape[:2]
-    _check_shape((height, width))
+    squared = np.einsum("...c,...c->...", directions, directions)
+    if not (np.abs(squared - 1) < UNIT_TOLERANCE).all():
+        raise UnirenderError(
+            f"directions: got lengths from {np.sqrt(squared.min()):.3g} to {np.sqrt(squared.max()):.3g}, expected unit "
+            "vectors; normalise them"
+        )
     row = np.arccos(np.clip(directions[..., 1], -1, 1)) * ((height - 1) / np.pi)
     column = np.arctan2(directions[..., 0], -directions[..., 2]) * (width / (2 * np.pi)) - 0.5
     row_0 = np.clip(np.floor(row).astype(np.int64), 0, height - 2)
@@ -84,11 +98,22 @@ def sample_environment(
 def rotate_environment(
     environment: Float[np.ndarray, "h w 3"], rotation: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The light turned by `rotation`: the new radiance from R x is the old one from x. Bilinear resampling."""
+    """The light turned by `rotation`: the new radiance from R x is the old one from x. Bilinear resampling.
+
+    Turns about +y keep the energy of every light. Others may lose or double what is smaller than a few texels.
+
+    Raises:
+        UnirenderError: the map has another shape, or the matrix is no rotation.
+    """
+    check_map(environment)
+    rotation = np.asarray(rotation, dtype=np.float32)
+    unmoved = rotation @ rotation.T if rotation.shape == (3, 3) else np.zeros((3, 3))
+    if not (np.abs(unmoved - np.eye(3)) < UNIT_TOLERANCE).all() or np.linalg.det(rotation) < 0:
+        raise UnirenderError(f"rotation: got {rotation.tolist()}, expected the 3 x 3 matrix of a rotation")
     directions = environment_directions(*environment.shape[:2])
     # At the pole of row 0 a direction has no azimuth: texels keep that of their column, as the last row's by rounding.
     directions[0] += np.float32(POLE_STEP) * directions[1] * np.array([1, 0, 1], dtype=np.float32)
-    return sample_environment(environment, directions @ np.asarray(rotation, dtype=np.float32))
+    return sample_environment(environment, directions @ rotation)
 
 
 def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.ndarray, "*n h w 3"]:
@@ -98,9 +123,40 @@ def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.n
 
 def mean_radiance(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 3"]:
     """Average over the sphere, by solid angle."""
-    check_radiance("environment", environment)
+    check_map(environment)
     weights = texel_solid_angles(*environment.shape[:2])
     return (np.einsum("hw,hwc->c", weights, environment, dtype=np.float64) / (4 * np.pi)).astype(np.float32)
+
+
+def drawable(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """The same light on a grid from which Mitsuba draws all of it: itself, or with a row between each two."""
+    return middle_rows(environment) if has_bright_pole(environment) else environment
+
+
+def has_bright_pole(environment: Float[np.ndarray, "h w 3"]) -> bool:
+    """Whether Mitsuba would miss light of the first or the last row.
+
+    It draws directions by luminance times sin(theta) of the texels, which is 0 all over these rows: their light is met
+    where the rows beside them draw it. Where those are dark, most samples miss it and a few count for all. A sample
+    that meets a texel counts about as often too much as the texel is brighter than the one beside it (the contrast);
+    the texels' mean contrast, by their share of the light's power, is therefore the variance that they bring.
+    """
+    brightness = luminance(environment).astype(np.float64)
+    power = brightness * texel_solid_angles(*environment.shape[:2])
+    noise, total = 0.0, max(float(power.sum()), 1e-300)
+    for pole, beside in ((0, 1), (-1, -2)):
+        least = np.maximum(brightness[beside], brightness[pole] / MOST_CONTRAST)
+        contrast = np.divide(brightness[pole], least, out=np.zeros_like(least), where=least > 0)
+        noise += float((power[pole] * contrast).sum()) / total
+    return noise > POLE_NOISE
+
+
+def middle_rows(rows: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
+    """Bilinear radiance on a grid with a row between each two: the same light, whose poles have bright neighbours."""
+    finer = np.empty((2 * len(rows) - 1, *rows.shape[1:]), rows.dtype)
+    finer[::2] = rows
+    finer[1::2] = (rows[:-1] + rows[1:]) / 2
+    return finer
 
 
 def resample_environment(
@@ -111,9 +167,10 @@ def resample_environment(
     Where it grows by a factor that is no whole number, texels of the old map would be met by more or fewer of the new
     one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
     """
-    check_radiance("environment", environment)
+    check_map(environment)
+    check_shape(shape)
     height, width = environment.shape[:2]
-    rows, columns = resampling_operators((height, width), shape)
+    rows, columns = resampling_operators((height, width), tuple(shape))
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
     new = (columns @ mixed.reshape(width, -1)).reshape(shape[1], shape[0], 3).transpose(1, 0, 2)
     return np.ascontiguousarray(new, dtype=np.float32)
@@ -129,8 +186,8 @@ def resampling_operators(source: tuple[int, int], target: tuple[int, int]) -> tu
     from scipy.sparse import csr_array
 
     (h, w), (h2, w2) = source, target
-    _check_shape(source)
-    _check_shape(target)
+    check_shape(source)
+    check_shape(target)
     if _is_integrated((h2 - 1) / (h - 1)):
         count = 64 * max(h, h2)
         theta = (np.arange(count) + 0.5) * np.pi / count  # midpoint rule over the polar angle
@@ -178,6 +235,25 @@ def weighted_means(weights: "csr_array", measure: Float[np.ndarray, " m"]) -> "c
     return csr_array(diags_array(1 / total) @ weights.T @ diags_array(measure))
 
 
-def _check_shape(shape: tuple[int, ...]) -> None:
-    if len(shape) != 2 or shape[0] < 2 or shape[1] < 2:
+def check_map(environment: Any) -> None:
+    """Looks at a lat-long map that somebody handed in.
+
+    Raises:
+        UnirenderError: it is one of whole numbers, or of a wrong shape.
+    """
+    check_radiance("environment", environment)
+    shape = np.shape(environment)
+    if len(shape) != 3 or shape[-1] != 3:
+        raise UnirenderError(f"environment: got shape {shape}, expected a lat-long map [height, width, 3]")
+    check_shape(shape[:2])
+
+
+def check_shape(shape: Any) -> None:
+    """Looks at the rows and columns of a map.
+
+    Raises:
+        UnirenderError: these are no two whole numbers of at least 2.
+    """
+    sides = shape if isinstance(shape, tuple | list) else ()
+    if len(sides) != 2 or not all(isinstance(side, Integral) and int(side) >= 2 for side in sides):
         raise UnirenderError(f"environment: got size {shape}, expected a lat-long map of at least 2 x 2 texels")

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from unirender.ggx import dot, facing_normal, halton, smith_g1, tangents, unit, visible_normals
-from unirender.intrinsics import check_radiance
-from unirender.lighting import environment_directions, resample_environment, texel_solid_angles
+from unirender.lighting import check_map, environment_directions, resample_environment, texel_solid_angles
 from unirender.subpixel import inside
 
 TAIL_SHAPE = (64, 128)  # texels over which the tails of sharp lobes are integrated
@@ -35,7 +34,7 @@ def texels(
     environment: Float[np.ndarray, "h w 3"], shape: tuple[int, int]
 ) -> tuple[Float[np.ndarray, "3 m"], Float[np.ndarray, "m 3"]]:
     """Directions, and radiance times solid angle, of a light brought to `shape`."""
-    check_radiance("environment", environment)
+    check_map(environment)
     if environment.shape[:2] != shape:
         environment = resample_environment(environment, shape)
     return texel_directions(shape), (environment * texel_solid_angles(*shape)[..., None]).reshape(-1, 3)

@@ -8,12 +8,15 @@ is wide. How the normal varies in there is taken from the pixels around it (`uni
 integrated is in `unirender.lobes`.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
+from unirender.errors import UnirenderError
 from unirender.ggx import facing_normal, halton, mirror_direction, unit
-from unirender.intrinsics import unit_normals
+from unirender.intrinsics import RANGE_TOLERANCE, as_numbers, unit_normals
 from unirender.lobes import TAIL_SHAPE, grid_lobes, sampled_cores, texels
 from unirender.subpixel import MEAN_WEIGHTS, MIRRORED, Surroundings, inside
 
@@ -58,13 +61,16 @@ def specular_light(
         environment: lat-long radiance, any resolution.
         camera: gives the view direction of each pixel; the contract's default if None.
         where: pixels to light, the others are 0; all if None.
+
+    Raises:
+        UnirenderError: roughness or environment are out of range or of another shape.
     """
     normal = unit_normals(normal)
     height, width = normal.shape[:2]
     view = (camera or Camera()).view_directions(height, width)
     there = np.any(normal != 0, axis=-1)
     lit = there if where is None else there & where
-    rough = np.broadcast_to(np.asarray(roughness, dtype=np.float32), (height, width, 1))[lit, 0]
+    rough = _checked_roughness(roughness, (height, width, 1))[lit, 0]
     surroundings = Surroundings(normal, there, lit)
     light = np.empty((len(rough), 3), dtype=np.float32)
     for part in surroundings.parts():
@@ -78,7 +84,7 @@ def specular_light(
 def lobe_light(
     n: Float[np.ndarray, "p 3"],
     v: Float[np.ndarray, "p 3"],
-    roughness: Float[np.ndarray, " p"],
+    roughness: Float[np.ndarray, " p"] | float,
     environment: Float[np.ndarray, "h w 3"],
 ) -> Float[np.ndarray, "p 3"]:
     """The light that GGX lobes of F = 1 reflect at points, for any normals and view directions.
@@ -86,11 +92,25 @@ def lobe_light(
     Args:
         n: unit normals; those that point away from the viewer are bent to graze the view ray.
         v: unit directions towards the viewer.
-        roughness: perceptual, [0, 1].
+        roughness: perceptual, [0, 1], of each point or one number.
         environment: lat-long radiance, any resolution.
+
+    Raises:
+        UnirenderError: as `specular_light`.
     """
+    roughness = _checked_roughness(roughness, (len(n),))
     around = np.repeat(np.concatenate([n.T, v.T])[..., None].astype(np.float32), 9, axis=-1)
     return _pixel_light(around, roughness, environment)
+
+
+def _checked_roughness(roughness: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    rough = as_numbers("roughness", roughness)
+    rough = rough.reshape(()) if rough.size == 1 else rough
+    if rough.ndim and rough.shape != shape:
+        raise UnirenderError(f"roughness: got shape {rough.shape}, expected one number or {shape}")
+    if not ((rough >= -RANGE_TOLERANCE) & (rough <= 1 + RANGE_TOLERANCE)).all():
+        raise UnirenderError(f"roughness: got values in [{rough.min():.4g}, {rough.max():.4g}], expected [0, 1]")
+    return np.broadcast_to(rough, shape)
 
 
 def _pixel_light(

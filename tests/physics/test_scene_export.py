@@ -83,6 +83,15 @@ def test_a_wrong_scene_would_not_pass(truth: np.ndarray, tmp_path: Path, fault: 
     assert relative(image[..., :3], truth, maps["mask"][..., 0] > 0) > 2 * WITHIN
 
 
+def test_a_bright_pole_lights_the_scene(tmp_path: Path) -> None:
+    """Most samples missed it: pixels were off by 80 % in the mean."""
+    light = np.full((128, 256, 3), 0.05, np.float32)
+    light[0] = 2000
+    maps = ball().replace(environment=light)
+    image, covered = rendered(maps, tmp_path / "scene")[..., :3], maps.require("mask")["mask"][..., 0] > 0
+    assert relative(image, shade(maps, spp=1024), covered) < WITHIN
+
+
 def test_a_card_beyond_mitsubas_far_clip_is_seen(tmp_path: Path) -> None:
     maps = ball().replace(camera=Camera(0.01))
     assert rendered(maps, tmp_path / "far")[..., 3].mean() > 0.4

@@ -198,6 +198,20 @@ class BlackBall(Renderer):
         return dataclasses.replace(found, mean=0 * found.mean)
 
 
+def test_a_sun_too_bright_for_half_precision_is_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A mirror under a sun of one texel shows that in pictures of 256 pixels; the message named no light."""
+
+    def dazzled(*_: Any, **__: Any) -> Estimate:
+        return Estimate(np.full((SIZE, SIZE, 3), 1e5, np.float32), None)
+
+    monkeypatch.setattr(Renderer, "specular", dazzled)
+    said = r"specular of train-\d+ under the light \S*mine\d\S* reaches 1e\+05, .*; give fewer rows as --light-height"
+    with pytest.raises(UnirenderError, match=said):
+        made(tmp_path / "out", folder, light_share=1.0)
+
+
 def test_an_object_that_an_even_light_does_not_reach_is_to_blame() -> None:
     ball = scenes.sphere(subdivisions=2)
     assert scene_exposure(Renderer(ball, resolution=SIZE), scenes.environment(), 0) > 0

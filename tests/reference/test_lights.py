@@ -3,6 +3,7 @@
 import re
 import struct
 import tracemalloc
+from functools import partial
 
 import numpy as np
 import OpenEXR
@@ -12,7 +13,7 @@ from PIL import Image
 from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import environment_directions, mean_radiance, sample_environment, texel_solid_angles
+from unirender.lighting import as_light, environment_directions, mean_radiance, sample_environment, texel_solid_angles
 from unirender_reference import lights
 from unirender_reference.lights import files
 from unirender_reference.lights.convert import PACKAGES, convert
@@ -119,6 +120,27 @@ def test_area_resampling_keeps_energy_and_directions():
     for shape in ((128, 256), (32, 64)):
         found = sample_environment(area_resampled(smooth.astype(np.float32), shape), np.eye(3, dtype=np.float32)[:2])
         assert found[:, :2] == pytest.approx(np.array([[1.5, 1.0], [1.0, 1.5]]), abs=0.01)
+
+
+def test_the_smallest_map_can_be_rendered_by(tmp_path):
+    """A map of 2 x 4 pixels was brought to two rows, and every renderer refused it."""
+    pixels = np.zeros((2, 4, 3), np.float32)
+    pixels[0] = 8  # light from above
+    write_exr(tmp_path / "a.exr", image_channels(pixels), half=False)
+    environment = lights.load_light(tmp_path / "a.exr", normalise=False).environment
+    assert as_light(environment).shape == (3, 4, 3)
+    assert mean_radiance(environment) == pytest.approx([4, 4, 4], rel=0.01)
+    assert (environment[0] > environment[1]).all()
+    assert (environment[1] > environment[2]).all()
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (1, 4)])
+def test_a_shape_that_is_none_is_refused(tmp_path, shape):
+    """Of no rows or of one, memory was written beside the arrays, and the process died."""
+    write_exr(tmp_path / "a.exr", image_channels(np.ones((8, 16, 3), np.float32)), half=False)
+    for made in (lights.load_light, partial(lights.load_light, photograph=True)):
+        with pytest.raises(UnirenderError, match="expected a lat-long map of at least 2 x 2 texels"):
+            made(tmp_path / "a.exr", shape=shape)
 
 
 def test_exr_and_rgbe_maps_agree(tmp_path):

@@ -238,7 +238,8 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
     "words": ("OFF", "", " a b c", np.full(3, 0.5), "colours"),
     "words of vertices": ("COFF", " a b c", "", np.full(3, 0.5), "colours"),
-    "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", np.full(3, 0.5), "colours"),
+    "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", PURPLE, ""),
+    "before coordinates": ("STCOFF", " 128 64 255 0.5 0.5", "", PURPLE, ""),
 }
 
 
@@ -263,6 +264,13 @@ def test_each_face_of_an_off_file_has_its_color(tmp_path):
     assert found == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
     (tmp_path / "b.off").write_text("\n".join(["OFF", "4 1 0", *CORNER_LINES, "4 0 1 2 3 255 0 0"]))
     assert load_mesh(tmp_path / "b.off").provenance["ignored"] == "colours"
+
+
+def test_normals_of_an_off_file(tmp_path):
+    """They were left out, and nothing said so."""
+    lines = ["NOFF", "4 2 0", *(line + " 0.6 0 0.8" for line in CORNER_LINES), "3 0 1 2", "3 0 2 3"]
+    (tmp_path / "a.off").write_text("\n".join(lines))
+    np.testing.assert_allclose(load_mesh(tmp_path / "a.off").normals, [[0.6, 0, 0.8]] * 4, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), "rgb"])

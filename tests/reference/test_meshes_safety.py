@@ -373,6 +373,9 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
         ("a.ply", PLY + b"element vertex 4000000000\nproperty float x\nend_header\n", "claims 4,000,000,000"),
         ("a.ply", PLY + b"element vertex 400000\nproperty float x\nend_header\n", "truncated: claims 400,000"),
         ("a.off", b"OFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
+        ("a.off", b"# made by hand\nNCOFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
+        ("a.off", b"4OFF\n3 1 0\n", "starts with '4OFF', expected OFF"),
+        ("a.off", b"off\n3 1 0\n", "expected OFF"),
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),
         ("a.ply", PLY + b"comment TextureFile ../a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "'../a.png' lies outside"),
         ("a.ply", PLY + b"comment\n" * 9000 + PLY_TRIANGLE + b"3 0 1 2\n", "header does not end within 65,536 bytes"),
@@ -382,6 +385,20 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
 def test_other_formats(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     assert re.search(message, reason(tmp_path / name))
+
+
+@pytest.mark.parametrize("lost", ["100 lines", "half of the last line"])
+@pytest.mark.parametrize("kind", ["off", "ply", "stl"])
+def test_a_text_that_is_cut_off(tmp_path, kind, lost):
+    """The faces that were left were read as the whole mesh; of an STL, as a point cloud."""
+    mesh = trimesh.creation.icosphere(1)
+    formats = {"ply": {"encoding": "ascii"}, "stl": {"file_type": "stl_ascii"}}
+    mesh.export(path := tmp_path / f"ball.{kind}", **formats.get(kind, {}))
+    assert len(load_mesh(path).faces) == 80
+    lines = path.read_text().split("\n")
+    last = " ".join(lines[-1 if lines[-1] else -2].split()[:-1])
+    path.write_text("\n".join(lines[:-52] if lost == "100 lines" else [*lines[: -1 if lines[-1] else -2], last]))
+    assert "truncated" in reason(path)
 
 
 def test_truncated_stl(tmp_path):

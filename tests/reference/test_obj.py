@@ -62,6 +62,22 @@ def test_pbr_keywords(tmp_path):
     assert obj.normal_map[1:-1, 1:-1] == pytest.approx(tilt, abs=1e-5)
 
 
+def test_normals_of_a_map_that_point_into_the_surface_count_as_flat(tmp_path):
+    """Under an even light such a surface reflected twice the light that there is."""
+    pixels = np.full((4, 4, 3), (128, 128, 255), np.uint8)
+    pixels[:, 2:] = 0  # black around a chart
+    pixels[0, 0] = 255, 128, 127  # along the surface, rounded
+    (tmp_path / "bumps.png").write_bytes(png(pixels))
+    obj = write(tmp_path, "norm bumps.png")
+    assert obj.provenance["ignored"] == "normals into the surface"
+    assert obj.normal_map is not None
+    assert obj.normal_map[..., 2].min() == pytest.approx(-1 / 255, abs=1e-3)
+    assert (obj.normal_map[..., 2] > 0.99).mean() > 0.8
+    pixels[:, 2:] = 128, 128, 255
+    (tmp_path / "bumps.png").write_bytes(png(pixels))
+    assert write(tmp_path, "norm bumps.png").provenance["ignored"] == ""
+
+
 def test_pbr_values_and_their_defaults(tmp_path):
     obj = write(tmp_path, "Kd 1 1 1\nPr 0.25")
     assert obj.roughness == pytest.approx(np.full((2, 2), 0.25))
@@ -200,14 +216,15 @@ def test_faces_smooth_across_what_some_of_them_lack(tmp_path, lacking):
     assert normals(True) == pytest.approx(normals(False), abs=1e-5)
 
 
-@pytest.mark.parametrize("written", ["\r", "\r\n", "tab", "bom"])
+@pytest.mark.parametrize("written", ["\r", "\r\n", "\r and others", "tab", "bom"])
 def test_line_ends_tabs_and_a_byte_order_mark(tmp_path, written):
     """Keywords behind a byte order mark or before a tab were passed over, and files with CR alone were one line."""
 
     def spelled(text: str) -> bytes:
         if written == "tab":
             text = "".join(line.replace(" ", "\t", 1) for line in text.splitlines(keepends=True))
-        text = text.replace("\n", written) if written[0] == "\r" else text
+        ends = {"\r": ["\r"], "\r\n": ["\r\n"], "\r and others": ["\r", "\r\n", "\n"]}.get(written, ["\n"])
+        text = "".join(line + ends[i % len(ends)] for i, line in enumerate(text.splitlines()))
         return (codecs.BOM_UTF8 if written == "bom" else b"") + text.encode()
 
     (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))

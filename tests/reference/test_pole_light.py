@@ -5,11 +5,11 @@ import pytest
 import reference_scenes as scenes
 import torch
 
-from unirender.lighting import environment_directions, sample_environment, texel_solid_angles
+from unirender.lighting import environment_directions, has_bright_pole, sample_environment, texel_solid_angles
 from unirender_reference import principled
 from unirender_reference.lights import bundled_lights, make_light
 from unirender_reference.render import Renderer
-from unirender_reference.scene import envmap_data, envmap_rows, has_bright_pole
+from unirender_reference.scene import envmap_data, envmap_rows
 from unirender_reference.shade import shade, shade_gradients
 
 SIZE, SPP = 24, 1024

@@ -13,6 +13,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference import backend, materials, passes, scene
 from unirender_reference.adaptive import render_sample_to_floor
+from unirender_reference.lights import Light
 from unirender_reference.render import (
     DIRECT_DEPTH,
     IMAGE_DEPTH,
@@ -321,8 +322,15 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         lambda r: r.diffuse(0 * scenes.environment(), 8),
         lambda r: r.diffuse(np.full((4, 8, 3), np.inf, np.float32), 8),
         lambda r: Renderer(r.obj, resolution=0),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.diag([2.0, 2, 2, 1])),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.diag([-1.0, 1, 1, 1])),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.full((4, 4), np.nan)),
+        lambda r: SceneSpec(r.obj, Light("a", scenes.environment()), 0.5, 0.5, exposure_seed=-1),
     ],
-    ids=["roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"],
+    ids=[
+        *("roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"),
+        *("scaled pose", "mirroring pose", "nan pose", "exposure seed"),
+    ],
 )
 def test_bad_arguments_are_refused(renderer: Renderer, call: object) -> None:
     with pytest.raises(UnirenderError, match="expected"):

@@ -104,3 +104,13 @@ def test_a_turn_by_nothing_or_by_whole_columns_moves_no_texel() -> None:
     about_y = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     # What came from +z, the middle, comes from +x: u = 1/4, to the left.
     np.testing.assert_allclose(rotate_environment(light, about_y), np.roll(light, -3, axis=1), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("texel", [(0, 3), (1, 0), (7, 31), (15, 9)])
+def test_a_turn_about_the_vertical_keeps_the_energy_of_a_lamp(texel: tuple[int, int]) -> None:
+    lamp = np.zeros((16, 32, 3), np.float32)
+    lamp[texel] = 1000
+    for turn_deg in (1.0, 11.25, 33.0, -123.4):
+        c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+        turned = rotate_environment(lamp, np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
+        np.testing.assert_allclose(mean_radiance(turned), mean_radiance(lamp), rtol=1e-4)

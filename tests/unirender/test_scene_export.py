@@ -116,6 +116,16 @@ def test_the_light_is_stored_as_it_is(intrinsics: Intrinsics, tmp_path: Path) ->
     assert (meta["fov_deg"], meta["width"], meta["distance"]) == (40.0, 16, Camera(40.0).distance())
 
 
+def test_a_light_is_finer_only_where_mitsuba_would_miss_its_pole(intrinsics: Intrinsics, tmp_path: Path) -> None:
+    light = np.full((128, 256, 3), 0.05, np.float32)
+    light[-1] = 2000
+    for number, (given, rows) in enumerate(((light, 255), (light[::-1], 255), (light[:-1], 127), (0 * light, 128))):
+        export_scene(tmp_path / str(number), intrinsics.replace(environment=given))
+        stored = channels_rgb(read_exr(tmp_path / str(number) / "environment.exr")[0])
+        assert len(stored) == rows
+        np.testing.assert_array_equal(stored[:: 2 if rows > len(given) else 1], given)
+
+
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(intrinsics: Intrinsics, tmp_path: Path) -> None:
     normal = intrinsics.require("normal")["normal"]
     several: dict[str, Any] = {name: value[None] for name, value in intrinsics.maps.items()}

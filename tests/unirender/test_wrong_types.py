@@ -10,17 +10,19 @@ import sys
 import pytest
 
 SCRIPT = """
+from dataclasses import replace
 import numpy as np
 import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from PIL import Image
-from unirender.lighting import rotate_environment
+from unirender.lighting import resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.surface_light import diffuse_light
-from unirender_reference.lights import make_light
-from unirender_reference.render import SceneSpec
+from unirender.surface_light import diffuse_light, specular_light
+from unirender_reference.lights import Light, make_light
+from unirender_reference.optimize.views import View
+from unirender_reference.render import Renderer, SceneSpec
 from unirender_reference.shade import shade, shade_gradients
 from unirender_reference.shapes import make_object
 
@@ -31,6 +33,8 @@ mask[4:-4, 4:-4] = 1
 image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
+renderer = Renderer(make_object(1, 'train'), resolution=8)
+renderer.image(light, 0.5, 0.5, 16)
 maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
 photograph = Image.fromarray(bytes_8)
 for case in %r:
@@ -61,7 +65,28 @@ CASES = {
     "Intrinsics(environment=bytes_8.tolist())": "environment: got list of int64 values, expected linear radiance as",
     "Intrinsics(diffuse=bytes_8)": "diffuse: got ndarray of uint8 values, expected linear radiance as floats; read a",
     "diffuse_light(maps.normal, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "diffuse_light(maps.normal, np.ones((16, 32, 4)))": "environment: got shape (16, 32, 4), expected a lat-long map",
+    "specular_light(maps.normal, 2.0, light)": "roughness: got values in [2, 2], expected [0, 1]",
+    "specular_light(maps.normal, maps.roughness[..., 0], light)": "roughness: got shape (16, 24), expected one number",
+    "rotate_environment(light, 2 * np.eye(3))": "rotation: got [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]],",
+    "rotate_environment(light, np.eye(4))": "rotation: got [[1.0, 0.0, 0.0, 0.0], ",
+    "sample_environment(light, 2 * maps.normal)": "directions: got lengths from 0 to 2, expected unit vectors",
     "rotate_environment(bytes_8, np.eye(3))": "environment: got ndarray of uint8 values, expected linear radiance as",
+    "renderer.image(None, 0.5, 0.5, 16)": "environment: got shape (), expected a lat-long map",
+    "renderer.diffuse(bytes_8, 16)": "environment: got ndarray of uint8 values, expected linear radiance as floats",
+    "renderer.specular(light, '0.5', 16)": "roughness: got '0.5', expected a value in [0, 1]",
+    "renderer.image(light, 0.5, 0.5, 64.0)": "spp: got 64.0, expected a whole number of samples",
+    "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
+    "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
+    "Renderer(make_object(1, 'train'), resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
+    "make_light('a', 'train')": "make_light: got seed 'a', split 'train'; expected seed >= 0",
+    "Light('a', light.tolist())": "light: got name 'a' and an environment of type list, expected a text and a",
+    "replace(renderer.obj, albedo=0.5)": "train-000001: got albedo 0.5, expected a numpy array",
+    "replace(renderer.obj, normals=None)": "train-000001: got normals None, expected a numpy array",
+    "renderer.obj.turned(np.eye(4))": "train-000001: got [[1.0, 0.0, 0.0, 0.0], ",
+    "View(image, mask, 36, np.eye(4))": "view: got camera 36, expected a unirender.camera.Camera",
+    "View([1], mask, Camera(), np.eye(4))": "view: got image (1,), mask (16, 24, 1); expected (h, w, 3) and (h, w, 1)",
+    "resample_environment(light, 16)": "environment: got size 16, expected a lat-long map of at least 2 x 2 texels",
     "shade(maps, photograph)": "environment: got Image of uint8 values, expected linear radiance as floats; read a",
     "shade_gradients(maps, image, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "shade(maps, light[:2])": "environment: got shape (2, 32, 3), expected a lat-long map [height, width, 3]",

@@ -1,6 +1,7 @@
 """`make_light`: light number `seed` of a split."""
 
 import re
+from numbers import Integral
 
 import numpy as np
 
@@ -33,8 +34,8 @@ def make_light(seed: int, split: Split, pool: LightPool | None = None) -> Light:
     Raises:
         UnirenderError: unknown split, negative seed, a pool of the other split, or one without readable files.
     """
-    if split not in SPLIT or seed < 0:
-        raise UnirenderError(f"make_light: got seed {seed}, split {split!r}; expected seed >= 0, 'train' or 'test'")
+    if split not in SPLIT or not isinstance(seed, Integral) or seed < 0:
+        raise UnirenderError(f"make_light: got seed {seed!r}, split {split!r}; expected seed >= 0, 'train' or 'test'")
     if pool is not None and pool.split != split:
         raise UnirenderError(f"make_light: got a {pool.split} pool for split {split!r}, expected one of the same split")
     rng = np.random.default_rng([SPLIT[split], seed])

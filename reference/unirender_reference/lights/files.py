@@ -29,7 +29,7 @@ from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, read_exr
-from unirender.lighting import resample_environment
+from unirender.lighting import LEAST_ROWS, check_shape, resample_environment
 from unirender.pictures import check_finite, negative_share
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
@@ -57,7 +57,7 @@ def load_light(
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
             None: by suffix (HDR formats are lat-long, others are photographs).
         shape: rows and columns of the result; None: the file's own for lat-long maps (bit for bit where it is on the
-            contract's grid), 128 x 256 for photographs.
+            contract's grid; of a map of 2 x 4 pixels 3 rows, which rendering needs), 128 x 256 for photographs.
         normalise: scale to mean luminance 1; False keeps the radiance of the file (of a photograph: white is `PEAK`).
 
     Returns:
@@ -66,11 +66,14 @@ def load_light(
         total is in the provenance.
 
     Raises:
-        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map.
+        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map; or
+            the shape is none of a map.
     """
     path = Path(path)
     if not path.is_file():
         raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
+    if shape is not None:
+        check_shape(shape)
     hdr = path.suffix.lower() in HDR_SUFFIXES
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     check_finite(pixels, f"light {path}")
@@ -90,7 +93,7 @@ def load_light(
             provenance["rule"] = "lat-long on the contract's grid"
             environment = pixels if shape in (None, (h, w)) else resample_environment(pixels, shape)
         else:
-            environment = area_resampled(pixels, shape or (h, w))
+            environment = area_resampled(pixels, shape or (max(h, LEAST_ROWS), w))
     if negative := negative_share(environment, f"light {path}"):
         provenance["negative_share"] = f"{negative:.2e}"
     environment = np.maximum(environment, 0)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from unirender.color import luminance
 from unirender.errors import UnirenderError
-from unirender.lighting import hat_weights, mean_radiance, weighted_means
+from unirender.lighting import check_shape, hat_weights, mean_radiance, weighted_means
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -38,6 +38,11 @@ class Light:
 
     def __post_init__(self) -> None:
         e = self.environment
+        if not isinstance(self.name, str) or not isinstance(e, np.ndarray):
+            raise UnirenderError(
+                f"light: got name {self.name!r:.40} and an environment of type {type(e).__name__}, expected a text and "
+                "a numpy array"
+            )
         if e.ndim != 3 or e.shape[2] != 3 or e.dtype != np.float32 or not np.isfinite(e).all() or e.min() < 0:
             raise UnirenderError(
                 f"light {self.name}: environment must be finite float32 (h, w, 3) >= 0, got {e.dtype} {e.shape}"
@@ -67,7 +72,11 @@ def area_resampled(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -
     """A lat-long picture (pixels are areas: rows end at the poles) on the grid of `Light`, energy kept.
 
     Each texel is the mean of the picture under the texel's bilinear weight, so the total over the sphere stays.
+
+    Raises:
+        UnirenderError: the shape is none of a map.
     """
+    check_shape(shape)
     (h, w), (h2, w2) = pixels.shape[:2], shape
     fine = max(1, -(-4 * h2 // h))
     theta = (np.arange(h * fine) + 0.5) * np.pi / (h * fine)

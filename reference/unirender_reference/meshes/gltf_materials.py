@@ -16,7 +16,7 @@ from unirender_reference.meshes.gloss import metallic_roughness
 from unirender_reference.meshes.gltf_document import Document
 from unirender_reference.meshes.images import Decode, ImageBudget, linear, nearest, texels_of
 from unirender_reference.meshes.limits import check_materials, texture_side
-from unirender_reference.meshes.surface import BARE, IDENTITY, Channel, Material, Texture, Wrap, unit_vectors
+from unirender_reference.meshes.surface import BARE, IDENTITY, Channel, Material, Texture, Wrap, tangent_normals
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 IMAGE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")
@@ -92,7 +92,9 @@ class Materials:
             info = material["normalTexture"]
             scale = _scalar(info, "scale", 1.0)
             texture = self._texture(info, "RGB", linear)
-            channels["normal"] = replace(texture, texels=unit_vectors(2 * texture.texels - 1, scale))
+            texels, buried = tangent_normals(texture.texels, scale)
+            channels["normal"] = replace(texture, texels=texels)
+            self.ignored |= buried
         return channels
 
     def _metallic_roughness(self, pbr: dict[str, Any]) -> dict[str, Channel]:

@@ -16,7 +16,7 @@ from unirender.errors import UnirenderError
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.images import Decode, ImageBudget, linear, texels_of
 from unirender_reference.meshes.limits import check_materials, texture_side
-from unirender_reference.meshes.surface import Channel, Material, Texture, unit_vectors
+from unirender_reference.meshes.surface import Channel, Material, Texture, tangent_normals
 
 DEFAULT_ALBEDO = 0.5
 DEFAULT_ROUGHNESS, DEFAULT_METALLIC = 0.5, 0.0  # beside materials that have them
@@ -133,7 +133,7 @@ class MtlMaterials:
             return self._folder.read(file, "texture")
         except UnirenderError as error:
             option, *more = file.split()
-            if not option.startswith("-") or not more:
+            if not re.match("-[a-zA-Z]", option) or not more:
                 raise
             raise UnirenderError(
                 f"texture {file[:80]!r}: got the option {option!r}, which is not known here, expected one of "
@@ -149,7 +149,8 @@ class MtlMaterials:
             self._texels[file, curve] = texels_of(image, repr(file), self._side, "RGB", curve)
         texels = self._texels[file, curve]
         if channel == "normal":
-            texels = unit_vectors(2 * texels - 1, _number(options.get("-bm"), 1.0))
+            texels, buried = tangent_normals(texels, _number(options.get("-bm"), 1.0))
+            self.ignored |= buried
         elif channel != "albedo":
             texels = texels[..., :1]
         # OBJ counts v from below: v_down = 1 - (s v_up + o), in terms of the 1 - v_up that the reader stores

@@ -6,6 +6,7 @@ ones (`normals`).
 
 import codecs
 import io
+import re
 from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -111,11 +112,11 @@ class _Lines:
 
 
 def _each_line(file: BinaryIO) -> Iterator[bytes]:
-    """Lines that end in LF, CR LF or, where the file has no LF, CR; one of too many bytes is cut off."""
+    """Lines that end in LF, CR LF or CR, also in turn; one of too many bytes is cut off."""
     head = file.read(MAX_LINE_BYTES)
     file.seek(len(codecs.BOM_UTF8) if head.startswith(codecs.BOM_UTF8) else 0)
-    if b"\r" in head and b"\n" not in head:
-        text = io.TextIOWrapper(file, "latin-1", newline="\r")
+    if re.search(rb"\r[^\n]", head):
+        text = io.TextIOWrapper(file, "latin-1", newline="")
         return (line.encode("latin-1") for line in iter(lambda: text.readline(MAX_LINE_BYTES + 1), ""))
     return iter(lambda: file.readline(MAX_LINE_BYTES + 1), b"")
 
@@ -167,7 +168,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
     materials = MtlMaterials(folder, entries, used)
     pieces = []
     made: dict[tuple[str | None, bool, bool], Material] = {}
-    ignored = set(materials.ignored)
+    ignored = set[str]()
     for number, group in zip(present // 8, np.split(order, starts[1:]), strict=True):
         name = names[number]
         faces = _looked_up(points_of[group], len(points), "vertex")
@@ -198,7 +199,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
         )
     if any(name is not None and name not in entries for name in used):
         ignored.add("undefined materials")
-    return Model(_smoothed(pieces, present // 8), frozenset(ignored))
+    return Model(_smoothed(pieces, present // 8), frozenset(ignored | materials.ignored))
 
 
 def _smoothed(pieces: list[Piece], owners: Int[np.ndarray, " k"]) -> list[Piece]:

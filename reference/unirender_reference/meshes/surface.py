@@ -37,6 +37,7 @@ class Texture:
         return replace(self, texels=self.texels * factor)
 
 
+BURIED = -0.1  # z of a normal that points into the surface, and not along it by rounding or resampling
 Channel = Texture | Float[np.ndarray, " c"]
 
 
@@ -81,6 +82,21 @@ class Model:
 
     pieces: list[Piece]
     ignored: frozenset[str]
+
+
+def tangent_normals(
+    texels: Float[np.ndarray, "h w 3"], scale: float
+) -> tuple[Float[np.ndarray, "h w 3"], frozenset[str]]:
+    """The vectors of a normal map's numbers in [0, 1], and what of them is left out.
+
+    A tangent-space normal points out of its surface (glTF 2.0, 3.9.3). Those that point into it (the black around
+    charts, object-space maps) count as flat: Mitsuba turns them round, and the surface then reflects light that it does
+    not receive.
+    """
+    vectors = unit_vectors(2 * texels - 1, scale)
+    buried = vectors[..., 2] < BURIED
+    vectors[buried] = [0, 0, 1]
+    return vectors, frozenset({"normals into the surface"} if buried.any() else ())
 
 
 def unit_vectors(vectors: Float[np.ndarray, "h w 3"], scale: float) -> Float[np.ndarray, "h w 3"]:

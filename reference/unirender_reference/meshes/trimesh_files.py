@@ -27,10 +27,12 @@ from unirender_reference.meshes.limits import (
     float32_step,
 )
 from unirender_reference.meshes.mtl import DEFAULT_ALBEDO
-from unirender_reference.meshes.off_colors import OffColors, read_off_colors
+from unirender_reference.meshes.off_lines import OffLines, read_off_lines
 from unirender_reference.meshes.surface import Channel, Material, Model, Piece, Texture
 
 PLY_ELEMENT = re.compile(rb"^element\s+(\w+)\s+(\d+)\s*$", re.MULTILINE)
+PLY_TEXT = re.compile(rb"^format\s+ascii", re.MULTILINE)
+FACES_LAST = re.compile(rb"^element\s+face\s+\d+\s+property\s+list[^\n]*\s*\Z", re.MULTILINE)
 DOUBLE = re.compile(rb"^format ascii|^property (double|float64) x", re.MULTILINE)
 PLY_COLOR = re.compile(rb"^(property\s+\w+\s+)((?:diffuse_)?(?:red|green|blue)|[rgb])(?=\s*$)", re.MULTILINE)
 PLY_COLORS = ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")
@@ -54,6 +56,8 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     with path.open("rb") as file:
         head = file.read(65536)
     _check_claims(path.suffix.lower(), head, length)
+    _check_end(path, head)
+    off = read_off_lines(path) if path.suffix.lower() == ".off" else OffLines()
     resolver = FolderResolver(folder)
     renamed = _with_usual_colors(path, head) if path.suffix.lower() == ".ply" else None
     if renamed is None:
@@ -63,7 +67,6 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     if resolver.error:
         raise resolver.error
     texture = _texture(folder, head)
-    off = read_off_colors(path) if path.suffix.lower() == ".off" else OffColors()
     pieces = []
     for mesh in scene.geometry.values():
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
@@ -72,7 +75,11 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
                 raise UnirenderError(f"its faces index outside the {len(mesh.vertices):,} vertices; export it again")
             step = 0.0 if DOUBLE.search(head) or path.suffix.lower() == ".off" else float32_step(mesh.vertices)
             piece = _piece(mesh, texture, step)
-            pieces.append(piece if not off.known else replace(piece, colors=off.corners(piece.faces), material=WHITE))
+            if off.normals is not None:
+                piece = replace(piece, normals=off.normals[piece.faces])
+            if off.colored:
+                piece = replace(piece, colors=off.corners(piece.faces), material=WHITE)
+            pieces.append(piece)
     return Model(pieces, frozenset({"colours"} if off.left_out else ()))
 
 
@@ -95,8 +102,8 @@ def _check_claims(suffix: str, head: bytes, length: int) -> None:
         if b"end_header" not in head:
             raise UnirenderError(f"truncated: its header does not end within {len(head):,} bytes; export it again")
         claims = {name.decode(): int(count) for name, count in PLY_ELEMENT.findall(head.partition(b"end_header")[0])}
-    elif suffix == ".off" and head[:3].upper() == b"OFF":
-        numbers = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", head[3:]))[:2]
+    elif suffix == ".off":
+        numbers = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", head).partition(b"OFF")[2])[:2]
         claims = dict(zip(("vertex", "face"), map(int, numbers), strict=False))
     elif suffix == ".stl" and not re.search(b"facet|endsolid", head[:1024]):
         count = int.from_bytes(head[80:84], "little")
@@ -110,6 +117,28 @@ def _check_claims(suffix: str, head: bytes, length: int) -> None:
             raise UnirenderError(f"claims {count:,} of element {name}, expected at most {limit:,}")
         if count > length:
             raise UnirenderError(f"truncated: claims {count:,} of element {name} in {length:,} bytes")
+
+
+def _check_end(path: Path, head: bytes) -> None:
+    """A text that is cut off: trimesh takes the faces of a PLY that are left, and of an STL none."""
+    if path.suffix.lower() == ".ply" and PLY_TEXT.search(head):
+        header, _, body = path.read_bytes().partition(b"end_header")
+        claimed = sum(int(count) for _, count in PLY_ELEMENT.findall(header))
+        lines = [line for line in body.splitlines() if line.strip()]
+        if len(lines) < claimed:
+            raise UnirenderError(
+                f"truncated: its header claims {claimed:,} lines, it has {len(lines):,}; copy it again"
+            )
+        last = lines[claimed - 1].split() if claimed and FACES_LAST.search(header) else [b"0", b""]
+        if len(last) <= int(last[0]):
+            raise UnirenderError(
+                f"truncated: its last face has {len(last) - 1} of {int(last[0])} corners; copy it again"
+            )
+    elif path.suffix.lower() == ".stl" and b"facet" in head and b"\0" not in head:
+        with path.open("rb") as file:
+            file.seek(-min(path.stat().st_size, 1024), io.SEEK_END)
+            if b"endsolid" not in file.read().lower():
+                raise UnirenderError("truncated: its last solid does not end, expected 'endsolid'; copy it again")
 
 
 def _texture(folder: ModelFolder, head: bytes) -> Texture | None:

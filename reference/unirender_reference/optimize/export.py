@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.exr import channels_rgb, image_channels, read_exr, write_environment, write_exr
-from unirender.lighting import sample_environment
+from unirender.lighting import drawable, sample_environment
 from unirender_reference.optimize.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject, Sphere
@@ -72,7 +72,7 @@ def _write_mitsuba(solution: Solution, folder: Path) -> None:
     for name, values in pictures.items():
         (folder / f"{name}.png").write_bytes(png_bytes(np.ascontiguousarray(values)))
     (folder / "mesh.ply").write_bytes(ply_bytes(obj))
-    write_environment(folder / ENVIRONMENT_FILE, solution.environment)
+    write_environment(folder / ENVIRONMENT_FILE, drawable(solution.environment))
     (folder / "scene.xml").write_text(_SCENE.format(**_scene_values(camera, "normal" in pictures)), encoding="utf-8")
 
 

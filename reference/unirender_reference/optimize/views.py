@@ -8,8 +8,9 @@ from jaxtyping import Bool, Float
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender.intrinsics import as_numbers
+from unirender_reference.scene import check_pose
 
-ROTATION_TOLERANCE = 1e-3
 RANGE_TOLERANCE = 1e-3
 SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
 BLACK = 0.5 / 255  # display values of 8 bits below are 0
@@ -38,10 +39,11 @@ class View:
     clipped: Bool[np.ndarray, "h w 3"] | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.camera, Camera):
+            raise UnirenderError(f"{self.name}: got camera {self.camera!r:.40}, expected a unirender.camera.Camera")
         for label in ("image", "mask", "pose"):
-            object.__setattr__(self, label, np.asarray(getattr(self, label), np.float32))
-        height, width = self.image.shape[:2]
-        if self.image.shape != (height, width, 3) or self.mask.shape != (height, width, 1):
+            object.__setattr__(self, label, as_numbers(f"{self.name}: {label}", getattr(self, label)))
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.mask.shape != (*self.image.shape[:2], 1):
             raise UnirenderError(
                 f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
             )
@@ -51,14 +53,7 @@ class View:
             raise UnirenderError(f"{self.name}: the image has negative, infinite or NaN values; expected values >= 0")
         if not (self.mask.min() >= 0 and self.mask.max() <= 1):
             raise UnirenderError(f"{self.name}: the mask leaves [0, 1]; expected coverage")
-        rotation = self.pose[:3, :3].astype(np.float64)
-        if self.pose.shape != (4, 4) or not (
-            np.abs(rotation.T @ rotation - np.eye(3)).max() < ROTATION_TOLERANCE and np.linalg.det(rotation) > 0
-        ):
-            raise UnirenderError(
-                f"{self.name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without "
-                "scale or mirroring"
-            )
+        check_pose(self.pose, self.name)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from unirender.errors import UnirenderError
 
 UNIT_TOLERANCE = 1e-3
+NEEDED = ("vertices", "faces", "normals", "albedo")
 RECONSTRUCTION = "reconstruction"  # the family of meshes made from pictures, in the world of their cameras
 RECONSTRUCTION_TOLERANCE = 0.3  # of their radius: the object's size was guessed from masks before its shape was known
 
@@ -52,6 +53,12 @@ class MeshObject:
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise UnirenderError(f"object name: got {self.name!r:.40}, expected a text")
+        for label in ("vertices", "faces", "normals", "uv", "albedo", "roughness", "metallic", "normal_map"):
+            array = getattr(self, label)
+            if not isinstance(array, np.ndarray) and (array is not None or label in NEEDED):
+                raise UnirenderError(f"{self.name}: got {label} {array!r:.40}, expected a numpy array")
         if "." in self.name or "/" in self.name:
             raise UnirenderError(f"object name: got {self.name!r}, expected no '.' and no '/'; rename the object")
         n = len(self.vertices)
@@ -114,8 +121,10 @@ class MeshObject:
         Args:
             rotation: p -> rotation @ p, of determinant 1.
         """
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
-            raise UnirenderError(f"{self.name}: got {rotation.tolist()}, expected the matrix of a rotation")
+        rotation = np.asarray(rotation)
+        unmoved = rotation @ rotation.T if rotation.shape == (3, 3) else np.zeros((3, 3))
+        if not np.allclose(unmoved, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise UnirenderError(f"{self.name}: got {rotation.tolist()}, expected the matrix of a rotation, 3 x 3")
 
         def turn(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
             return (vectors.astype(np.float64) @ rotation.T).astype(np.float32)

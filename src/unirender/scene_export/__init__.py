@@ -9,14 +9,15 @@
 | `metallic_roughness.png` | roughness in G, metallic in B, as glTF wants them |
 | `normal.png` | tangent-space normals (n + 1) / 2, green up |
 | `scene.xml` | the same card for Mitsuba 3, with `card.ply`, `roughness.png`, `metallic.png`, `opacity.png` |
-| `environment.exr` | the light on Mitsuba's lat-long grid, in the scene's axes: no rotation |
+| `environment.exr` | the light on Mitsuba's lat-long grid, in the scene's axes: no rotation; finer for a bright pole |
 | `latlong.exr` | the same light as most programs read a map: rows are areas between the poles |
 | `meta.json` | camera, size, distance and where the maps come from |
 
 Axes: those of the camera, moved to the middle of the object: +x right, +y up, +z towards the viewer. The camera stands
 on +z at `Camera.distance()`, where a unit sphere fills 0.9 of the frame's height, and the card is the plane z = 0. The
 middle of the light's map is +z. Light is in display units: a render at exposure 1 shows through sRGB what the picture
-showed.
+showed. Mitsuba draws directions by the texels times sin(theta) and would miss light of the first or the last row that
+has little beside it: such a light is written with a row between each two (`unirender.lighting.drawable`).
 
 What a card cannot show: it has one depth, so that nothing casts a shadow and the maps hold from the camera's place
 only; and normals that face away from the viewer are bent until they do not (a renderer would show them black or

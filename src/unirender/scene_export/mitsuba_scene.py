@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
 from unirender.files import write_png
-from unirender.lighting import sample_environment
+from unirender.lighting import drawable, sample_environment
 from unirender.scene_export.card import Card
 
 FAR_CLIP = 1e4  # Mitsuba's own
@@ -26,7 +26,7 @@ def write_mitsuba(card: Card, folder: Path) -> None:
     for name, values in (("roughness", card.roughness), ("metallic", card.metallic), ("opacity", card.opacity)):
         write_png(folder / f"{name}.png", values)
     (folder / "card.ply").write_bytes(ply_bytes(card))
-    write_environment(folder / "environment.exr", card.environment)
+    write_environment(folder / "environment.exr", drawable(card.environment))
     write_exr(folder / "latlong.exr", image_channels(latlong(card.environment)), half=False)
     (folder / "scene.xml").write_text(scene_xml(card), encoding="utf-8")
 

@@ -13,7 +13,7 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import environment_directions, sample_environment
+from unirender.lighting import environment_directions, middle_rows, sample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed
@@ -156,6 +156,14 @@ def test_mitsuba_renders_the_folder_like_our_scene(solution: Solution, tmp_path:
     difference = np.abs(images[0] - images[1])
     assert np.median(images[1][images[1][..., 3] > 0.5]) > 0.05
     assert np.quantile(difference, 0.99) < (0.02 if bumpy else 2e-3)
+
+
+def test_mitsuba_can_draw_a_light_at_the_pole(solution: Solution, tmp_path: Path):
+    light = np.full((16, 32, 3), 0.05, np.float32)
+    light[0] = 2000
+    write_solution(Solution(solution.obj, light), tmp_path)
+    np.testing.assert_array_equal(read_environment(tmp_path), light)
+    np.testing.assert_array_equal(read_environment(tmp_path / "mitsuba"), middle_rows(light))
 
 
 def test_what_lacks_a_texture_is_refused():
