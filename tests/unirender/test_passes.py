@@ -134,14 +134,24 @@ def test_parts_are_rows_of_the_batch_whoever_computes_them(size: int, parallel: 
 
 
 def test_the_cycle_has_its_share_of_the_batch_not_of_each_part(batch: dict[str, Tensor]) -> None:
-    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, cycle_share=0.25))
+    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, cycle_share=0.5), p_render=0.25)
     gradient = gradient_of(config, parallel=BATCH)
     parts = gradient.parts(batch)
     inverse = [part for part in parts if part.mass["environment"]]
     rendered_again = [part for part in parts if "cycle" in gradient.terms(part, batch)]
-    assert len(inverse) > 2
-    assert len(rendered_again) == round(0.25 * len(inverse)) > 0  # of a single row a quarter is none
+    assert (len(inverse), len(rendered_again)) == (6, 3)  # of a single row one half is none
     assert all(part.mass["cycle"] for part in rendered_again)
+
+
+@pytest.mark.parametrize("size", [1, 4], ids=["one picture", "as in the paper"])
+def test_the_cycle_has_its_share_of_a_small_batch_in_the_mean(size: int) -> None:
+    """Of two inverse rows a quarter is half a row, which rounded is none: never rendered again."""
+    batch = make_batch(size)
+    gradient = gradient_of(dataclasses.replace(CONFIG, loss=LossConfig(), batch_size=size, p_render=0.5))
+    drawn = [gradient.parts(batch)[0] for _ in range(1000)]
+    inverse = sum(part.mass["answers"] for part in drawn)
+    again = sum(part.cycle_share * part.mass["answers"] for part in drawn)
+    assert again / inverse == pytest.approx(0.25, abs=0.05)
 
 
 def test_a_part_of_which_nothing_is_noisy_has_no_share(

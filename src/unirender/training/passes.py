@@ -175,9 +175,11 @@ class BatchGradient:
             )
         last = last_timestep(self.loss.scheduler)
         drawn = draw_timesteps(c.timestep_rule, split.batch_size, last, c.p_render, c.p_t, self.generator)
-        seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
         inverse = (drawn.attributes > 0) & (drawn.image == 0)
-        again = inverse & (inverse.cumsum(0) <= round(self.loss.config.cycle_share * int(inverse.sum())))
+        # A share of few rows is no whole number: rounded at random it is right in the mean, of one row too.
+        count = int(self.loss.config.cycle_share * int(inverse.sum()) + float(torch.rand((), generator=self.generator)))
+        again = inverse & (inverse.cumsum(0) <= count)
+        seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
         weight = self._row_weights(batch["mask"])
         parts: list[Part] = []
         for j in range(split.parts):
