@@ -27,18 +27,12 @@ from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
 from unirender.errors import UnirenderError
 from unirender.models.priors import Maps
-from unirender.training.loss_terms import Errors, LossTerms
+from unirender.training.loss_terms import COLOURS, Errors, LossTerms
 from unirender.training.losses import LossFunction
 from unirender.training.presets import TrainConfig
 from unirender.training.processes import ALONE, Processes
 
-OWN_ROWS = (
-    "image",
-    "environment",
-    "composite",
-    "cycle",
-    "answers",
-)  # terms that are means over rows, or with weights, of their own
+OWN_ROWS = ("image", "environment", "composite", "cycle", "answers")  # terms whose means have weights of their own
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
 ByName = dict[str, float]
@@ -97,7 +91,8 @@ class Part:
         timesteps: of these rows.
         seed: of noise and dropped maps.
         cycle_share: share of its inverse rows, from the first on, that are rendered again.
-        mass: weight of its rows in the mean of each term of `OWN_ROWS`, and of the others ("attributes").
+        mass: weight of its rows in the mean of each term of `OWN_ROWS`, of those of `COLOURS` ("colours") and of the
+            others ("attributes").
     """
 
     rows: slice
@@ -181,13 +176,15 @@ class BatchGradient:
         again = inverse & (inverse.cumsum(0) <= count)
         seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
         weight = self._row_weights(batch["mask"])
+        floors = self.loss.config.image_floor, self.loss.config.colour_floor
+        of_image, of_colours = (torch.ones_like(weight) if floor else weight for floor in floors)  # see `_decibels`
         parts: list[Part] = []
         for j in range(split.parts):
             rows = slice(j, None, split.parts)
             a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
             w = weight[rows]
-            mass = {"image": w[i > 0], "attributes": w[a > 0], "environment": a > 0, "composite": w[x], "cycle": w[y]}
-            mass["answers"] = x
+            mass = {"image": of_image[rows][i > 0], "attributes": w[a > 0], "colours": of_colours[rows][a > 0]}
+            mass |= {"environment": a > 0, "composite": w[x], "cycle": w[y], "answers": x}
             seed = seeds[split.processes.rank + split.processes.size * j]
             share = int(y.sum()) / max(1, int(x.sum()))
             parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))
@@ -224,7 +221,7 @@ class BatchGradient:
 
 def kind_of(term: str) -> str:
     """The name under which `Part.mass` has the weights of a loss term's mean."""
-    return term if term in OWN_ROWS else "attributes"
+    return term if term in OWN_ROWS else "colours" if term in COLOURS else "attributes"
 
 
 def _plus(a: Sequence[Tensor | None], b: Sequence[Tensor | None]) -> Gradients:
