@@ -229,6 +229,7 @@ class Trainer:
                 if main and (stopping is not None or due("save", self.run.save_minutes)):
                     self.save(source)
                 if stopping is not None:
+                    self.processes.share(None)  # all wait: when one has ended, torchrun ends the one that saves
                     raise Ended(stopping)
                 with request.unheard():
                     if main and due("picture", self.run.picture_minutes):
