@@ -110,14 +110,17 @@ def test_who_asks_twice_is_not_made_to_wait(tmp_path: Path) -> None:
 
 def test_a_sigterm_that_a_launcher_passes_on_is_no_second_request(monkeypatch: pytest.MonkeyPatch) -> None:
     """torchrun tells its processes what a batch system has told them, too."""
-    with stopping_gently() as request:
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGTERM)
-    assert request.signal == signal.SIGTERM
+
+    def told_twice() -> None:
+        with stopping_gently() as request:
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGTERM)
+        assert request.signal == signal.SIGTERM
+
+    told_twice()
     monkeypatch.setattr(stopping, "PASSED_ON_S", 0.0)
-    with pytest.raises(Ended), stopping_gently():  # the twin: later it is one
-        for _ in range(2):
-            os.kill(os.getpid(), signal.SIGTERM)
+    with pytest.raises(Ended):
+        told_twice()  # the twin: later it is one
 
 
 def test_in_another_thread_nothing_changes() -> None:

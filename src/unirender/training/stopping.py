@@ -1,8 +1,8 @@
 """Asked to stop, a training ends its step and saves: nothing of it is lost, and no weight is left half way.
 
 An interrupt from the keyboard, the SIGTERM of a batch system that wants its machine back and the SIGHUP of a terminal
-that closes are such a request. Who asks a second time is not made to wait. A SIGTERM that comes at once after another is no
-second request: a launcher such as torchrun passes on what a batch system has told all processes already.
+that closes are such a request. Who asks a second time is not made to wait. A SIGTERM that comes at once after another
+is no second request: a launcher such as torchrun passes on what a batch system has told all processes already.
 """
 
 import contextlib
