@@ -144,10 +144,18 @@ def test_state_of_another_config_is_refused(tmp_path: Path) -> None:
 
 
 def test_broken_state_is_refused(tmp_path: Path) -> None:
-    (tmp_path / STATE_FILE).write_bytes(b"no state")
-    with pytest.raises(UnirenderError, match="cannot be read"):
-        load_state(tmp_path)
+    for broken in (b"no state", b""):
+        (tmp_path / STATE_FILE).write_bytes(broken)
+        with pytest.raises(UnirenderError, match=r"cannot be read as a training state \(\w"):
+            load_state(tmp_path)
     assert load_state(tmp_path / "empty") is None
+
+
+@pytest.mark.parametrize("other", [{"step": 1, "net": {}}, [1]])
+def test_a_state_of_something_else_is_refused(other: Any, tmp_path: Path) -> None:
+    torch.save(other, tmp_path / STATE_FILE)
+    with pytest.raises(UnirenderError, match="has no entry config, expected the state of a run of this command"):
+        run_for(tmp_path, 1)
 
 
 def test_save_replaces_at_once(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, DType, notice, usage
+from unirender.options import Device, DType, check_seed, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
@@ -85,6 +85,11 @@ class Train:
     are installed."""
 
     @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.out or cache_dir() / "runs" / self.preset
+
+    @property
     def scored_on(self) -> str | None:
         """In words: what `validate` measures on."""
         return f"{self.validate} scenes of the suite {Path(self.validate_suite).stem}" if self.validate else None
@@ -98,8 +103,9 @@ class Train:
         positive = ("minutes", "steps", "batch_size", "learning_rate", "parallel", "accumulate", "log_every")
         for name in (*positive, "save_minutes", "refresh_minutes"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise UsageError(f"--{name.replace('_', '-')} {value}: expected more than 0")
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: expected a number above 0")
+        check_seed(self.seed)
         if self.validate < 0:
             raise UsageError(f"--validate {self.validate}: expected a number of scenes, or 0 for none")
         if self.keep_best is not None and not self.validate:
@@ -131,7 +137,7 @@ class Train:
     def _check_start(self, config: TrainConfig) -> None:
         if self.init is not None and self.init_from is not None:
             raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
-        if config.trains != "all" and self.init is None:
+        if config.trains != "all" and self.init is None and not self._is_saved():
             raise UsageError(
                 f"--preset {self.preset}: it trains a part of a network and leaves the others as they are, expected "
                 "--init with a trained one (the name of a shipped checkpoint, or a pipeline folder)"
@@ -152,6 +158,12 @@ class Train:
                 "needs; pass --init-from with a Stable Diffusion folder (or --init with a pipeline of this preset)"
             )
 
+    def _is_saved(self) -> bool:
+        """Whether there is a run to go on with, which has all weights."""
+        from unirender.training.checkpoint import STATE_FILE
+
+        return (self.folder / STATE_FILE).is_file()
+
     def run(self, make_validation: MakeValidation, score_names: ScoreNames) -> int:
         """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status.
 
@@ -164,10 +176,9 @@ class Train:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
-        out = self.out or cache_dir() / "runs" / self.preset
-        check_out(out)
+        check_out(self.folder)
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        pipeline = train(self, config, out, validate)
+        pipeline = train(self, config, self.folder, validate)
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0

@@ -47,6 +47,7 @@ from unirender.training.validation import Validate, Validation
 from unirender.writing import writing
 
 MOST_NAMED = 5  # maps and groups of a batch in a message
+OF_A_STATE = ("config", "step", "seconds", "model", "ema", "optimizer", "generator", "source")  # of every version
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,7 +319,7 @@ class Trainer:
         Raises:
             UnirenderError: the state is broken, belongs to another config, or was begun with other weights.
         """
-        state = load_state(self.run.out)
+        state = load_state(self.run.out, OF_A_STATE)
         if state is None:
             self.log.forget_after(-1)  # all of a run that was killed before its first save
             return False
