@@ -11,7 +11,8 @@ from torch import Tensor
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
-from unirender.training import consistency, losses, passes
+from unirender.models.conditioning import TRIPLETS
+from unirender.training import consistency, loss_terms, losses, passes
 from unirender.training.losses import LossFunction
 from unirender.training.passes import BatchGradient, Split
 from unirender.training.presets import LossConfig, TrainConfig
@@ -43,12 +44,14 @@ def without_noise(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "noise_like", lambda x, generator: torch.zeros_like(x))
 
 
-def gradient_of(config: TrainConfig = CONFIG, parallel: int = 1, accumulate: int = 1) -> BatchGradient:
+def gradient_of(
+    config: TrainConfig = CONFIG, parallel: int = 1, accumulate: int = 1, dtype: torch.dtype = torch.float32
+) -> BatchGradient:
     features, unified = config.model.picture_features, config.model.unified
     model, conditioning = make_model(picture_features=features, unified=unified)
     loss = LossFunction(model, conditioning, make_scheduler(), config.loss, config.map_dropout)
     split = Split(config.batch_size, parallel=parallel, accumulate=accumulate)
-    return BatchGradient(loss, config, split, torch.Generator().manual_seed(4), torch.float32)
+    return BatchGradient(loss, config, split, torch.Generator().manual_seed(4), dtype)
 
 
 def run(gradient: BatchGradient, batch: dict[str, Tensor]) -> tuple[dict[str, float], Tensor]:
@@ -165,6 +168,21 @@ def test_a_part_of_which_nothing_is_noisy_has_no_share(
     halves, pieces = run(gradient_of(parallel=2), batch)  # the first half is the clean one
     assert halves == pytest.approx(whole, rel=1e-5)
     torch.testing.assert_close(pieces, gradient, rtol=0, atol=1e-5 * float(gradient.abs().max()))
+
+
+def test_float16_keeps_small_gradients(batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has nothing below 6e-8: what a pixel of a large batch, or of a network that is nearly right, comes to."""
+    weights = {name: 0.003 * getattr(CONFIG.loss, name) for name in (*TRIPLETS, "image", "cycle", "composite")}
+    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, cycle_into_renderer=False, **weights))
+    _, exact = run(gradient_of(config), batch)
+
+    def error() -> float:
+        _, found = run(gradient_of(config, dtype=torch.float16), batch)
+        return float((found - exact).norm() / exact.norm())
+
+    assert error() < 0.01
+    monkeypatch.setattr(loss_terms, "HALF_SCALE", 1.0)
+    assert error() > 0.02  # the twin
 
 
 def test_a_batch_too_small_for_the_processes_is_refused(batch: dict[str, Tensor]) -> None:

@@ -27,7 +27,7 @@ from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
 from unirender.errors import UnirenderError
 from unirender.models.priors import Maps
-from unirender.training.loss_terms import COLOURS, Errors, LossTerms
+from unirender.training.loss_terms import COLOURS, Errors, LossTerms, gradients
 from unirender.training.losses import LossFunction
 from unirender.training.presets import TrainConfig
 from unirender.training.processes import ALONE, Processes
@@ -140,18 +140,17 @@ class BatchGradient:
             terms = {name: shares[name] * mean for name, mean in means.items()}
             if not terms:  # Algorithm 1 may leave both streams of a row clean
                 return [None] * len(parameters), {}
-            gradients = torch.autograd.grad(self.loss.total(terms), parameters, allow_unused=True)
-            return gradients, {name: float(term.detach()) for name, term in terms.items()}
+            found = gradients(self.loss.total(terms), parameters, self.dtype)
+            return found, {name: float(term.detach()) for name, term in terms.items()}
 
-        gradients: Gradients = [None] * len(parameters)
+        summed: Gradients = [None] * len(parameters)
         values: list[ByName] = []
         for first in range(0, len(parts), self.split.at_once):
             some = parts[first : first + self.split.at_once]
             for more, terms in self.pool.map(run, some) if self.pool else map(run, some):
-                gradients = _plus(gradients, more)
+                summed = _plus(summed, more)
                 values.append(terms)
-        gradients = self._over_processes(parameters, gradients)
-        for p, gradient in zip(parameters, gradients, strict=True):
+        for p, gradient in zip(parameters, self._over_processes(parameters, summed), strict=True):
             p.grad = None if gradient is None else laid_out_like(p, gradient)
         return _sum(self.split.processes.gather(_sum(values)))
 
@@ -205,14 +204,14 @@ class BatchGradient:
         errors = Errors(self.loss.conditioning, self.loss.config.background)
         return errors.pixel_weights(mask.double()).sum(dim=(1, 2, 3)).cpu()
 
-    def _over_processes(self, parameters: Sequence[Tensor], gradients: Gradients) -> Gradients:
+    def _over_processes(self, parameters: Sequence[Tensor], own: Gradients) -> Gradients:
         """Sums over the processes. A parameter that took no part in any of them keeps None as its gradient."""
         processes = self.split.processes
-        here = [gradient is not None for gradient in gradients]
+        here = [gradient is not None for gradient in own]
         used = [any(flags) for flags in zip(*processes.gather(here), strict=True)]
         held = [
             torch.zeros_like(p) if gradient is None else gradient
-            for p, gradient, is_used in zip(parameters, gradients, used, strict=True)
+            for p, gradient, is_used in zip(parameters, own, used, strict=True)
             if is_used
         ]
         summed = iter(processes.sum(held))
