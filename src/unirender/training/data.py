@@ -8,6 +8,7 @@ time, or one pair of any other group.
 
 import functools
 import hashlib
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,19 +126,19 @@ class GroupDataset:
                 progress(len(self.shards), len(available))
         pairs = list(zip(available, self.shards, strict=True))
         self._derived: list[DerivedLight] | None = open_derived(pairs, progress) if derived else None
-        sizes = {shard.shared.shape[-2:] for shard in self.shards}
+        sizes = {shard.shared.shape[-2:]: shard.name for shard in self.shards}
         if len(sizes) != 1:
-            raise UnirenderError(
-                f"{folder}: pictures have sizes {sorted(sizes)}, expected one; make one folder per size"
-            )
-        self.resolution: tuple[int, int] = sizes.pop()
+            named = ", ".join(f"{width} x {height} ({name})" for (height, width), name in sorted(sizes.items()))
+            raise UnirenderError(f"{folder}: pictures have the sizes {named}, expected one; make one folder per size")
+        self.resolution: tuple[int, int] = next(iter(sizes))
         self._groups = [(shard, group) for shard in self.shards for group in shard.groups]
         self._shard_of = [number for number, shard in enumerate(self.shards) for _ in shard.groups]
         self.keys = tuple(group.key for _, group in self._groups)
-        if len(set(self.keys)) != len(self.keys):
-            twice = sorted({key for key in self.keys if self.keys.count(key) > 1})
+        if twice := [key for key, count in Counter(self.keys).items() if count > 1]:
+            where = [shard.name for shard, group in self._groups if group.key == twice[0]]
             raise UnirenderError(
-                f"{folder}: groups {', '.join(twice[:5])} occur in several shards, expected each key once"
+                f"{folder}: {len(twice)} groups occur twice ({twice[0]} in {', '.join(where)}), expected each key "
+                "once; take one of the shards away, or render one set with another --seed"
             )
         basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
         self._basis = {i: _basis(*self._groups[i]) for i in basis}

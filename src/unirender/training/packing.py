@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float16
+from jaxtyping import Bool, Float, Float16
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
@@ -24,6 +24,8 @@ from unirender.training.environments import turned_environments
 ENVIRONMENT_SIZE = (16, 32)  # the environment that the model predicts
 SCALAR_CHANNELS = 7  # of shared maps without roughness and metallic
 KINDS = ("basis", "independent", "one-at-a-time", "paper", "sweep")  # what `vary` may be
+BLACK = 1e-3  # radiance that shows nothing
+LEAST_OUTSIDE = 0.01  # share of a picture's pixels whose median says something
 ADVICE = "remake the data set; for shards of your own see `Your own renders` on the docs' page on training"
 
 _LIGHT = re.compile(
@@ -119,6 +121,8 @@ class Packer:
                 rows[light, "specular", _percent(match["level"])] = len(self._pixels)
             else:
                 rows[light, _percent(match["metallic"]), _percent(match["roughness"])] = len(self._pixels)
+            if not kind:
+                _check_background(pixels, self._shared[-1][6] == 0, file)
             self._pixels.append(np.moveaxis(pixels, -1, 0).astype(np.float16))
         pairs = tuple(
             _pair(*image, rows, lights, where)
@@ -290,6 +294,15 @@ def _radiance(channels: Channels, kind: str, interpolated: bool, file: str) -> F
     if not interpolated and (low := float(rgb.min())) < -RANGE_TOLERANCE:
         raise UnirenderError(f"{file}: got a minimum of {low:.4g}, expected radiance >= 0")
     return rgb
+
+
+def _check_background(picture: Float[np.ndarray, "h w 3"], outside: Bool[np.ndarray, "h w"], file: str) -> None:
+    """Looks whether a picture is premultiplied; noise and denoisers reach a few pixels outside the mask, too."""
+    if outside.mean() > LEAST_OUTSIDE and (seen := float(np.median(picture[outside].max(axis=-1)))) > BLACK:
+        raise UnirenderError(
+            f"{file}: shows its background (median radiance {seen:.3g} where the mask is 0), expected 0 there; "
+            "premultiply it: multiply it by the coverage"
+        )
 
 
 def _pair(
