@@ -244,8 +244,8 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         group_size=config.group_size,
     )
     memory = training_bytes(trainer.model, config.optimizer.kind)
-    on_device = options.batches == "device" or (options.batches == "auto" and fits(source.open(), device, memory))
-    source.open()
+    data = source.open()
+    on_device = options.batches == "device" or (options.batches == "auto" and fits(data, device, memory))
     if on_device:
         source = DeviceSource(source, device)
     parameters = sum(p.numel() for p in trainer.model.parameters()) / 1e6
@@ -257,6 +257,9 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     say(f"{out}: {place}{parameters:.2f} M parameters, {device}, {dtype}, {passes}{made}")
     if processes.is_main:
         say(f"memory: {memory}")
+        if not resumed:  # which goes on with the shards that it has
+            say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+    del data  # a folder that grew is opened anew: not both at once
     with contextlib.closing(source):
         with (
             live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,
