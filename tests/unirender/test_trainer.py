@@ -312,6 +312,20 @@ def test_the_best_pipeline_is_kept_by_the_scores_own_direction(
     assert not (tmp_path / "best.partial").exists()
 
 
+def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> None:
+    validate, _ = scores_in_turn([2.0, 3.0, 2.5], higher_is_better=True)
+    fit(tmp_path, 1, validate, keep_best="error")
+    (tmp_path / STATE_FILE).unlink()
+    log, best = ((tmp_path / name).read_text() for name in ("log.jsonl", "best/validation.json"))
+    other = Trainer(dataclasses.replace(TRAIN, seed=1), RunConfig(tmp_path, 1, keep_best="error"), CPU, torch.float32)
+    with pytest.raises(UnirenderError, match=r"best: is the best of another run, with seed 0 instead of 1, .* move it"):
+        other.fit(SyntheticSource(), validate=scores_in_turn([1.0], higher_is_better=True)[0])
+    assert [(tmp_path / name).read_text() for name in ("log.jsonl", "best/validation.json")] == [log, best]
+    again, _ = scores_in_turn([2.0, 1.0, 1.0], higher_is_better=True)
+    fit(tmp_path, 1, again, keep_best="error")  # its own: it was killed before its first save
+    assert (tmp_path / "best" / "validation.json").read_text() == best
+
+
 def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:
     validate, _ = scores_in_turn([1.0], higher_is_better=True)
     with pytest.raises(UnirenderError, match="expected one of: error, other"):

@@ -184,14 +184,15 @@ class Trainer:
         Raises:
             Ended: it was asked to stop.
         """
-        self.source = source
+        self.source, main = source, self.processes.is_main
+        validation = Validation(validate, self.run.keep_best) if validate else None
+        if main and validation is not None and not (self.run.out / STATE_FILE).exists():
+            validation.begin(self)
         resumed = self.resume(source, report)
         self._start_alike(source)
-        main = self.processes.is_main
         if resumed and main:
             say(standing(self.step, self.seconds / 60, self.run.steps, self.run.minutes))
         self._write_config()
-        validation = Validation(validate, self.run.keep_best) if validate else None
         fixed: Maps | None = None
 
         def look() -> None:
