@@ -35,7 +35,7 @@ def cached_folder(folder: Path) -> Iterator[Path]:
                 raise
     except OSError as error:
         raise UnirenderError(
-            f"{folder}: cannot be written ({error.strerror or error}); free some space or set UNIRENDER_CACHE"
+            f"{folder}: cannot be written ({error.strerror}); free some space or set UNIRENDER_CACHE"
         ) from error
     finally:
         if temporary is not None:

@@ -2,6 +2,9 @@
 
 import io
 import json
+import re
+import subprocess
+import sys
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -245,6 +248,16 @@ def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.
         (index.parent / "pixels.npy").write_bytes((index.parent / "pixels.npy").read_bytes()[:200])
     with pytest.raises(UnirenderError, match=r"packed/.*: this folder of the cache is damaged \(.*\); delete it"):
         GroupDataset(tmp_path)
+
+
+def test_a_full_disk_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    write_shard(tmp_path / "shard-000000.tar", {"a": members()})
+    script = "import sys; from unirender.training.data import GroupDataset; GroupDataset(sys.argv[1])"
+    limited = f"ulimit -f 1; exec {sys.executable} -c '{script}' {tmp_path}"  # kilobytes of a file
+    ended = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)
+    assert re.search(r"cannot be written \(\w.*\); free some space or set UNIRENDER_CACHE", ended.stderr)
+    assert "(None)" not in ended.stderr
 
 
 @pytest.mark.parametrize("end", ["group", "member"])

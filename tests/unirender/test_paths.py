@@ -11,15 +11,13 @@ from unirender.paths import cached_folder
 def test_a_folder_of_the_cache_is_whole_or_not_there(tmp_path: Path) -> None:
     folder = tmp_path / "cache" / "key"
 
-    def fails_halfway(error: Exception) -> None:
+    def fails_halfway() -> None:
         with cached_folder(folder) as made:
             (made / "half").touch()
-            raise error
+            raise RuntimeError
 
     with pytest.raises(RuntimeError):
-        fails_halfway(RuntimeError())
-    with pytest.raises(UnirenderError, match=r"cannot be written \(3 of 4 written\)"):  # as NumPy says it
-        fails_halfway(OSError("3 of 4 written"))
+        fails_halfway()
     assert list(folder.parent.iterdir()) == []
     with cached_folder(folder) as slower, cached_folder(folder) as faster:
         (slower / "slower").touch()

@@ -30,7 +30,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
-from unirender.training.groups import Group, Shard, mapped, read_environments
+from unirender.training.groups import Group, Shard, mapped, read_environments, store
 
 logger = logging.getLogger(__name__)
 
@@ -105,8 +105,8 @@ def _derive(path: Path, shard: Shard) -> None:
             pixels.append(light)
     with cached_folder(folder) as made:
         for name, maps in zip(_STORED, np.stack(pixels, axis=1), strict=True):
-            np.save(made / f"{name}.npy", maps)
-        np.save(made / "rows.npy", rows)
+            store(made / f"{name}.npy", maps)
+        store(made / "rows.npy", rows)
 
 
 def _of_group(

@@ -208,6 +208,19 @@ def mapped(path: Path) -> np.ndarray:
         raise damaged(path.parent, error) from error
 
 
+def store(path: Path, array: np.ndarray) -> None:
+    """Writes an array of the cache.
+
+    Raises:
+        OSError: it cannot be written, with words on why: of a full disk NumPy has no number that the system has words
+            for.
+    """
+    try:
+        np.save(path, array)
+    except OSError as error:
+        raise OSError(error.errno or 0, error.strerror or str(error)) from error
+
+
 def damaged(folder: Path, error: Exception) -> UnirenderError:
     """What is said of a folder of the cache that is not what was written."""
     return UnirenderError(f"{folder}: this folder of the cache is damaged ({error}); delete it, it is then made again")
@@ -221,7 +234,7 @@ def _pack(path: Path, folder: Path) -> None:
         raise UnirenderError(f"{path}: the shard has no groups; delete it and remake the dataset")
     with cached_folder(folder) as made:
         for name, array in packer.arrays().items():
-            np.save(made / f"{name}.npy", array)
+            store(made / f"{name}.npy", array)
         (made / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
 
 
@@ -236,4 +249,5 @@ __all__ = [
     "open_packed",
     "read_environments",
     "read_groups",
+    "store",
 ]
