@@ -1,5 +1,6 @@
 """The trainer: exact resume, averaged weights, overfitting one sample, and a run on shards."""
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -506,6 +507,21 @@ def test_growing_folder(tmp_path: Path) -> None:
     assert not torch.equal(grown["image"], old["image"])
     source.close()
     resumed.close()
+
+
+def test_a_new_shard_that_cannot_be_used_does_not_end_the_run(tmp_path: Path) -> None:
+    data, lines = write_dataset(tmp_path / "data", size=32), list[dict[str, Any]]()
+
+    def report(line: dict[str, Any]) -> None:
+        lines.append(line)
+        (data / "shard-000009.tar").write_bytes(b"no tar")
+
+    run = RunConfig(tmp_path / "run", steps=3, log_every=1, refresh_minutes=0.0)
+    with contextlib.closing(ShardSource(data, TRAIN.batch_size, TRAIN.seed)) as source:
+        Trainer(TRAIN, run, CPU, torch.float32).fit(source, report)
+        assert (source.state_dict()["shards"], source.consumed) == (["shard-000000.tar", "shard-000001.tar"], 12)
+    assert [line["step"] for line in lines if "lr" in line] == [1, 2, 3]
+    assert re.search("no new shards: .*shard-000009.tar: not a readable tar", lines[1]["data"])
 
 
 def test_presets_are_rows() -> None:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import Device, DType, check_seed, notice, usage
@@ -17,11 +17,15 @@ from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:
+    import torch
+
+    from unirender.training.processes import Processes
     from unirender.training.validation import Validate
 
 Batches = Literal["auto", "cpu", "device"]
 MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
 ScoreNames = Callable[[], Sequence[str]]  # names of the scores that such a function gives
+Alone = Callable[[Path], contextlib.AbstractContextManager[Any]]  # holds a run's folder against another process
 
 
 @dataclass(frozen=True)
@@ -164,7 +168,9 @@ class Train:
 
         return (self.folder / STATE_FILE).is_file()
 
-    def run(self, make_validation: MakeValidation, score_names: ScoreNames) -> int:
+    def run(
+        self, make_validation: MakeValidation, score_names: ScoreNames, alone: Alone = contextlib.nullcontext
+    ) -> int:
         """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status.
 
         Under torchrun this is one of several processes, of which the first one writes and speaks.
@@ -178,34 +184,56 @@ class Train:
             )
         check_out(self.folder)
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        pipeline = train(self, config, self.folder, validate)
+        pipeline = train(self, config, self.folder, validate, alone)
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
 
 
-def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path | None:
+def train(
+    options: Train,
+    config: TrainConfig,
+    out: Path,
+    validate: "Validate | None" = None,
+    alone: Alone = contextlib.nullcontext,
+) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
+    from unirender.models.precision import resolve_device
+    from unirender.training.groups import list_shards
+    from unirender.training.processes import join_processes
+
+    processes, device = join_processes(resolve_device(options.device))
+    if options.batches == "device" and device.type != "cuda":
+        raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
+    list_shards(options.data)  # says what is wrong with the data before anything is built or written
+    with alone(out) if processes.is_main else contextlib.nullcontext():
+        return _train(options, config, out, validate, processes, device)
+
+
+def _train(
+    options: Train,
+    config: TrainConfig,
+    out: Path,
+    validate: "Validate | None",
+    processes: "Processes",
+    device: "torch.device",
+) -> Path | None:
+    """In a folder that no other run writes to."""
     import diffusers
     import torch
     from rich.console import Console
 
-    from unirender.models.precision import resolve_device, resolve_dtype
+    from unirender.models.precision import resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
     from unirender.training.device_data import DeviceSource, fits
     from unirender.training.export import export_pipeline
-    from unirender.training.groups import list_shards
     from unirender.training.live import live_report
     from unirender.training.memory import training_bytes
-    from unirender.training.processes import join_processes
     from unirender.training.source import ShardSource
     from unirender.training.start import read_start
     from unirender.training.trackers import make_trackers, tracking
     from unirender.training.trainer import RunConfig, Trainer
 
-    processes, device = join_processes(resolve_device(options.device))
-    if options.batches == "device" and device.type != "cuda":
-        raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
@@ -224,7 +252,6 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         scored_on=options.scored_on,
     )
     trackers = make_trackers(options.track, out) if processes.is_main else ()
-    list_shards(options.data)  # says what is wrong with the data before anything is built or written
     tell = notice if processes.is_main else lambda text: None
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     start = read_start(config.model, options.init, options.init_from)

@@ -264,7 +264,12 @@ class Trainer:
             source.load_state_dict(state)
 
     def _refresh(self, source: BatchSource, report: Report) -> None:
-        news = source.refresh() if self.processes.is_main else None
+        """Takes in new shards; where they cannot be used, the run goes on with those that it has, and says so."""
+        news = None
+        try:
+            news = source.refresh() if self.processes.is_main else None
+        except UnirenderError as error:
+            news = f"no new shards: {error}"
         if news := self.processes.share(news):
             self._follow_main(source)
             self.log.tell({"step": self.step, "data": news}, report)

@@ -13,6 +13,7 @@ A run resumes by running the same command again: the order of objects and all th
 and the step.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
 from unirender.options import check_seed
+from unirender.training.run import Alone
 from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:
@@ -82,7 +84,7 @@ class TrainVisibility:
         if not 0 <= self.halved <= 1:
             raise UsageError(f"--halved {self.halved}: expected a share in [0, 1]")
 
-    def run(self) -> int:
+    def run(self, alone: Alone = contextlib.nullcontext) -> int:
         """Trains, or resumes; returns the exit status."""
         self.check()
         if not self.data.is_dir():
@@ -90,7 +92,8 @@ class TrainVisibility:
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
         check_out(self.out)
-        print(f"{train_visibility(self)}: trained")
+        with alone(self.out):
+            print(f"{train_visibility(self)}: trained")
         return 0
 
 
