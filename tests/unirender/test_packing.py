@@ -126,6 +126,10 @@ CASES: dict[str, tuple[Callable[[], Members], str]] = {
     "broken json": (lambda: members() | {"json": b"{not"}, "json: cannot be read as JSON"),
     "json list": (lambda: members() | {"json": b"[]"}, r"json: got \[\], expected an object"),
     "no pictures": (lambda: {n: members()[n] for n in ("shared.exr", "json")}, "has no picture, expected at least one"),
+    "one picture twice": (
+        lambda: members() | {"l0.m50_r40.exr": members()["l0.m050_r040.exr"]},
+        "two members are the same picture, like m050_r030 and m50_r30",
+    ),
     "no light": (lambda: without("l0.environment.exr"), r"l0.environment.exr is missing, which l0.m000_r040.exr needs"),
     "no s": (lambda: without("l0.r040.specular.exr"), r"l0.r040.specular.exr is missing, which l0.m000_r040.exr needs"),
     "no albedo": (
