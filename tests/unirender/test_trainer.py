@@ -756,7 +756,7 @@ def test_a_gradient_that_is_none_says_why(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda weights, norm: torch.tensor(math.inf))
     with pytest.raises(UnirenderError, match=r"is inf; lower the learning rate \(--learning-rate\)"):
         Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
-    save_state(tmp_path, trainer.state_dict() | {"source": {"place": 0}})
+    trainer.save(SyntheticSource())
     with pytest.raises(UnirenderError, match="is inf; begin anew with a lower --learning-rate and another --out"):
         Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
 

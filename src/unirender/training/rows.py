@@ -54,8 +54,6 @@ def basis_rows(shard: Shard, group: Group) -> BasisRows:
     where = f"{shard.name}: group {group.key}"
     lights = sorted({pair.light for pair in group.pairs})
     roughness = sorted({pair.roughness for pair in group.pairs if pair.roughness is not None})
-    if not roughness:  # of a shard that was packed by an earlier version
-        raise UnirenderError(f"{where}: has no picture of a roughness and metallic, expected a full basis grid")
     by_node = {(pair.light, pair.roughness, pair.metallic): pair for pair in group.pairs}
     try:
         grid = [[[by_node[light, r, m] for m in METALLIC_NODES] for r in roughness] for light in lights]

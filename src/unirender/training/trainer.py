@@ -11,7 +11,6 @@ clock; weights, optimiser and random state are alike on all.
 
 import contextlib
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,29 +24,27 @@ from torch import nn
 from unirender.command_line import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
-from unirender.files import replace_file
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
-from unirender.training.beginning import Beginning, check_beginning
-from unirender.training.checkpoint import STATE_FILE, differences, load_state, plain, save_state
+from unirender.training.beginning import Beginning
+from unirender.training.checkpoint import STATE_FILE, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
 from unirender.training.losses import LossFunction
 from unirender.training.muon import make_optimizer
-from unirender.training.passes import BatchGradient, Split, laid_out_like
+from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
+from unirender.training.state import resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
-from unirender.writing import writing
 
 MOST_NAMED = 5  # maps and groups of a batch in a message
-OF_A_STATE = ("config", "step", "seconds", "model", "ema", "optimizer", "generator", "source")  # of every version
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,7 +189,7 @@ class Trainer:
         self._start_alike(source)
         if resumed and main:
             say(standing(self.step, self.seconds / 60, self.run.steps, self.run.minutes))
-        self._write_config()
+        write_config(self)
         fixed: Maps | None = None
 
         def look() -> None:
@@ -302,66 +299,8 @@ class Trainer:
 
     def save(self, source: BatchSource) -> Path:
         """Writes everything that the next step depends on."""
-        return save_state(self.run.out, self.state_dict() | {"source": source.state_dict()})
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "config": plain(self.config),
-            "step": self.step,
-            "seconds": self.seconds,
-            "model": self.model.state_dict(),
-            "ema": self.ema.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "parts": self.split.all_parts,
-            "unlogged": dict(self.log.waiting),
-            "continues": self.continues,
-            "begun_with": self.begun_with,
-        }
+        return save_state(self.run.out, state_of(self, source))
 
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
-        """Continues from the folder's state, if it has one; `report` is told where that cannot be exact.
-
-        Raises:
-            UnirenderError: the state is broken, belongs to another config, or was begun with other weights.
-        """
-        state = load_state(self.run.out, OF_A_STATE)
-        if state is None:
-            self.log.forget_after(-1)  # all of a run that was killed before its first save
-            return False
-        if differing := differences(state["config"], self.config):
-            raise UnirenderError(
-                f"{self.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
-                "another --out"
-            )
-        begun = state.get("begun_with")
-        check_beginning(self.run.out, begun, self.begun_with or {})
-        self.begun_with = begun
-        self.step, self.seconds = state["step"], state["seconds"]
-        self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
-        self.model.load_state_dict(state["model"])
-        self.ema.load_state_dict(state["ema"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        for p, moments in self.optimizer.state.items():
-            same_shape = {name: value for name, value in moments.items() if value.shape == p.shape}
-            moments.update({name: laid_out_like(p, value) for name, value in same_shape.items()})
-        self.generator.set_state(state["generator"])
-        self.log.waiting.update(state.get("unlogged", {}))
-        source.load_state_dict(state["source"])
-        self.log.forget_after(self.step)
-        parts = state.get("parts", state.get("parallel", self.split.all_parts))  # older states: parallel, or nothing
-        if parts != self.split.all_parts:
-            news = f"{parts} -> {self.split.all_parts}: from here on other noise is drawn than without the change"
-            self.log.tell({"step": self.step, "parts": news}, report)
-        return True
-
-    def _write_config(self) -> None:
-        own = {"device": str(self.device), "dtype": str(self.dtype), "threads": torch.get_num_threads()}
-        hardware = self.processes.gather(own)  # by process
-        if not self.processes.is_main:
-            return
-        run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
-        text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        path = self.run.out / "config.json"
-        with writing(path):
-            replace_file(path, text + "\n")
+        """As `unirender.training.state.resume`."""
+        return resume(self, source, report)
