@@ -712,12 +712,14 @@ def test_only_steps_count_as_training(tmp_path: Path) -> None:
         return {"error": Score(1.0, higher_is_better=False)}
 
     before = time.monotonic()
-    fit(tmp_path, 2, slow)
+    lines = [line for line in fit(tmp_path, 2, slow) if "lr" in line]
     elapsed = time.monotonic() - before
     state = load_state(tmp_path)
     assert state is not None
     assert len(naps) >= 3
     assert 0 < state["seconds"] < elapsed - sum(naps)
+    spent = 60 * (lines[1]["minutes"] - lines[0]["minutes"])
+    assert lines[1]["samples_per_s"] == pytest.approx(TRAIN.batch_size / spent)
 
 
 def test_a_resume_forgets_what_the_log_says_of_later_steps(tmp_path: Path) -> None:

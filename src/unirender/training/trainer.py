@@ -207,8 +207,8 @@ class Trainer:
             return True
 
         look()
-        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
-        logged = self.step
+        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh")}
+        logged = self.step, self.seconds
         with stopping_gently() as request:
             while self.progress < 1:
                 clock["step"] = time.monotonic()  # pictures, validation and saves are no training
@@ -216,12 +216,12 @@ class Trainer:
                 if fixed is None:
                     fixed = {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-                now = time.monotonic()
-                seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)
+                seconds = self.seconds + time.monotonic() - clock["step"]
+                refresh = due("refresh", self.run.refresh_minutes)
                 self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.signal))
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
-                    speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
-                    clock["log"], logged = now, self.step
+                    speed = (self.step - logged[0]) * self.config.batch_size / (self.seconds - logged[1])
+                    logged = self.step, self.seconds
                     rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
                     with request.unheard():
                         self.log.tell(rates | self.log.means(), report)
