@@ -52,8 +52,9 @@ def finished_shards(
     check_versions(folder, made_with, header["versions"])
     wanted = json.loads(json.dumps(header["config"]))
     if found != wanted:
-        differs = ", ".join(sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key)))
-        raise UnirenderError(f"{folder}: holds a data set with other {differs}; choose another --out or delete it")
+        keys = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
+        differs = ", ".join(f"{key} {found.get(key)!s:.16} instead of {wanted.get(key)!s:.16}" for key in keys)
+        raise UnirenderError(f"{folder}: holds a data set with {differs}; choose another --out or delete it")
     records = listed | _journal(folder / JOURNAL)
     surplus = sorted(record.name for record in records.values() if record.planned > sizes.get(record.name, 0))
     if surplus and wanted.get("meshes"):

@@ -159,6 +159,15 @@ def score_names() -> tuple[str, ...]:
     return SCORES
 
 
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """The folder of a run: made, and written by this process alone."""
+    from unirender_reference.folder_lock import locked, made_folder
+
+    with made_folder(folder), locked(folder):
+        yield
+
+
 def predict_maps(image_srgb: "np.ndarray", mask: "np.ndarray", camera: "Camera") -> "Intrinsics":
     """The shipped model's decomposition of a picture, for `optimize --init unirender`."""
     return shipped_pipeline().decompose(image_srgb, mask=mask, camera=camera).intrinsics
@@ -182,7 +191,9 @@ def run(command: Any) -> int:
     if isinstance(command, Render | Relight):
         return command.run(read_light)
     if isinstance(command, Train):
-        return command.run(make_validation, score_names)
+        return command.run(make_validation, score_names, alone)
+    if isinstance(command, TrainVisibility):
+        return command.run(alone)
     if isinstance(command, Optimize):
         return command.run(predict_maps)
     return command.run()

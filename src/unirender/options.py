@@ -256,6 +256,16 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     return picture, remarks
 
 
+def check_seed(seed: int) -> None:
+    """Looks at the seed of a training.
+
+    Raises:
+        UsageError: PyTorch or NumPy does not take it.
+    """
+    if not 0 <= seed < 2**63:
+        raise UsageError(f"--seed {seed}: expected an integer from 0 to 2^63 - 1")
+
+
 def at_least(low: int, **options: int | None) -> None:
     """Looks at options that have a least value; None is one that was not given.
 

@@ -2,6 +2,10 @@
 
 import io
 import json
+import re
+import subprocess
+import sys
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +19,7 @@ from unirender.exr import read_exr_bytes
 from unirender.training.augment import DEFAULT_AUGMENTATION
 from unirender.training.data import GroupDataset, make_batch
 from unirender.training.derived import _derive
+from unirender.training.groups import read_groups
 from unirender.training.packing import Packer
 
 Members = dict[str, bytes]
@@ -92,6 +97,10 @@ CASES: dict[str, tuple[Callable[[], Members], str]] = {
         "is 8 x 8 texels, .* twice as wide as high",
     ),
     "picture": (lambda: altered(IMAGE, times("R", 1, -5)), rf"{IMAGE}: got a minimum of -5, expected radiance >= 0"),
+    "background": (
+        lambda: altered(IMAGE, times("R", 1, 0.1)),
+        rf"{IMAGE}: shows its background \(median radiance 0.1 where the mask is 0\), .* multiply it by the coverage",
+    ),
     "picture nan": (lambda: altered(IMAGE, one("R", np.nan)), rf"{IMAGE}: 1 of 768 values are NaN or infinite"),
     "picture size": (
         lambda: members() | {IMAGE: members(size=8)[IMAGE]},
@@ -117,6 +126,10 @@ CASES: dict[str, tuple[Callable[[], Members], str]] = {
     "broken json": (lambda: members() | {"json": b"{not"}, "json: cannot be read as JSON"),
     "json list": (lambda: members() | {"json": b"[]"}, r"json: got \[\], expected an object"),
     "no pictures": (lambda: {n: members()[n] for n in ("shared.exr", "json")}, "has no picture, expected at least one"),
+    "one picture twice": (
+        lambda: members() | {"l0.m50_r40.exr": members()["l0.m050_r040.exr"]},
+        "two members are the same picture, like m050_r030 and m50_r30",
+    ),
     "no light": (lambda: without("l0.environment.exr"), r"l0.environment.exr is missing, which l0.m000_r040.exr needs"),
     "no s": (lambda: without("l0.r040.specular.exr"), r"l0.r040.specular.exr is missing, which l0.m000_r040.exr needs"),
     "no albedo": (
@@ -161,6 +174,10 @@ def test_rounding_and_the_noise_of_sweeps_are_taken(make: Callable[[], Members])
     assert len(Packer("some.tar").add("a", make()).pairs) == 3
 
 
+def test_noise_outside_the_mask_is_taken() -> None:
+    Packer("some.tar").add("a_g0", altered(IMAGE, one("R", 5.0)))
+
+
 def test_normals_of_a_silhouette_are_taken_at_length_one() -> None:
     """Averages of a pixel are shorter; what a shard of ours holds stays as it is, to the bit."""
     shared = read_exr_bytes(members()["shared.exr"])[0]
@@ -201,6 +218,50 @@ def test_other_sizes_are_named_with_both_groups(tmp_path: Path) -> None:
     write_shard(tmp_path / "shard-000000.tar", {"a": members(), "b": members(size=8)})
     with pytest.raises(UnirenderError, match=r"group b\.shared.exr: is 8 x 8 pixels, expected 16 x 16, .* of group a"):
         GroupDataset(tmp_path)
+
+
+def test_sizes_and_keys_of_several_shards_are_named_with_their_shards(tmp_path: Path) -> None:
+    write_shard(tmp_path / "shard-000000.tar", {"a": members()})
+    write_shard(tmp_path / "shard-000001.tar", {"b": members(size=8)})
+    with pytest.raises(UnirenderError, match=r"sizes 8 x 8 \(shard-000001.tar\), 16 x 16 \(shard-000000.tar\), exp"):
+        GroupDataset(tmp_path)
+    write_shard(tmp_path / "shard-000001.tar", {"a": members("independent")})
+    with pytest.raises(UnirenderError, match=r"1 groups occur twice \(a in shard-000000.tar, shard-000001.tar\)"):
+        GroupDataset(tmp_path)
+
+
+def test_members_that_do_not_stand_together_are_named(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "shard-000000.tar", "w") as tar:
+        for name in ("a.shared.exr", "b.shared.exr", "a.json"):
+            tar.addfile(tarfile.TarInfo(name), io.BytesIO())
+    with pytest.raises(UnirenderError, match="group a occurs twice, or other members stand between its own"):
+        list(read_groups(tmp_path / "shard-000000.tar"))
+
+
+@pytest.mark.parametrize("end", ["emptied", "gone", "cut"])
+def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    write_shard(tmp_path / "shard-000000.tar", {"a": members()})
+    GroupDataset(tmp_path)
+    (index,) = (tmp_path / "cache").rglob("index.json")
+    if end == "emptied":
+        index.write_text("")
+    elif end == "gone":
+        (index.parent / "pixels.npy").unlink()
+    else:
+        (index.parent / "pixels.npy").write_bytes((index.parent / "pixels.npy").read_bytes()[:200])
+    with pytest.raises(UnirenderError, match=r"packed/.*: this folder of the cache is damaged \(.*\); delete it"):
+        GroupDataset(tmp_path)
+
+
+def test_a_full_disk_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    write_shard(tmp_path / "shard-000000.tar", {"a": members()})
+    script = "import sys; from unirender.training.data import GroupDataset; GroupDataset(sys.argv[1])"
+    limited = f"ulimit -f 1; exec {sys.executable} -c '{script}' {tmp_path}"  # kilobytes of a file
+    ended = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)
+    assert re.search(r"cannot be written \(\w.*\); free some space or set UNIRENDER_CACHE", ended.stderr)
+    assert "(None)" not in ended.stderr
 
 
 @pytest.mark.parametrize("end", ["group", "member"])

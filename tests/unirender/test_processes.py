@@ -40,6 +40,26 @@ if os.environ["RANK"] == "1":
     ShardSource.next = next
 """
 
+SLOW_SAVE = """
+import os, signal, time
+from unirender.training import trainer
+from unirender.training.source import ShardSource
+
+own_next, own_save = ShardSource.next, trainer.save_state
+
+def next(self):
+    if self.consumed == 5:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return own_next(self)
+
+def save_state(folder, state):
+    time.sleep(4)
+    return own_save(folder, state)
+
+if os.environ["RANK"] == "0":
+    ShardSource.next, trainer.save_state = next, save_state
+"""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -59,6 +79,14 @@ def torchrun(data: Path, out: Path, *options: str, script: Path = SCRIPT) -> sub
     return subprocess.run(
         [*launch, *command, *common, *options], env=env, capture_output=True, text=True, timeout=500, check=False
     )
+
+
+def changed_by(lines: str, folder: Path) -> Path:
+    """The program with something of it changed."""
+    script = folder / "changed.py"
+    run = f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')"
+    script.write_text(f"{lines}\nimport runpy, sys\nsys.path.insert(0, {str(SCRIPT.parent)!r})\n{run}\n")
+    return script
 
 
 def losses(out: Path) -> list[dict[str, float]]:
@@ -131,16 +159,22 @@ def test_two_processes_resume_and_end_by_one_clock(run: Run) -> None:
 
 @pytest.mark.long
 def test_an_error_of_one_process_ends_all_with_a_line(run: Run, tmp_path: Path) -> None:
-    script = tmp_path / "broken_disk.py"
-    script.write_text(f"{BROKEN_DISK}\nimport runpy, sys\nsys.path.insert(0, {str(SCRIPT.parent)!r})\n")
-    with script.open("a") as file:
-        file.write(f"runpy.run_path({str(SCRIPT)!r}, run_name='__main__')\n")
-    ended = torchrun(run.data, tmp_path / "run", "--steps", "2", script=script)
+    ended = torchrun(run.data, tmp_path / "run", "--steps", "2", script=changed_by(BROKEN_DISK, tmp_path))
     assert ended.returncode == 1
     said = [line for line in ended.stderr.splitlines() if line.startswith("unirender: error:")]
     assert "unirender: error: the disk of process 1 is gone" in said
     assert all("the disk of process 1" in line or "process 0 of 2 stops: another process" in line for line in said)
     assert load_state(tmp_path / "run") is None
+
+
+@pytest.mark.long
+def test_all_wait_for_the_one_that_saves(run: Run, tmp_path: Path) -> None:
+    """The first process alone is asked to stop; torchrun ends it, too, as soon as another one has ended."""
+    ended = torchrun(run.data, tmp_path / "run", "--steps", "9", script=changed_by(SLOW_SAVE, tmp_path))
+    assert ended.returncode == 1
+    state = load_state(tmp_path / "run")
+    assert state is not None
+    assert state["step"] == 2
 
 
 def test_alone_everything_is_itself(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,8 @@ def test_it_moves_the_image_decoder_and_nothing_of_what_is_found_in_pictures(
 
 
 def test_it_learns_a_batch(tmp_path: Path) -> None:
-    run, batch = trainer(tmp_path / "run", steps=40), make_batch(4)
+    run, batch = trainer(tmp_path / "run", dataclasses.replace(RENDERER, map_dropout=0.0), steps=40), make_batch(4)
+    batch["image"] = 0.5 * batch["image"]  # not its closed form, with which the network begins
     errors = [run.train_step(dict(batch)) for _ in range(40)]
     assert set(errors[0]) == {"image", "grad_norm", "lr"}
     assert errors[-1]["image"] < 0.5 * errors[0]["image"]

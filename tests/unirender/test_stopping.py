@@ -14,6 +14,7 @@ from torch import Tensor
 
 from unirender import cli
 from unirender.command_line import Ended
+from unirender.training import stopping
 from unirender.training.checkpoint import load_state
 from unirender.training.stopping import SIGNALS, stopping_gently
 from unirender.training.trainer import RunConfig, Trainer
@@ -105,6 +106,21 @@ def test_who_asks_twice_is_not_made_to_wait(tmp_path: Path) -> None:
         fit(tmp_path, source)
     assert source.place == 2
     assert load_state(tmp_path) is None  # not even the first step was saved: that takes minutes
+
+
+def test_a_sigterm_that_a_launcher_passes_on_is_no_second_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    """torchrun tells its processes what a batch system has told them, too."""
+
+    def told_twice() -> None:
+        with stopping_gently() as request:
+            for _ in range(2):
+                os.kill(os.getpid(), signal.SIGTERM)
+        assert request.signal == signal.SIGTERM
+
+    told_twice()
+    monkeypatch.setattr(stopping, "PASSED_ON_S", 0.0)
+    with pytest.raises(Ended):
+        told_twice()  # the twin: later it is one
 
 
 def test_in_another_thread_nothing_changes() -> None:

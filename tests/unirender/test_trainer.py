@@ -1,5 +1,6 @@
 """The trainer: exact resume, averaged weights, overfitting one sample, and a run on shards."""
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -144,10 +145,18 @@ def test_state_of_another_config_is_refused(tmp_path: Path) -> None:
 
 
 def test_broken_state_is_refused(tmp_path: Path) -> None:
-    (tmp_path / STATE_FILE).write_bytes(b"no state")
-    with pytest.raises(UnirenderError, match="cannot be read"):
-        load_state(tmp_path)
+    for broken in (b"no state", b""):
+        (tmp_path / STATE_FILE).write_bytes(broken)
+        with pytest.raises(UnirenderError, match=r"cannot be read as a training state \(\w"):
+            load_state(tmp_path)
     assert load_state(tmp_path / "empty") is None
+
+
+@pytest.mark.parametrize("other", [{"step": 1, "net": {}}, [1]])
+def test_a_state_of_something_else_is_refused(other: Any, tmp_path: Path) -> None:
+    torch.save(other, tmp_path / STATE_FILE)
+    with pytest.raises(UnirenderError, match="has no entry config, expected the state of a run of this command"):
+        run_for(tmp_path, 1)
 
 
 def test_save_replaces_at_once(tmp_path: Path) -> None:
@@ -302,6 +311,20 @@ def test_the_best_pipeline_is_kept_by_the_scores_own_direction(
     assert json.loads((tmp_path / "best" / "validation.json").read_text()) == best
     assert UniRenderPipeline.from_pretrained(tmp_path / "best").size == 32
     assert not (tmp_path / "best.partial").exists()
+
+
+def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> None:
+    validate, _ = scores_in_turn([2.0, 3.0, 2.5], higher_is_better=True)
+    fit(tmp_path, 1, validate, keep_best="error")
+    (tmp_path / STATE_FILE).unlink()
+    log, best = ((tmp_path / name).read_text() for name in ("log.jsonl", "best/validation.json"))
+    other = Trainer(dataclasses.replace(TRAIN, seed=1), RunConfig(tmp_path, 1, keep_best="error"), CPU, torch.float32)
+    with pytest.raises(UnirenderError, match=r"best: is the best of another run, with seed 0 instead of 1, .* move it"):
+        other.fit(SyntheticSource(), validate=scores_in_turn([1.0], higher_is_better=True)[0])
+    assert [(tmp_path / name).read_text() for name in ("log.jsonl", "best/validation.json")] == [log, best]
+    again, _ = scores_in_turn([2.0, 1.0, 1.0], higher_is_better=True)
+    fit(tmp_path, 1, again, keep_best="error")  # its own: it was killed before its first save
+    assert (tmp_path / "best" / "validation.json").read_text() == best
 
 
 def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:
@@ -484,6 +507,21 @@ def test_growing_folder(tmp_path: Path) -> None:
     assert not torch.equal(grown["image"], old["image"])
     source.close()
     resumed.close()
+
+
+def test_a_new_shard_that_cannot_be_used_does_not_end_the_run(tmp_path: Path) -> None:
+    data, lines = write_dataset(tmp_path / "data", size=32), list[dict[str, Any]]()
+
+    def report(line: dict[str, Any]) -> None:
+        lines.append(line)
+        (data / "shard-000009.tar").write_bytes(b"no tar")
+
+    run = RunConfig(tmp_path / "run", steps=3, log_every=1, refresh_minutes=0.0)
+    with contextlib.closing(ShardSource(data, TRAIN.batch_size, TRAIN.seed)) as source:
+        Trainer(TRAIN, run, CPU, torch.float32).fit(source, report)
+        assert (source.state_dict()["shards"], source.consumed) == (["shard-000000.tar", "shard-000001.tar"], 12)
+    assert [line["step"] for line in lines if "lr" in line] == [1, 2, 3]
+    assert re.search("no new shards: .*shard-000009.tar: not a readable tar", lines[1]["data"])
 
 
 def test_presets_are_rows() -> None:
@@ -674,12 +712,14 @@ def test_only_steps_count_as_training(tmp_path: Path) -> None:
         return {"error": Score(1.0, higher_is_better=False)}
 
     before = time.monotonic()
-    fit(tmp_path, 2, slow)
+    lines = [line for line in fit(tmp_path, 2, slow) if "lr" in line]
     elapsed = time.monotonic() - before
     state = load_state(tmp_path)
     assert state is not None
     assert len(naps) >= 3
     assert 0 < state["seconds"] < elapsed - sum(naps)
+    spent = 60 * (lines[1]["minutes"] - lines[0]["minutes"])
+    assert lines[1]["samples_per_s"] == pytest.approx(TRAIN.batch_size / spent)
 
 
 def test_a_resume_forgets_what_the_log_says_of_later_steps(tmp_path: Path) -> None:
@@ -718,7 +758,7 @@ def test_a_gradient_that_is_none_says_why(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda weights, norm: torch.tensor(math.inf))
     with pytest.raises(UnirenderError, match=r"is inf; lower the learning rate \(--learning-rate\)"):
         Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
-    save_state(tmp_path, trainer.state_dict() | {"source": {"place": 0}})
+    trainer.save(SyntheticSource())
     with pytest.raises(UnirenderError, match="is inf; begin anew with a lower --learning-rate and another --out"):
         Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float32).fit(SyntheticSource())
 

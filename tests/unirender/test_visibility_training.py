@@ -3,6 +3,7 @@
 import io
 import json
 import logging
+import math
 import os
 from pathlib import Path
 
@@ -177,7 +178,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     assert stopped.read_bytes() == whole.read_bytes()
     steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1, 2, 3, 4]
-    with pytest.raises(UnirenderError, match="other options or data"):
+    with pytest.raises(UnirenderError, match="other batch_size; repeat the options"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
 
@@ -200,8 +201,14 @@ def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
     assert load_state(tmp_path / "run")["step"] == 1  # pyright: ignore[reportOptionalSubscript] - it was saved
 
 
+def test_a_gradient_that_is_not_finite_ends_the_run(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(UnirenderError, match=r"the gradient at step \d is (nan|inf); begin anew with a lower"):
+        train_visibility(TrainVisibility(folder, tmp_path, steps=8, batch_size=1, learning_rate=1e30))
+
+
 def test_options_are_checked(tmp_path: Path) -> None:
     wrong = ({"steps": 0}, "--steps 0"), ({"halved": 1.5}, "--halved 1.5"), ({"batch_size": -1}, "--batch-size -1")
+    wrong += ({"learning_rate": math.inf}, "--learning-rate inf"), ({"seed": -1}, "--seed -1")
     for change, named in wrong:
         with pytest.raises(UsageError, match=named):
             TrainVisibility(tmp_path, tmp_path, **change).run()  # pyright: ignore[reportArgumentType] - from tests

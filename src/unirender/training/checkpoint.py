@@ -5,7 +5,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,21 +41,32 @@ def save_state(folder: Path, state: dict[str, Any]) -> Path:
     return path
 
 
-def load_state(folder: Path) -> dict[str, Any] | None:
+def load_state(folder: Path, entries: Sequence[str] = ()) -> dict[str, Any] | None:
     """Reads the state back, or None where there is none. Only data is read: no code in the file is run.
 
+    Args:
+        folder: of the run.
+        entries: that the state has.
+
     Raises:
-        UnirenderError: the file is broken.
+        UnirenderError: the file is broken, or lacks one of the entries.
     """
     path = folder / STATE_FILE
     if not path.exists():
         return None
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises half a dozen kinds for a broken file
+        reason = str(error) or type(error).__name__
         raise UnirenderError(
-            f"{path}: cannot be read as a training state ({error}); move it away to start anew"
+            f"{path}: cannot be read as a training state ({reason}); move it away to start anew"
         ) from error
+    if missing := [name for name in entries if not isinstance(state, dict) or name not in state]:
+        raise UnirenderError(
+            f"{path}: has no entry {missing[0]}, expected the state of a run of this command; move it away to start "
+            "anew, or choose another --out"
+        )
+    return state
 
 
 def plain(config: TrainConfig) -> dict[str, Any]:

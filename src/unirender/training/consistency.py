@@ -23,7 +23,7 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import TRIPLETS, Conditioning, srgb_encode
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.priors import PRIORS
-from unirender.training.loss_terms import Errors, noise_like, predict, weighted_mean
+from unirender.training.loss_terms import Errors, gradients, noise_like, predict, weighted_mean
 from unirender.training.presets import LossConfig
 
 ALL = slice(None)
@@ -62,7 +62,11 @@ class Consistency:
             return self._rendered(rows, clean_i, mask, generator)
         leaf = rows.detach().requires_grad_()
         error = self._rendered(leaf, clean_i, mask, generator)
-        return _with_gradient(error.detach(), rows, torch.autograd.grad(error, leaf)[0])
+        kind = leaf.device.type
+        dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
+        (gradient,) = gradients(error, [leaf], dtype)
+        assert gradient is not None, "what is rendered comes of it"
+        return _with_gradient(error.detach(), rows, gradient)
 
     def composite(
         self,

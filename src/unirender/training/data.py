@@ -8,13 +8,13 @@ time, or one pair of any other group.
 
 import functools
 import hashlib
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from unirender.errors import UnirenderError
@@ -23,7 +23,6 @@ from unirender.intrinsics import Intrinsics
 from unirender.symmetries import Maps, mirror, quarter_turn, scale_light
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
-    METALLIC_NODES,
     NO_AUGMENTATION,
     Draw,
     draw,
@@ -33,10 +32,11 @@ from unirender.training.augment import (
     permute_channels,
 )
 from unirender.training.derived import DerivedLight, open_derived
-from unirender.training.groups import SCALAR_CHANNELS, Group, Pair, Shard, list_shards, open_packed, read_environments
+from unirender.training.groups import Pair, Shard, list_shards, open_packed, read_environments
 from unirender.training.moving import moved
 from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
+from unirender.training.rows import SampleRows, basis_rows, shared_maps, trailing, with_material
 
 DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d as derived from the light, where `derived` is 1
 DERIVED_FLAGS = ("derived", "shadowed")  # 0 or 1 of a sample; shadowed: they have the shadows that the picture shows
@@ -45,40 +45,6 @@ BATCH_MAPS = ("image", "albedo", "normal", "roughness", "metallic", "specular", 
 ALL_ROWS = slice(None)
 
 Batch = dict[str, Float[Tensor, "b c h w"]]
-
-
-@dataclass(frozen=True)
-class SampleRows:
-    """Which rows of its packed shard a sample is mixed of.
-
-    Attributes:
-        shard: number of the shard.
-        shared: row of albedo, normal and mask.
-        image: rows of the pictures, by light and metallic node; one node for a pair.
-        specular: row by light, and so the others.
-        metallic: of the object; None: its own map.
-        roughness: likewise.
-    """
-
-    shard: int
-    shared: int
-    image: Int[np.ndarray, "l n"]
-    specular: Int[np.ndarray, " l"]
-    diffuse: Int[np.ndarray, " l"]
-    environment: Int[np.ndarray, " l"]
-    metallic: float | None
-    roughness: float | None
-
-
-@dataclass(frozen=True)
-class _Basis:
-    """Rows of a basis group, by light, roughness and metallic node."""
-
-    roughness: tuple[float, ...]
-    image: Int[np.ndarray, "l r 3"]
-    specular: Int[np.ndarray, "l r"]
-    diffuse: Int[np.ndarray, " l"]
-    environment: Int[np.ndarray, " l"]
 
 
 class GroupDataset:
@@ -125,22 +91,22 @@ class GroupDataset:
                 progress(len(self.shards), len(available))
         pairs = list(zip(available, self.shards, strict=True))
         self._derived: list[DerivedLight] | None = open_derived(pairs, progress) if derived else None
-        sizes = {shard.shared.shape[-2:] for shard in self.shards}
+        sizes = {shard.shared.shape[-2:]: shard.name for shard in self.shards}
         if len(sizes) != 1:
-            raise UnirenderError(
-                f"{folder}: pictures have sizes {sorted(sizes)}, expected one; make one folder per size"
-            )
-        self.resolution: tuple[int, int] = sizes.pop()
+            named = ", ".join(f"{width} x {height} ({name})" for (height, width), name in sorted(sizes.items()))
+            raise UnirenderError(f"{folder}: pictures have the sizes {named}, expected one; make one folder per size")
+        self.resolution: tuple[int, int] = next(iter(sizes))
         self._groups = [(shard, group) for shard in self.shards for group in shard.groups]
         self._shard_of = [number for number, shard in enumerate(self.shards) for _ in shard.groups]
         self.keys = tuple(group.key for _, group in self._groups)
-        if len(set(self.keys)) != len(self.keys):
-            twice = sorted({key for key in self.keys if self.keys.count(key) > 1})
+        if twice := [key for key, count in Counter(self.keys).items() if count > 1]:
+            where = [shard.name for shard, group in self._groups if group.key == twice[0]]
             raise UnirenderError(
-                f"{folder}: groups {', '.join(twice[:5])} occur in several shards, expected each key once"
+                f"{folder}: {len(twice)} groups occur twice ({twice[0]} in {', '.join(where)}), expected each key "
+                "once; take one of the shards away, or render one set with another --seed"
             )
         basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
-        self._basis = {i: _basis(*self._groups[i]) for i in basis}
+        self._basis = {i: basis_rows(*self._groups[i]) for i in basis}
         self._items: list[tuple[int, Pair | None]] = []
         for i, (_, group) in enumerate(self._groups):
             self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
@@ -166,10 +132,10 @@ class GroupDataset:
     def stored(self, group: int, pair: Pair) -> tuple[Float[np.ndarray, "h w 3"], Intrinsics]:
         """A stored pair as it is: premultiplied linear image and intrinsics (environment at the model's size)."""
         shard, entry = self._groups[group]
-        maps = _with_material(_shared_maps(shard, entry), pair.metallic, pair.roughness)
+        maps = with_material(shared_maps(shard, entry), pair.metallic, pair.roughness)
         rows = {"image": pair.image, "specular": pair.specular, "diffuse": pair.diffuse}
-        maps |= {name: _trailing(shard.pixels[row]) for name, row in rows.items()}
-        return from_maps(maps | {"environment": _trailing(shard.environment[pair.light, 0])})
+        maps |= {name: trailing(shard.pixels[row]) for name, row in rows.items()}
+        return from_maps(maps | {"environment": trailing(shard.environment[pair.light, 0])})
 
     def whole_light(self, group: int, pair: Pair) -> Float[np.ndarray, "eh ew 3"]:
         """The light of a stored pair as its tar has it; `stored` has it at the model's size.
@@ -206,16 +172,16 @@ class GroupDataset:
         """
         rows = self.rows(group, pair, drawn)
         shard, entry = self._groups[group]
-        maps = _shared_maps(shard, entry)
-        nodes = np.stack([_trailing(shard.pixels[of_node]) for of_node in rows.image.T])
+        maps = shared_maps(shard, entry)
+        nodes = np.stack([trailing(shard.pixels[of_node]) for of_node in rows.image.T])
         maps["image"] = nodes[0] if pair is not None else interpolate_metallic(nodes, drawn.metallic)
-        maps |= {"specular": _trailing(shard.pixels[rows.specular]), "diffuse": _trailing(shard.pixels[rows.diffuse])}
-        maps = mix_lights(_with_material(maps, rows.metallic, rows.roughness), drawn.weights)
+        maps |= {"specular": trailing(shard.pixels[rows.specular]), "diffuse": trailing(shard.pixels[rows.diffuse])}
+        maps = mix_lights(with_material(maps, rows.metallic, rows.roughness), drawn.weights)
         if drawn.paint is not None:
             maps = repaint(maps, recoloured(maps["albedo"], maps["mask"], self.mean_colour(drawn.paint)))
         maps = quarter_turn(maps, drawn.turns)
         environment = shard.environment[rows.environment, drawn.turns]  # stored under each quarter turn
-        maps |= mix_lights({"environment": _trailing(environment)}, drawn.weights)
+        maps |= mix_lights({"environment": trailing(environment)}, drawn.weights)
         maps = permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
         factor = 1.0
         if drawn.exposure_target is not None:
@@ -239,7 +205,7 @@ class GroupDataset:
     @functools.cache  # noqa: B019 - a dataset lives as long as the training that reads it
     def mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
         """Of a group's object, as `unirender.training.repaint` has it."""
-        maps = _shared_maps(*self._groups[group])
+        maps = shared_maps(*self._groups[group])
         return mean_colour(maps["albedo"], maps["mask"])
 
     @property
@@ -257,7 +223,7 @@ class GroupDataset:
             raise UnirenderError("derived light was drawn, but the data was opened without it; pass derived=True")
         stored = self._derived[rows.shard]
         own = {name: stored.of(getattr(rows, name), drawn.shadowed) for name in ("specular", "diffuse")}
-        maps = mix_lights({name: _trailing(pixels) for name, pixels in own.items()}, drawn.weights)
+        maps = mix_lights({name: trailing(pixels) for name, pixels in own.items()}, drawn.weights)
         maps = quarter_turn(maps, drawn.turns)
         return permute_channels(mirror(maps) if drawn.mirror else maps, drawn.order)
 
@@ -290,59 +256,6 @@ def make_batch(
             stacked[i] = np.moveaxis(sample[name], -1, 0)
         batch[name] = torch.from_numpy(stacked)
     return moved(batch, [draw.move for _, _, draw in drawn])
-
-
-def _basis(shard: Shard, group: Group) -> _Basis:
-    """Sorts a basis group's pairs into its grid.
-
-    Raises:
-        UnirenderError: the grid is not complete.
-    """
-    where = f"{shard.name}: group {group.key}"
-    lights = sorted({pair.light for pair in group.pairs})
-    roughness = sorted({pair.roughness for pair in group.pairs if pair.roughness is not None})
-    if not roughness:  # of a shard that was packed by an earlier version
-        raise UnirenderError(f"{where}: has no picture of a roughness and metallic, expected a full basis grid")
-    by_node = {(pair.light, pair.roughness, pair.metallic): pair for pair in group.pairs}
-    try:
-        grid = [[[by_node[light, r, m] for m in METALLIC_NODES] for r in roughness] for light in lights]
-    except KeyError as error:
-        raise UnirenderError(
-            f"{where}: no picture for (light, roughness, metallic) {error}, expected a full basis grid"
-        ) from error
-    if len(by_node) != len(lights) * len(roughness) * len(METALLIC_NODES):
-        others = {"maps" if m is None else f"{m:g}" for _, _, m in by_node if m not in METALLIC_NODES}
-        raise UnirenderError(
-            f"{where}: got pictures at metallic {', '.join(sorted(others))} in a basis group, expected "
-            f"{', '.join(map(str, METALLIC_NODES))} alone; write vary independent"
-        )
-    return _Basis(
-        roughness=tuple(roughness),
-        image=np.array([[[pair.image for pair in nodes] for nodes in row] for row in grid]),
-        specular=np.array([[nodes[0].specular for nodes in row] for row in grid]),
-        diffuse=np.array([row[0][0].diffuse for row in grid]),
-        environment=np.array(lights),
-    )
-
-
-def _trailing(stored: Float16[np.ndarray, "*l c h w"] | Float[np.ndarray, "*l c h w"]) -> Float[np.ndarray, "*l h w c"]:
-    return np.moveaxis(stored.astype(np.float32, copy=False), -3, -1)
-
-
-def _shared_maps(shard: Shard, group: Group) -> Maps:
-    shared = _trailing(shard.shared[group.shared])
-    maps = {"albedo": shared[..., :3], "normal": shared[..., 3:6], "mask": shared[..., 6:7]}
-    if shared.shape[-1] > SCALAR_CHANNELS:
-        maps |= {"roughness": shared[..., 7:8], "metallic": shared[..., 8:9]}
-    return maps
-
-
-def _with_material(maps: Maps, metallic: float | None, roughness: float | None) -> Maps:
-    """The maps with a material that is one value over the object; None: it is in the maps already."""
-    if metallic is None or roughness is None:
-        return maps
-    inside = (maps["mask"] > 0).astype(np.float32)
-    return maps | {"metallic": inside * np.float32(metallic), "roughness": inside * np.float32(roughness)}
 
 
 __all__ = ["DEFAULT_AUGMENTATION", "NO_AUGMENTATION", "Augmentation", "Batch", "GroupDataset", "make_batch"]

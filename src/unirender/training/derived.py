@@ -30,7 +30,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
-from unirender.training.groups import Group, Shard, read_environments
+from unirender.training.groups import Group, Shard, mapped, read_environments, store
 
 logger = logging.getLogger(__name__)
 
@@ -82,9 +82,7 @@ def _folder(shard: Shard) -> Path:
 
 
 def _open(folder: Path) -> DerivedLight:
-    mapped = (np.load(folder / f"{name}.npy", mmap_mode="r") for name in _STORED)
-    unshadowed, shadowed = (np.asarray(pixels) for pixels in mapped)  # plain views of the memory maps
-    return DerivedLight(unshadowed, shadowed, np.load(folder / "rows.npy"))
+    return DerivedLight(*(mapped(folder / f"{name}.npy") for name in (*_STORED, "rows")))
 
 
 def one_thread() -> None:
@@ -107,8 +105,8 @@ def _derive(path: Path, shard: Shard) -> None:
             pixels.append(light)
     with cached_folder(folder) as made:
         for name, maps in zip(_STORED, np.stack(pixels, axis=1), strict=True):
-            np.save(made / f"{name}.npy", maps)
-        np.save(made / "rows.npy", rows)
+            store(made / f"{name}.npy", maps)
+        store(made / "rows.npy", rows)
 
 
 def _of_group(

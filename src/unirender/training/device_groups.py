@@ -27,10 +27,11 @@ from unirender.exposure import MASK_THRESHOLD, PERCENTILE
 from unirender.models.priors import PRIORS
 from unirender.symmetries import LIGHT_MAPS
 from unirender.training.augment import COLOUR_MAPS, Draw, metallic_weights
-from unirender.training.data import DERIVED_MAPS, Batch, GroupDataset, SampleRows
+from unirender.training.data import DERIVED_MAPS, Batch, GroupDataset
 from unirender.training.groups import SCALAR_CHANNELS, Pair
 from unirender.training.moving import moved
 from unirender.training.repaint import CHANNEL_RANGE, POWER_RANGE
+from unirender.training.rows import SampleRows
 
 SHARED_CHANNELS = SCALAR_CHANNELS + 2  # with roughness and metallic maps, whether a group has them or not
 

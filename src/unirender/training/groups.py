@@ -32,7 +32,7 @@ from unirender.paths import cache_dir, cached_folder
 from unirender.training.packing import SCALAR_CHANNELS, Group, Packer, Pair
 from unirender.whole_files import file_sha256
 
-PACK_VERSION = 2  # part of the cache's path: raise it when what is packed, or refused, changes
+PACK_VERSION = 3  # part of the cache's path: raise it when what is packed, or refused, changes
 END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends
 
 
@@ -131,7 +131,10 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                     if members:
                         yield key, members
                     if name in seen:
-                        raise UnirenderError(f"{path}: group {name} occurs twice, expected each key once")
+                        raise UnirenderError(
+                            f"{path}: group {name} occurs twice, or other members stand between its own, expected each "
+                            "key once and its members together"
+                        )
                     key, members = name, {}
                     seen.add(name)
                 if rest in members:
@@ -182,14 +185,45 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
                 f"{path}: sha256 is {actual}, the manifest says {sha256}; delete the shard and remake the dataset"
             )
         _pack(path, folder)
-    arrays = {}
-    for array in ("pixels", "shared", "environment"):
-        arrays[array] = np.asarray(np.load(folder / f"{array}.npy", mmap_mode="r"))  # a plain view of the memory map
-    groups = tuple(
-        Group(**{**group, "pairs": tuple(Pair(**pair) for pair in group["pairs"])})
-        for group in json.loads((folder / "index.json").read_text())
-    )
+    arrays = {array: mapped(folder / f"{array}.npy") for array in ("pixels", "shared", "environment")}
+    try:
+        groups = tuple(
+            Group(**{**group, "pairs": tuple(Pair(**pair) for pair in group["pairs"])})
+            for group in json.loads((folder / "index.json").read_text())
+        )
+    except (OSError, ValueError) as error:
+        raise damaged(folder, error) from error
     return Shard(name=name or path.name, sha256=known, groups=groups, **arrays)
+
+
+def mapped(path: Path) -> np.ndarray:
+    """A plain read-only view of an array of the cache, which stays on the disk.
+
+    Raises:
+        UnirenderError: it is gone, or cut off.
+    """
+    try:
+        return np.asarray(np.load(path, mmap_mode="r"))
+    except (OSError, ValueError) as error:
+        raise damaged(path.parent, error) from error
+
+
+def store(path: Path, array: np.ndarray) -> None:
+    """Writes an array of the cache.
+
+    Raises:
+        OSError: it cannot be written, with words on why: of a full disk NumPy has no number that the system has words
+            for.
+    """
+    try:
+        np.save(path, array)
+    except OSError as error:
+        raise OSError(error.errno or 0, error.strerror or str(error)) from error
+
+
+def damaged(folder: Path, error: Exception) -> UnirenderError:
+    """What is said of a folder of the cache that is not what was written."""
+    return UnirenderError(f"{folder}: this folder of the cache is damaged ({error}); delete it, it is then made again")
 
 
 def _pack(path: Path, folder: Path) -> None:
@@ -200,7 +234,7 @@ def _pack(path: Path, folder: Path) -> None:
         raise UnirenderError(f"{path}: the shard has no groups; delete it and remake the dataset")
     with cached_folder(folder) as made:
         for name, array in packer.arrays().items():
-            np.save(made / f"{name}.npy", array)
+            store(made / f"{name}.npy", array)
         (made / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
 
 
@@ -209,8 +243,11 @@ __all__ = [
     "Group",
     "Pair",
     "Shard",
+    "damaged",
     "list_shards",
+    "mapped",
     "open_packed",
     "read_environments",
     "read_groups",
+    "store",
 ]

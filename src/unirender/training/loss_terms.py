@@ -3,6 +3,7 @@
 Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +17,7 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 
+HALF_SCALE = 1024.0  # of a loss whose gradient goes through float16, which has nothing below 6e-8
 COLOURS = ("albedo", "specular", "diffuse")  # the attribute pictures that are scored by PSNR
 LossTerms = dict[str, Float[Tensor, ""]]
 
@@ -147,6 +149,23 @@ def _decibels(
     """The mean of the samples' errors, each of them `compressed`."""
     own = compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor)
     return (own if rows is None else own * rows).mean()
+
+
+def gradients(
+    loss: Float[Tensor, ""], inputs: Sequence[Tensor], dtype: torch.dtype = torch.float32
+) -> list[Tensor | None]:
+    """The gradient of a loss with respect to each input; None: it takes no part.
+
+    Args:
+        loss: a scalar.
+        inputs: float32.
+        dtype: of the autocast in which the loss was computed. In float16 a third of the gradients of a trained network
+            would be 0; of a larger loss they are not, and they are divided again.
+    """
+    if dtype != torch.float16:
+        return list(torch.autograd.grad(loss, inputs, allow_unused=True))
+    scaled = torch.autograd.grad(HALF_SCALE * loss, inputs, allow_unused=True)
+    return [None if gradient is None else gradient / HALF_SCALE for gradient in scaled]
 
 
 def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:

@@ -27,18 +27,12 @@ from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
 from unirender.errors import UnirenderError
 from unirender.models.priors import Maps
-from unirender.training.loss_terms import Errors, LossTerms
+from unirender.training.loss_terms import COLOURS, Errors, LossTerms, gradients
 from unirender.training.losses import LossFunction
 from unirender.training.presets import TrainConfig
 from unirender.training.processes import ALONE, Processes
 
-OWN_ROWS = (
-    "image",
-    "environment",
-    "composite",
-    "cycle",
-    "answers",
-)  # terms that are means over rows, or with weights, of their own
+OWN_ROWS = ("image", "environment", "composite", "cycle", "answers")  # terms whose means have weights of their own
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
 ByName = dict[str, float]
@@ -97,7 +91,8 @@ class Part:
         timesteps: of these rows.
         seed: of noise and dropped maps.
         cycle_share: share of its inverse rows, from the first on, that are rendered again.
-        mass: weight of its rows in the mean of each term of `OWN_ROWS`, and of the others ("attributes").
+        mass: weight of its rows in the mean of each term of `OWN_ROWS`, of those of `COLOURS` ("colours") and of the
+            others ("attributes").
     """
 
     rows: slice
@@ -145,18 +140,17 @@ class BatchGradient:
             terms = {name: shares[name] * mean for name, mean in means.items()}
             if not terms:  # Algorithm 1 may leave both streams of a row clean
                 return [None] * len(parameters), {}
-            gradients = torch.autograd.grad(self.loss.total(terms), parameters, allow_unused=True)
-            return gradients, {name: float(term.detach()) for name, term in terms.items()}
+            found = gradients(self.loss.total(terms), parameters, self.dtype)
+            return found, {name: float(term.detach()) for name, term in terms.items()}
 
-        gradients: Gradients = [None] * len(parameters)
+        summed: Gradients = [None] * len(parameters)
         values: list[ByName] = []
         for first in range(0, len(parts), self.split.at_once):
             some = parts[first : first + self.split.at_once]
             for more, terms in self.pool.map(run, some) if self.pool else map(run, some):
-                gradients = _plus(gradients, more)
+                summed = _plus(summed, more)
                 values.append(terms)
-        gradients = self._over_processes(parameters, gradients)
-        for p, gradient in zip(parameters, gradients, strict=True):
+        for p, gradient in zip(parameters, self._over_processes(parameters, summed), strict=True):
             p.grad = None if gradient is None else laid_out_like(p, gradient)
         return _sum(self.split.processes.gather(_sum(values)))
 
@@ -175,17 +169,21 @@ class BatchGradient:
             )
         last = last_timestep(self.loss.scheduler)
         drawn = draw_timesteps(c.timestep_rule, split.batch_size, last, c.p_render, c.p_t, self.generator)
-        seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
         inverse = (drawn.attributes > 0) & (drawn.image == 0)
-        again = inverse & (inverse.cumsum(0) <= round(self.loss.config.cycle_share * int(inverse.sum())))
+        # A share of few rows is no whole number: rounded at random it is right in the mean, of one row too.
+        count = int(self.loss.config.cycle_share * int(inverse.sum()) + float(torch.rand((), generator=self.generator)))
+        again = inverse & (inverse.cumsum(0) <= count)
+        seeds = [int(torch.randint(0, 2**62, (), generator=self.generator)) for _ in range(split.all_parts)]
         weight = self._row_weights(batch["mask"])
+        floors = self.loss.config.image_floor, self.loss.config.colour_floor
+        of_image, of_colours = (torch.ones_like(weight) if floor else weight for floor in floors)  # see `_decibels`
         parts: list[Part] = []
         for j in range(split.parts):
             rows = slice(j, None, split.parts)
             a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
             w = weight[rows]
-            mass = {"image": w[i > 0], "attributes": w[a > 0], "environment": a > 0, "composite": w[x], "cycle": w[y]}
-            mass["answers"] = x
+            mass = {"image": of_image[rows][i > 0], "attributes": w[a > 0], "colours": of_colours[rows][a > 0]}
+            mass |= {"environment": a > 0, "composite": w[x], "cycle": w[y], "answers": x}
             seed = seeds[split.processes.rank + split.processes.size * j]
             share = int(y.sum()) / max(1, int(x.sum()))
             parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))
@@ -206,14 +204,14 @@ class BatchGradient:
         errors = Errors(self.loss.conditioning, self.loss.config.background)
         return errors.pixel_weights(mask.double()).sum(dim=(1, 2, 3)).cpu()
 
-    def _over_processes(self, parameters: Sequence[Tensor], gradients: Gradients) -> Gradients:
+    def _over_processes(self, parameters: Sequence[Tensor], own: Gradients) -> Gradients:
         """Sums over the processes. A parameter that took no part in any of them keeps None as its gradient."""
         processes = self.split.processes
-        here = [gradient is not None for gradient in gradients]
+        here = [gradient is not None for gradient in own]
         used = [any(flags) for flags in zip(*processes.gather(here), strict=True)]
         held = [
             torch.zeros_like(p) if gradient is None else gradient
-            for p, gradient, is_used in zip(parameters, gradients, used, strict=True)
+            for p, gradient, is_used in zip(parameters, own, used, strict=True)
             if is_used
         ]
         summed = iter(processes.sum(held))
@@ -222,7 +220,7 @@ class BatchGradient:
 
 def kind_of(term: str) -> str:
     """The name under which `Part.mass` has the weights of a loss term's mean."""
-    return term if term in OWN_ROWS else "attributes"
+    return term if term in OWN_ROWS else "colours" if term in COLOURS else "attributes"
 
 
 def _plus(a: Sequence[Tensor | None], b: Sequence[Tensor | None]) -> Gradients:

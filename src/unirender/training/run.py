@@ -7,18 +7,22 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, DType, notice, usage
+from unirender.options import Device, DType, check_seed, notice, usage
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
 from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:
+    import torch
+
+    from unirender.training.data import GroupDataset
     from unirender.training.device_data import DeviceSource
     from unirender.training.memory import TrainingBytes
+    from unirender.training.processes import Processes
     from unirender.training.source import ShardSource
     from unirender.training.trainer import Trainer
     from unirender.training.validation import Validate
@@ -26,6 +30,7 @@ if TYPE_CHECKING:
 Batches = Literal["auto", "cpu", "device"]
 MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
 ScoreNames = Callable[[], Sequence[str]]  # names of the scores that such a function gives
+Alone = Callable[[Path], contextlib.AbstractContextManager[Any]]  # holds a run's folder against another process
 
 
 @dataclass(frozen=True)
@@ -89,6 +94,11 @@ class Train:
     are installed."""
 
     @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.out or cache_dir() / "runs" / self.preset
+
+    @property
     def scored_on(self) -> str | None:
         """In words: what `validate` measures on."""
         return f"{self.validate} scenes of the suite {Path(self.validate_suite).stem}" if self.validate else None
@@ -102,8 +112,9 @@ class Train:
         positive = ("minutes", "steps", "batch_size", "learning_rate", "parallel", "accumulate", "log_every")
         for name in (*positive, "save_minutes", "refresh_minutes"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise UsageError(f"--{name.replace('_', '-')} {value}: expected more than 0")
+            if value is not None and not 0 < value < math.inf:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: expected a number above 0")
+        check_seed(self.seed)
         if self.validate < 0:
             raise UsageError(f"--validate {self.validate}: expected a number of scenes, or 0 for none")
         if self.keep_best is not None and not self.validate:
@@ -135,7 +146,7 @@ class Train:
     def _check_start(self, config: TrainConfig) -> None:
         if self.init is not None and self.init_from is not None:
             raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
-        if config.trains != "all" and self.init is None:
+        if config.trains != "all" and self.init is None and not self._is_saved():
             raise UsageError(
                 f"--preset {self.preset}: it trains a part of a network and leaves the others as they are, expected "
                 "--init with a trained one (the name of a shipped checkpoint, or a pipeline folder)"
@@ -156,7 +167,15 @@ class Train:
                 "needs; pass --init-from with a Stable Diffusion folder (or --init with a pipeline of this preset)"
             )
 
-    def run(self, make_validation: MakeValidation, score_names: ScoreNames) -> int:
+    def _is_saved(self) -> bool:
+        """Whether there is a run to go on with, which has all weights."""
+        from unirender.training.checkpoint import STATE_FILE
+
+        return (self.folder / STATE_FILE).is_file()
+
+    def run(
+        self, make_validation: MakeValidation, score_names: ScoreNames, alone: Alone = contextlib.nullcontext
+    ) -> int:
         """Trains, or resumes; `pipeline/` in the run folder is what it leaves. Returns the exit status.
 
         Under torchrun this is one of several processes, of which the first one writes and speaks.
@@ -168,35 +187,56 @@ class Train:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
-        out = self.out or cache_dir() / "runs" / self.preset
-        check_out(out)
+        check_out(self.folder)
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
-        pipeline = train(self, config, out, validate)
+        pipeline = train(self, config, self.folder, validate, alone)
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
 
 
-def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | None" = None) -> Path | None:
+def train(
+    options: Train,
+    config: TrainConfig,
+    out: Path,
+    validate: "Validate | None" = None,
+    alone: Alone = contextlib.nullcontext,
+) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
-    import diffusers
-    import torch
-    from rich.console import Console
-
-    from unirender.models.precision import resolve_device, resolve_dtype
-    from unirender.training.checkpoint import STATE_FILE
-    from unirender.training.export import export_pipeline
+    from unirender.models.precision import resolve_device
     from unirender.training.groups import list_shards
-    from unirender.training.live import live_report
-    from unirender.training.memory import training_bytes
     from unirender.training.processes import join_processes
-    from unirender.training.start import read_start
-    from unirender.training.trackers import make_trackers, tracking
-    from unirender.training.trainer import RunConfig, Trainer
 
     processes, device = join_processes(resolve_device(options.device))
     if options.batches == "device" and device.type != "cuda":
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
+    list_shards(options.data)  # says what is wrong with the data before anything is built or written
+    with alone(out) if processes.is_main else contextlib.nullcontext():
+        return _train(options, config, out, validate, processes, device)
+
+
+def _train(
+    options: Train,
+    config: TrainConfig,
+    out: Path,
+    validate: "Validate | None",
+    processes: "Processes",
+    device: "torch.device",
+) -> Path | None:
+    """In a folder that no other run writes to."""
+    import diffusers
+    import torch
+    from rich.console import Console
+
+    from unirender.models.precision import resolve_dtype
+    from unirender.training.checkpoint import STATE_FILE
+    from unirender.training.export import export_pipeline
+    from unirender.training.live import live_report
+    from unirender.training.memory import training_bytes
+    from unirender.training.start import read_start
+    from unirender.training.trackers import make_trackers, tracking
+    from unirender.training.trainer import RunConfig, Trainer
+
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
@@ -215,7 +255,6 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
         scored_on=options.scored_on,
     )
     trackers = make_trackers(options.track, out) if processes.is_main else ()
-    list_shards(options.data)  # says what is wrong with the data before anything is built or written
     tell = notice if processes.is_main else lambda text: None
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     start = read_start(config.model, options.init, options.init_from)
@@ -226,11 +265,14 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
     if options.gradient_checkpointing:
         trainer.model.enable_gradient_checkpointing()
     memory = training_bytes(trainer.model, config.optimizer.kind)
-    source = make_source(options, config, trainer, memory)
+    source, data = make_source(options, config, trainer, memory)
     say = functools.partial(Console().print, soft_wrap=True, highlight=False, markup=False)
     say(f"{out}: {described(trainer, source)}")
     if processes.is_main:
         say(f"memory: {memory}")
+        if not resumed:  # which goes on with the shards that it has
+            say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+    del data  # a folder that grew is opened anew: not both at once
     with contextlib.closing(source):
         with (
             live_report(run.steps, run.minutes, Console(quiet=not processes.is_main)) as show,
@@ -244,8 +286,9 @@ def train(options: Train, config: TrainConfig, out: Path, validate: "Validate | 
 
 def make_source(
     options: Train, config: TrainConfig, trainer: "Trainer", memory: "TrainingBytes"
-) -> "ShardSource | DeviceSource":
-    """Where the batches come from, opened: the CPU; or the training's device, where that is asked for or has the place.
+) -> "tuple[ShardSource | DeviceSource, GroupDataset]":
+    """Where the batches come from, and the packed data that it opened: the CPU; or the training's device, where that is
+    asked for or has the place.
 
     Args:
         options: data folder, and where batches are made.
@@ -267,8 +310,8 @@ def make_source(
     )
     packed = source.open()
     if options.batches == "device" or (options.batches == "auto" and fits(packed, trainer.device, memory)):
-        return DeviceSource(source, trainer.device)
-    return source
+        return DeviceSource(source, trainer.device), packed
+    return source, packed
 
 
 def described(trainer: "Trainer", source: "ShardSource | DeviceSource") -> str:

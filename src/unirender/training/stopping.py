@@ -1,12 +1,14 @@
 """Asked to stop, a training ends its step and saves: nothing of it is lost, and no weight is left half way.
 
 An interrupt from the keyboard, the SIGTERM of a batch system that wants its machine back and the SIGHUP of a terminal
-that closes are such a request. Who asks a second time is not made to wait.
+that closes are such a request. Who asks a second time is not made to wait. A SIGTERM that comes at once after another
+is no second request: a launcher such as torchrun passes on what a batch system has told all processes already.
 """
 
 import contextlib
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
@@ -14,6 +16,7 @@ from types import FrameType
 from unirender.command_line import Ended
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+PASSED_ON_S = 2.0  # seconds in which a SIGTERM may come again by another way
 
 
 @dataclass
@@ -21,6 +24,7 @@ class StopRequest:
     """The signal by which somebody asked; None: nobody has."""
 
     signal: int | None = None
+    last: float = float("-inf")  # time of the last one
 
     @property
     def asked(self) -> bool:
@@ -49,9 +53,11 @@ def stopping_gently() -> Iterator[StopRequest]:
         return
 
     def hear(number: int, frame: FrameType | None) -> None:
-        if request.asked:
+        now, before = time.monotonic(), request.last
+        passed_on = request.signal == number == signal.SIGTERM and now - before < PASSED_ON_S
+        if request.asked and not passed_on:
             raise Ended(number)
-        request.signal = number
+        request.signal, request.last = number, now
 
     hung_up_for_nobody = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     heard = [number for number in SIGNALS if not (number == signal.SIGHUP and hung_up_for_nobody)]

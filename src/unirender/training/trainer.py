@@ -11,7 +11,6 @@ clock; weights, optimiser and random state are alike on all.
 
 import contextlib
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,24 +26,23 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
-from unirender.training.beginning import Beginning, check_beginning
-from unirender.training.checkpoint import STATE_FILE, differences, load_state, plain, save_state
+from unirender.training.beginning import Beginning
+from unirender.training.checkpoint import STATE_FILE, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
 from unirender.training.losses import LossFunction
 from unirender.training.muon import make_optimizer
-from unirender.training.passes import BatchGradient, Split, laid_out_like
+from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
+from unirender.training.state import resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
-from unirender.whole_files import replace_file
-from unirender.writing import writing
 
 MOST_NAMED = 5  # maps and groups of a batch in a message
 
@@ -183,14 +181,15 @@ class Trainer:
         Raises:
             Ended: it was asked to stop.
         """
-        self.source = source
+        self.source, main = source, self.processes.is_main
+        validation = Validation(validate, self.run.keep_best) if validate else None
+        if main and validation is not None and not (self.run.out / STATE_FILE).exists():
+            validation.begin(self)
         resumed = self.resume(source, report)
         self._start_alike(source)
-        main = self.processes.is_main
         if resumed and main:
             say(standing(self.step, self.seconds / 60, self.run.steps, self.run.minutes))
-        self._write_config()
-        validation = Validation(validate, self.run.keep_best) if validate else None
+        write_config(self)
         fixed: Maps | None = None
 
         def look() -> None:
@@ -208,8 +207,8 @@ class Trainer:
             return True
 
         look()
-        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh", "log")}
-        logged = self.step
+        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh")}
+        logged = self.step, self.seconds
         with stopping_gently() as request:
             while self.progress < 1:
                 clock["step"] = time.monotonic()  # pictures, validation and saves are no training
@@ -217,18 +216,19 @@ class Trainer:
                 if fixed is None:
                     fixed = {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-                now = time.monotonic()
-                seconds, refresh = self.seconds + now - clock["step"], due("refresh", self.run.refresh_minutes)
+                seconds = self.seconds + time.monotonic() - clock["step"]
+                refresh = due("refresh", self.run.refresh_minutes)
                 self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.signal))
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
-                    speed = (self.step - logged) * self.config.batch_size / (now - clock["log"])
-                    clock["log"], logged = now, self.step
+                    speed = (self.step - logged[0]) * self.config.batch_size / (self.seconds - logged[1])
+                    logged = self.step, self.seconds
                     rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
                     with request.unheard():
                         self.log.tell(rates | self.log.means(), report)
                 if main and (stopping is not None or due("save", self.run.save_minutes)):
                     self.save(source)
                 if stopping is not None:
+                    self.processes.share(None)  # all wait: when one has ended, torchrun ends the one that saves
                     raise Ended(stopping)
                 with request.unheard():
                     if main and due("picture", self.run.picture_minutes):
@@ -261,7 +261,12 @@ class Trainer:
             source.load_state_dict(state)
 
     def _refresh(self, source: BatchSource, report: Report) -> None:
-        news = source.refresh() if self.processes.is_main else None
+        """Takes in new shards; where they cannot be used, the run goes on with those that it has, and says so."""
+        news = None
+        try:
+            news = source.refresh() if self.processes.is_main else None
+        except UnirenderError as error:
+            news = f"no new shards: {error}"
         if news := self.processes.share(news):
             self._follow_main(source)
             self.log.tell({"step": self.step, "data": news}, report)
@@ -294,66 +299,8 @@ class Trainer:
 
     def save(self, source: BatchSource) -> Path:
         """Writes everything that the next step depends on."""
-        return save_state(self.run.out, self.state_dict() | {"source": source.state_dict()})
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "config": plain(self.config),
-            "step": self.step,
-            "seconds": self.seconds,
-            "model": self.model.state_dict(),
-            "ema": self.ema.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "parts": self.split.all_parts,
-            "unlogged": dict(self.log.waiting),
-            "continues": self.continues,
-            "begun_with": self.begun_with,
-        }
+        return save_state(self.run.out, state_of(self, source))
 
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
-        """Continues from the folder's state, if it has one; `report` is told where that cannot be exact.
-
-        Raises:
-            UnirenderError: the state is broken, belongs to another config, or was begun with other weights.
-        """
-        state = load_state(self.run.out)
-        if state is None:
-            self.log.forget_after(-1)  # all of a run that was killed before its first save
-            return False
-        if differing := differences(state["config"], self.config):
-            raise UnirenderError(
-                f"{self.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
-                "another --out"
-            )
-        begun = state.get("begun_with")
-        check_beginning(self.run.out, begun, self.begun_with or {})
-        self.begun_with = begun
-        self.step, self.seconds = state["step"], state["seconds"]
-        self.continues = state.get("continues", self.continues)  # states of version 0.1.0 do not say
-        self.model.load_state_dict(state["model"])
-        self.ema.load_state_dict(state["ema"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        for p, moments in self.optimizer.state.items():
-            same_shape = {name: value for name, value in moments.items() if value.shape == p.shape}
-            moments.update({name: laid_out_like(p, value) for name, value in same_shape.items()})
-        self.generator.set_state(state["generator"])
-        self.log.waiting.update(state.get("unlogged", {}))
-        source.load_state_dict(state["source"])
-        self.log.forget_after(self.step)
-        parts = state.get("parts", state.get("parallel", self.split.all_parts))  # older states: parallel, or nothing
-        if parts != self.split.all_parts:
-            news = f"{parts} -> {self.split.all_parts}: from here on other noise is drawn than without the change"
-            self.log.tell({"step": self.step, "parts": news}, report)
-        return True
-
-    def _write_config(self) -> None:
-        own = {"device": str(self.device), "dtype": str(self.dtype), "threads": torch.get_num_threads()}
-        hardware = self.processes.gather(own)  # by process
-        if not self.processes.is_main:
-            return
-        run = dataclasses.asdict(self.run) | {"out": str(self.run.out)}
-        text = json.dumps({"train": dataclasses.asdict(self.config), "run": run, "hardware": hardware}, indent=2)
-        path = self.run.out / "config.json"
-        with writing(path):
-            replace_file(path, text + "\n")
+        """As `unirender.training.state.resume`."""
+        return resume(self, source, report)

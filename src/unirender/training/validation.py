@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.training.checkpoint import restore_folder
-from unirender.training.export import SCORES_FILE, averaged_pipeline, export_pipeline
+from unirender.training.checkpoint import differences, restore_folder
+from unirender.training.export import SCORES_FILE, TRAINING_FILE, averaged_pipeline, export_pipeline
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
@@ -38,6 +38,21 @@ class Validation:
 
     validate: Validate
     keep_best: str | None = None
+
+    def begin(self, trainer: "Trainer") -> None:
+        """Looks at the `best/` of a run that begins: it may be its own, if it was killed before its first save.
+
+        Raises:
+            UnirenderError: it is that of a run of another configuration.
+        """
+        path = trainer.run.out / BEST_FOLDER / TRAINING_FILE
+        if self.keep_best is None or not path.is_file():
+            return
+        if differing := differences(json.loads(path.read_text())["train"], trainer.config):
+            raise UnirenderError(
+                f"{path.parent}: is the best of another run, with {', '.join(differing)}, whose scores these weights "
+                "would have to beat; move it away, or pass another --out"
+            )
 
     def run(self, trainer: "Trainer") -> dict[str, Any]:
         """Scores the averaged weights, and keeps them if they are the best so far; returns a line for the log.

@@ -13,8 +13,10 @@ A run resumes by running the same command again: the order of objects and all th
 and the step.
 """
 
+import contextlib
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
+from unirender.options import check_seed
+from unirender.training.run import Alone
 from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:
@@ -44,6 +48,7 @@ EMA_DECAY = 0.995
 MAX_NORM = 1.0
 SAVE_SECONDS = 120.0
 WEIGHTS_FILE, LOG_FILE = "visibility.safetensors", "log.jsonl"
+OF_A_STATE = ("options", "step", "net", "optimizer", "ema")
 
 
 @dataclass(frozen=True)
@@ -73,12 +78,13 @@ class TrainVisibility:
             UsageError: one is outside its range.
         """
         for name in ("steps", "batch_size", "learning_rate"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected more than 0")
+            if not 0 < getattr(self, name) < math.inf:
+                raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected a number above 0")
+        check_seed(self.seed)
         if not 0 <= self.halved <= 1:
             raise UsageError(f"--halved {self.halved}: expected a share in [0, 1]")
 
-    def run(self) -> int:
+    def run(self, alone: Alone = contextlib.nullcontext) -> int:
         """Trains, or resumes; returns the exit status."""
         self.check()
         if not self.data.is_dir():
@@ -86,7 +92,8 @@ class TrainVisibility:
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
         check_out(self.out)
-        print(f"{train_visibility(self)}: trained")
+        with alone(self.out):
+            print(f"{train_visibility(self)}: trained")
         return 0
 
 
@@ -149,7 +156,7 @@ class _Run:
         self.ema = Ema(self.net, EMA_DECAY)
         self.step, self.losses = 0, list[tuple[float, float]]()
         self.log = options.out / LOG_FILE
-        if (state := load_state(options.out)) is not None:
+        if (state := load_state(options.out, OF_A_STATE)) is not None:
             self._resume(state)
         elif self.log.is_file():
             self.log.unlink()  # of a run that was killed before its first state
@@ -159,9 +166,11 @@ class _Run:
     def _resume(self, state: Mapping[str, Any]) -> None:
         from unirender.training.run_log import forget_after
 
-        if state["options"] != self.asked:
+        before = state["options"]
+        if differing := [name for name in self.asked if before.get(name) != self.asked[name]]:
             raise UnirenderError(
-                f"{self.options.out}: holds a run of other options or data, expected a new folder; choose another --out"
+                f"{self.options.out}: holds a run with other {', '.join(differing)}; repeat the options of that run, "
+                "or choose another --out"
             )
         self.net.load_state_dict(state["net"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -181,7 +190,12 @@ class _Run:
             bce, error = terms(self.net, item, rng)
             ((bce + LIGHT_WEIGHT * error) / options.batch_size).backward()
             self.losses.append((bce.item(), error.item()))
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), MAX_NORM)
+        norm = torch.nn.utils.clip_grad_norm_(self.net.parameters(), MAX_NORM)
+        if not torch.isfinite(norm):
+            raise UnirenderError(
+                f"training: the gradient at step {self.step} is {float(norm)}; begin anew with a lower --learning-rate "
+                "and another --out"
+            )
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(self.net)

@@ -1,0 +1,50 @@
+"""The options of `unirender train`, looked at before anything is read."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic_shards import write_dataset
+
+from unirender import cli
+from unirender.errors import UsageError
+from unirender.training.checkpoint import STATE_FILE
+from unirender.training.run import Train
+from unirender_reference.folder_lock import locked, made_folder
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"learning_rate": math.inf}, "--learning-rate inf: expected a number above 0"),
+        ({"minutes": math.nan}, "--minutes nan: expected a number above 0"),
+        ({"minutes": math.inf}, "--minutes inf"),
+        ({"steps": 0}, "--steps 0"),
+        ({"seed": -1}, "--seed -1: expected an integer from 0"),
+        ({"seed": 10**23}, "--seed 1000"),
+    ],
+)
+def test_a_value_outside_its_range_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        Train(Path("data"), **options).check()
+
+
+def test_a_run_of_a_part_goes_on_without_what_it_began_with(tmp_path: Path) -> None:
+    """Its state has all weights, and the folder that it began with may be gone."""
+    run = Train(Path("data"), preset="tiny_inverse", out=tmp_path)
+    with pytest.raises(UsageError, match="expected --init with a trained one"):
+        run.check()
+    (tmp_path / STATE_FILE).touch()
+    assert run.check().trains == "inverse"
+
+
+@pytest.mark.parametrize("command", ["train", "train-visibility"])
+def test_a_second_run_in_one_folder_is_refused(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset(tmp_path / "data", size=64)
+    with made_folder(tmp_path / "run"), locked(tmp_path / "run"), pytest.raises(SystemExit) as stopped:
+        cli.main([command, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), "--steps", "1"])
+    assert stopped.value.code == 1
+    assert "run: another run is writing here; wait for it, or choose another --out" in capsys.readouterr().err
