@@ -513,7 +513,7 @@ USAGE = {
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
     "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
-    "minutes": (["train", "--data", "FOLDER", "--minutes", "0"], "more than 0"),
+    "minutes": (["train", "--data", "FOLDER", "--minutes", "0"], "above 0"),
     "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
     "best of another": (
         ["train", "--data", "FOLDER", "--out", "OUT", "--validate", "1", "--keep-best", "albedo.snr"],
