@@ -226,8 +226,9 @@ class CompositeOf:
     """Edits and relights with another method's decomposition and the closed-form composite: what its renderer has to
     beat.
 
-    By our pipeline's own rules, under another light s and d keep a part of what they have beyond their own, and, where
-    it is anchored, what the decomposition could not explain of the picture is carried over.
+    By our pipeline's own rules, from the maps alone that the method returns: under another light s and d keep a part of
+    what they have beyond their own, and, where it is anchored, what the decomposition could not explain of the picture
+    is carried over.
     """
 
     def __init__(self, base: Any, anchored: bool, edited: dict[str, Intrinsics] | None = None) -> None:

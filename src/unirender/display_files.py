@@ -9,12 +9,12 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
-from unirender.sixteen_bits import has_sixteen_bits, opened, sixteen_bit_values
+from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
-SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read, since they are converted: save it in sRGB to keep them"
+SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
 def open_picture(path: str | Path) -> Image.Image:
@@ -31,6 +31,11 @@ def open_picture(path: str | Path) -> Image.Image:
                 if width * height > MAX_PIXELS:
                     raise UnirenderError(
                         f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
+                    )
+                if misread(file):
+                    raise UnirenderError(
+                        f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
+                        "cannot be read; save it as PNG, or with interleaved channels"
                     )
                 file.load()
                 return ImageOps.exif_transpose(file)

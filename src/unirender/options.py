@@ -223,7 +223,7 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     """
     import numpy as np
 
-    from unirender.pictures import read_mask_file, read_picture
+    from unirender.pictures import OPAQUE, read_mask_file, read_picture
 
     picture = read_picture(path)
     remarks = dict(picture.remarks)
@@ -232,12 +232,12 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
         picture = dataclasses.replace(picture, mask=coverage)
-        if coverage.min() == 1:
+        if coverage.min() >= OPAQUE:
             remarks["mask"] = "the mask covers the whole frame, which is taken as the object"
     elif picture.mask is None:
         remarks["mask"] = f"no mask and no alpha channel: the whole frame is taken as the object{option}"
         picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
-    elif picture.mask.min() == 1:
+    elif picture.mask.min() >= OPAQUE:
         remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
     assert picture.mask is not None, "the whole frame at least"
     if (most := picture.mask.max()) < FULL_COVERAGE:

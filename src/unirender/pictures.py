@@ -16,6 +16,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
 
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
+OPAQUE = DISPLAY_WHITE  # a coverage from which it is whole: no alpha of 8 bits lies between
 NEGATIVE_MOST = 0.05  # share of all radiance up to which negative values pass, as a filter's ringing or a wider gamut
 ALPHA_TOLERANCE = 1e-3  # of an EXR: half precision and filters step over [0, 1]
 MASK_BEYOND = 0.1  # how far an EXR's mask may step over [0, 1]: more is no filter's ringing
@@ -137,7 +138,7 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
 
 def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
     """What RGB or RGBA values say as a mask: the alpha channel if it varies, else the mean of the colours."""
-    if values.shape[-1] == 4 and values[..., 3].min() < 1:
+    if values.shape[-1] == 4 and values[..., 3].min() < OPAQUE:
         return values[..., 3:]
     return values[..., :3].mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
 

@@ -15,6 +15,9 @@ from PIL import Image, ImageOps
 
 OTHER_ORDER = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # N: this machine's own
 UNPACKED = {"RGB": "RGB", "RGBX": "RGBX", "RGBA": "RGBA", "RGBa": "RGBA"}  # as Pillow names them -> bytes as they are
+PLANAR_CONFIGURATION, SEPARATE = 284, 2  # tags and values of TIFF
+COMPRESSION, UNCOMPRESSED = 259, 1
+BITS = 258
 GREY_AND_ALPHA = "LA"  # four bytes a pixel: the grey's, then the alpha's
 
 
@@ -26,13 +29,13 @@ def sixteen_bit_values(path: Path, *, upright: bool = False) -> Float[np.ndarray
         upright: turn it as its EXIF orientation says.
 
     Returns:
-        The values; None where Pillow itself keeps all bits of the pixels, or where they are CMYK.
+        The values; None where Pillow itself keeps all bits of the pixels, or where they are CMYK or `planar`.
 
     Raises:
         OSError, ValueError or SyntaxError: the picture is broken, as Pillow says it.
     """
     with opened(path) as picture:
-        name = has_sixteen_bits(picture)
+        name = "" if planar(picture) else has_sixteen_bits(picture)
         key = picture.info.get("transparency")
     pixels, _, order = (name or "").partition(";16")
     if pixels == GREY_AND_ALPHA:
@@ -60,9 +63,20 @@ def has_sixteen_bits(picture: Image.Image) -> str:
     """
     for tile in getattr(picture, "tile", ()):
         name = _name(tile.args)
-        if ";16" in name and not picture.mode.startswith("I"):
+        if ";16" in name and not picture.mode.startswith("I") and not name.startswith("BGR"):  # 16 bits a pixel
             return name
     return ""
+
+
+def planar(picture: Image.Image) -> bool:
+    """Whether it is a TIFF whose channels are stored one after the other: their low bytes are not to be had."""
+    return getattr(picture, "tag_v2", {}).get(PLANAR_CONFIGURATION) == SEPARATE
+
+
+def misread(picture: Image.Image) -> bool:
+    """Whether Pillow makes noise of it: such a TIFF, uncompressed and of more than 8 bits."""
+    tags = getattr(picture, "tag_v2", {})
+    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and max(tags.get(BITS, (8,))) > 8
 
 
 def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:

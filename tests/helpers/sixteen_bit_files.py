@@ -38,6 +38,7 @@ def write_tiff16(
     extra: int | None = None,
     compressed: bool = False,
     orientation: int = 1,
+    planar: bool = False,
 ) -> None:
     """A TIFF of `[h w c]` whole numbers, in one strip.
 
@@ -48,23 +49,26 @@ def write_tiff16(
         extra: what it says of a fourth channel: 0 nothing, 1 premultiplied alpha, 2 straight alpha.
         compressed: by Deflate.
         orientation: as EXIF counts them.
+        planar: channels one after the other, each in a strip.
     """
     height, width, channels = values.shape
-    data = values.astype(f"{order}u2").tobytes()
-    data = zlib.compress(data) if compressed else data
+    parts = [values[..., k] for k in range(channels)] if planar else [values]
+    strips = [part.astype(f"{order}u2").tobytes() for part in parts]
+    strips = [zlib.compress(strip) if compressed else strip for strip in strips]
     tags = [(256, 3, [width]), (257, 3, [height]), (258, 3, [16] * channels), (259, 3, [8 if compressed else 1])]
-    tags += [(262, 3, [2]), (273, 4, [0]), (274, 3, [orientation]), (277, 3, [channels]), (278, 3, [height])]
-    tags += [(279, 4, [len(data)])] + ([] if extra is None else [(338, 3, [extra])])
+    tags += [(262, 3, [2]), (273, 4, [0] * len(strips)), (274, 3, [orientation]), (277, 3, [channels])]
+    tags += [(278, 3, [height]), (279, 4, [len(strip) for strip in strips]), (284, 3, [2 if planar else 1])]
+    tags += [] if extra is None else [(338, 3, [extra])]
     first = 8 + 2 + 12 * len(tags) + 4
-    bits = struct.pack(f"{order}{channels}H", *[16] * channels)
-    entries = b""
+    beside = sum(len(numbers) * struct.calcsize(FORMATS[kind]) for _, kind, numbers in tags if len(numbers) > 1)
+    starts = np.cumsum([first + beside, *(len(strip) for strip in strips[:-1])]).tolist()
+    entries, long_values = b"", b""
     for tag, kind, numbers in tags:
+        value = struct.pack(f"{order}{len(numbers)}{FORMATS[kind]}", *(starts if tag == 273 else numbers))
         if len(numbers) > 1:  # too long for its entry
-            value = struct.pack(f"{order}I", first)
-        elif tag == 273:  # where the pixels are
-            value = struct.pack(f"{order}I", first + len(bits))
+            place, long_values = struct.pack(f"{order}I", first + len(long_values)), long_values + value
         else:
-            value = struct.pack(f"{order}{FORMATS[kind]}", *numbers).ljust(4, b"\0")
-        entries += struct.pack(f"{order}HHI", tag, kind, len(numbers)) + value
+            place = value.ljust(4, b"\0")
+        entries += struct.pack(f"{order}HHI", tag, kind, len(numbers)) + place
     head = struct.pack(f"{order}2sHIH", b"II" if order == "<" else b"MM", 42, 8, len(tags))
-    path.write_bytes(head + entries + bytes(4) + bits + data)
+    path.write_bytes(head + entries + bytes(4) + long_values + b"".join(strips))

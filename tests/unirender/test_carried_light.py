@@ -27,7 +27,7 @@ OPPOSITE = lamp(-1, -1, 0.4)
 
 
 def found(shadow: float = 0.6) -> Intrinsics:
-    """A ball whose right half lies in a shadow that its own light cannot explain."""
+    """A ball with a band in a shadow that its own light cannot explain."""
     y, x = (np.mgrid[:SIDE, :SIDE].astype(np.float32) + 0.5) / SIDE * 2.4 - 1.2
     z = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     mask = (x**2 + y**2 < 1)[..., None].astype(np.float32)
@@ -91,6 +91,22 @@ def test_light_that_is_given_stays_as_it_is(names: tuple[str, ...]) -> None:
     for name in NAMES:
         same = np.array_equal(after.require(name)[name], carried.require(name)[name])
         assert same == (name not in names), name
+
+
+@pytest.mark.parametrize("missing", ["environment", "specular", "diffuse"])
+def test_where_a_map_is_unknown_nothing_is_carried(missing: str) -> None:
+    before = found()
+    after = under_light(before, OWN, "keep")
+    assert with_carried_light(before.replace(**{missing: None}), after, NAMES) is after
+
+
+def test_the_light_at_hand_is_taken_as_it_is() -> None:
+    before = found()
+    after = under_light(before, OWN, "keep", mirrors=False)
+    searched, given = with_carried_light(before, after, NAMES), with_carried_light(before, after, NAMES, OWN)
+    by_hand = with_carried_light(before.replace(environment=None), after, NAMES, OWN)
+    assert error(given, before) < error(searched, before) + 0.02
+    assert np.array_equal(given.require("diffuse")["diffuse"], by_hand.require("diffuse")["diffuse"])
 
 
 def test_lights_agree_whatever_their_power_and_tint_and_not_where_they_come_from_other_sides() -> None:

@@ -110,6 +110,39 @@ def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_pat
     assert read_input(tmp_path / "a.png", None)[1]["depth"].startswith("its colours have 16 bits, of which 8 are read")
 
 
+def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_refused(tmp_path: Path) -> None:
+    values = np.random.default_rng(0).integers(0, 65536, (8, 9, 3))
+    write_tiff16(tmp_path / "a.tif", values, planar=True, compressed=True)
+    picture, remarks = read_input(tmp_path / "a.tif", None)
+    assert remarks["depth"].startswith("its colours have 16 bits, of which 8 are read")
+    np.testing.assert_allclose(picture.image_srgb, values / 65535, atol=1 / 255)
+    write_tiff16(tmp_path / "b.tif", values, planar=True)
+    with pytest.raises(UnirenderError, match="channels are stored one after the other, uncompressed"):
+        read_input(tmp_path / "b.tif", None)
+
+
+def test_a_bitmap_of_16_bits_a_pixel_has_lost_nothing(tmp_path: Path) -> None:
+    pixels = np.full((8, 9), 0xF81F, dtype="<u2")  # magenta: five bits of red, six of green, five of blue
+    rows = np.pad(pixels, ((0, 0), (0, 1))).tobytes()
+    sizes = struct.pack("<IiiHHIIiiII", 40, 9, 8, 1, 16, 3, len(rows), 0, 0, 0, 0)
+    masks = struct.pack("<III", 0xF800, 0x07E0, 0x001F)
+    start = 14 + len(sizes) + len(masks)
+    (tmp_path / "a.bmp").write_bytes(
+        b"BM" + struct.pack("<IHHI", start + len(rows), 0, 0, start) + sizes + masks + rows
+    )
+    picture, remarks = read_input(tmp_path / "a.bmp", None)
+    assert "depth" not in remarks
+    np.testing.assert_array_equal(picture.image_srgb, np.broadcast_to([1, 0, 1], (8, 9, 3)))
+
+
+def test_an_alpha_that_a_float_writer_rounded_down_says_nothing_of_a_mask(tmp_path: Path) -> None:
+    values = np.zeros((8, 9, 4), dtype=int)
+    values[2:6, 2:6, :3], values[..., 3] = 65535, 65534
+    write_png16(tmp_path / "mask.png", values)
+    assert read_mask(tmp_path / "mask.png", (8, 9)).mean() == pytest.approx(16 / 72)
+    assert "covers the whole frame" in read_input(tmp_path / "mask.png", None)[1]["mask"]
+
+
 def test_a_file_of_several_pictures_gives_its_first_which_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

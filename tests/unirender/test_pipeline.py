@@ -31,6 +31,7 @@ from unirender.pipelines.editing import (
     specular_for_roughness,
     specular_share,
     trust,
+    under_light,
 )
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -339,6 +340,19 @@ def test_relight_takes_any_light(pipeline: UniRenderPipeline) -> None:
     target = 0.3 * mask.repeat(3, axis=-1)
     given = pipeline.relight(image, None, mask, specular=target, diffuse=target, decomposition=base)
     assert np.array_equal(get(given.intrinsics, "diffuse"), target)
+
+
+def test_relight_by_the_light_that_was_found_gives_the_light_of_the_decomposition(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    found = pipeline.decompose(image, mask, generator=seeded())
+    own = found.intrinsics.environment
+    relit = pipeline.relight(image, own, mask, exposure="keep", decomposition=found).intrinsics
+    bare = under_light(found.with_network_light, own, "keep", mirrors=False)
+    for name in ("specular", "diffuse"):
+        new, old = (np.abs(get(maps, name) - get(found.intrinsics, name)).mean() for maps in (relit, bare))
+        assert new < 0.7 * old
+    unknown = replace(found, intrinsics=found.intrinsics.replace(specular=None, environment=None))
+    assert pipeline.relight(image, own, mask, decomposition=unknown, anchored=False).image_linear.shape == image.shape
 
 
 def test_anchor_closed_forms() -> None:

@@ -325,6 +325,11 @@ def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> Non
     again, _ = scores_in_turn([2.0, 1.0, 1.0], higher_is_better=True)
     fit(tmp_path, 1, again, keep_best="error")  # its own: it was killed before its first save
     assert (tmp_path / "best" / "validation.json").read_text() == best
+    (tmp_path / STATE_FILE).unlink()
+    for broken in ("{}", '{"train":', "[]"):
+        (tmp_path / "best" / "training.json").write_text(broken)
+        with pytest.raises(UnirenderError, match=r"training\.json: cannot be read as the record of a training"):
+            other.fit(SyntheticSource(), validate=scores_in_turn([1.0], higher_is_better=True)[0])
 
 
 def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
         light = turned(own if controls.light is None else as_environment(controls.light), controls.turn_deg)
         edited = under_light(edited, light, "keep" if controls.light is None else "auto", mirrors=False)
         derived = ("specular", "diffuse")
-        edited = with_carried_light(before, edited, derived)
+        edited = with_carried_light(before, edited, derived, subject.decomposition.own_agreeing_light)
         remarks.append("Under a light that was changed, nothing casts a new shadow.")
     elif controls.roughness is not None:
         target = edited.require("roughness")["roughness"]

@@ -31,24 +31,34 @@ SMOOTHING = 0.13  # standard deviation of K where lights do not agree, of the si
 
 
 def with_carried_light(
-    before: Intrinsics, after: Intrinsics, names: Collection[str], *, shadows: bool = False
+    before: Intrinsics,
+    after: Intrinsics,
+    names: Collection[str],
+    light: Float[np.ndarray, "eh ew 3"] | None = None,
+    *,
+    shadows: bool = False,
 ) -> Intrinsics:
-    """The maps under another light, with what their own s and d have beyond their own light.
+    """The maps under another light, with what their own s and d have beyond their own light; where that light, s or d
+    is unknown, as they are.
 
     Args:
-        before: normal, roughness, specular, diffuse, mask, and the environment as the network predicts it.
+        before: with normal, roughness and mask.
         after: the same maps, with s and d derived from another environment.
         names: of specular and diffuse, those that were derived.
+        light: that agrees with s and d of `before`, L_0; None: found from them and from its environment.
         shadows: whether they were derived with the shadows that the picture's own surfaces cast.
 
     Raises:
-        UnirenderError: a map is missing.
+        UnirenderError: normal, roughness or mask is missing.
     """
-    if not names:
+    known = set(before.present)
+    names = [name for name in names if name in known]
+    if not names or (light is None and not known.issuperset(("specular", "diffuse", "environment"))):
         return after
-    old, mask = before.require("specular", "diffuse", "mask"), before.require("mask")["mask"]
+    old, mask = before.require(*names), before.require("mask")["mask"]
     new = after.require(*names)
-    explained = derived_light(before, agreeing_light(before), names, mirrors=False, shadows=shadows)
+    light = agreeing_light(before) if light is None else light
+    explained = derived_light(before, light, names, mirrors=False, shadows=shadows)
     carried = {}
     for name in names:
         trust = agreement(new[name], explained[name], mask)

@@ -48,6 +48,11 @@ class Decomposition:
         theirs = self.intrinsics.environment is not self.agreeing_light
         return self.intrinsics if theirs else self.intrinsics.replace(environment=self.network_light)
 
+    @property
+    def own_agreeing_light(self) -> Float[np.ndarray, "eh ew 3"] | None:
+        """The light that agrees with s and d, unless you have put another one in its place."""
+        return self.agreeing_light if self.intrinsics.environment is self.agreeing_light else None
+
 
 @dataclass(frozen=True)
 class EditResult:

@@ -330,7 +330,7 @@ class UniRenderPipeline(DualStreamPipeline):
         else:
             edited = before.replace(environment=None, specular=specular, diffuse=diffuse)
         missing = [name for name, given in (("specular", specular), ("diffuse", diffuse)) if given is None]
-        edited = with_carried_light(before, edited, missing, shadows=shadows)
+        edited = with_carried_light(before, edited, missing, decomposition.own_agreeing_light, shadows=shadows)
         derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)

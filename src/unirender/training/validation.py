@@ -48,7 +48,14 @@ class Validation:
         path = trainer.run.out / BEST_FOLDER / TRAINING_FILE
         if self.keep_best is None or not path.is_file():
             return
-        if differing := differences(json.loads(path.read_text())["train"], trainer.config):
+        try:
+            config = json.loads(path.read_text())["train"]
+            differing = differences(config, trainer.config)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UnirenderError(
+                f"{path}: cannot be read as the record of a training ({error}); move it away"
+            ) from error
+        if differing:
             raise UnirenderError(
                 f"{path.parent}: is the best of another run, with {', '.join(differing)}, whose scores these weights "
                 "would have to beat; move it away, or pass another --out"
