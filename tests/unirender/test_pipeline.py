@@ -345,7 +345,7 @@ def test_relight_takes_any_light(pipeline: UniRenderPipeline) -> None:
 def test_relight_by_the_light_that_was_found_gives_the_light_of_the_decomposition(pipeline: UniRenderPipeline) -> None:
     image, mask = picture()
     found = pipeline.decompose(image, mask, generator=seeded())
-    own = found.intrinsics.environment
+    own = get(found.intrinsics, "environment")
     relit = pipeline.relight(image, own, mask, exposure="keep", decomposition=found).intrinsics
     bare = under_light(found.with_network_light, own, "keep", mirrors=False)
     for name in ("specular", "diffuse"):
