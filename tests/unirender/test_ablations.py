@@ -166,5 +166,6 @@ def test_a_split_model_learns_under_either_rule(tmp_path: Path, rule: str) -> No
     config = dataclasses.replace(SPLIT, timestep_rule=rule)
     trainer = Trainer(config, RunConfig(tmp_path, steps=30), CPU, torch.float32)
     batch = make_batch(4)
-    sums = [trainer.train_step(batch)["albedo"] for _ in range(30)]
+    steps = [trainer.train_step(batch) for _ in range(30)]
+    sums = [losses["albedo"] for losses in steps if "albedo" in losses]  # of four rows perhaps none is inverse
     assert np.mean(sums[-10:]) < 0.8 * np.mean(sums[:10])
