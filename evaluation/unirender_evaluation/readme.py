@@ -16,7 +16,9 @@ import json
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from safetensors import safe_open
@@ -32,6 +34,7 @@ from unirender_evaluation.results_findings import Question, against_trivial
 from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.table_text import plain_paragraph
 from unirender_evaluation.tables import Table, build_tables
 from unirender_evaluation.tasks import LIGHT
 
@@ -47,6 +50,7 @@ SHOWN = (  # table, protocol, subset
 )
 HEADLINES = SHOWN[:3]
 OURS = "ours-mean"
+NOTES = "### Notes on the rows of these tables"
 STANDING = (
     Question("albedo", "inverse", "single-image", "albedo", "psnr", OURS),
     Question("normals", "inverse", "single-image", "normal", "cosine", OURS),
@@ -146,13 +150,20 @@ def checkpoint_text(folder: Path) -> str:
 
 
 def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = SHOWN) -> str:
-    """Those tables, masked, as Markdown."""
+    """Those tables, masked, as Markdown; what is to be said below more than one of them follows the last, once."""
     chosen = [
         table
         for table in tables
         if (table.name, table.protocol_key, table.subset) in shown and table.variant.mask == "masked"
     ]
-    return "\n".join(to_markdown(table) for table in chosen)
+    counts = Counter(note for table in chosen for note in table.notes)
+    common = [note for note, count in counts.items() if count > 1]
+    texts = [
+        to_markdown(replace(table, notes=tuple(note for note in table.notes if counts[note] == 1))) for table in chosen
+    ]
+    if common:
+        texts.append("\n".join([NOTES, "", *(f"- {plain_paragraph(note)}" for note in common)]) + "\n")
+    return "\n".join(texts)
 
 
 def standing_text(results: Results) -> str:

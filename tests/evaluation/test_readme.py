@@ -14,6 +14,8 @@ from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import readme
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
+from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.tables import build_tables
 from unirender_evaluation.tasks import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
@@ -70,6 +72,24 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     assert any("21.50" in table for table in stored)
     assert not (folder / "98-a-table-of-before.md").exists()
     assert (folder / "notes.md").exists()
+
+
+def test_what_is_said_below_several_tables_is_said_once() -> None:
+    methods = (MethodInfo("mine", "Mine", "external", note="said of a row"), MethodInfo("b", "B", "external"))
+    records = [
+        Record("inverse", "single-image", method, "s", "object", {"albedo.psnr@masked-srgb-raw": 20.0}, key=method)
+        for method in ("mine", "b")
+    ]
+    records.append(
+        Record("relighting", "from-image-hdri", "mine", "s", "object", {"relit.psnr@masked-srgb-raw": 9.0}, key="k")
+    )
+    text = readme.selection(build_tables(records, RunInfo("tiny", "0" * 64, 64, methods), ALL_TABLES))
+    assert text.count("Mine: said of a row") == 1
+    assert text.index("### Relighting") < text.index("### Notes") < text.index("- Mine: said of a row")
+
+    alone = readme.selection(build_tables(records[:2], RunInfo("tiny", "0" * 64, 64, methods), ALL_TABLES))
+    assert "Mine: said of a row" in alone
+    assert "### Notes" not in alone
 
 
 def test_what_is_stored_gives_the_same_again(tmp_path: Path) -> None:
