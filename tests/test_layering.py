@@ -34,6 +34,7 @@ VOCABULARY = {
         "surface_light",
         "symmetries",
         "whole_files",
+        "worker_pool",
         "writing",
     )
 }

@@ -20,6 +20,7 @@ import numpy as np
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
 from unirender.whole_files import replace_file
+from unirender.worker_pool import WorkerPool
 from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights
@@ -28,7 +29,6 @@ from unirender_evaluation.suite_spec import SuiteSpec, read_spec
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
-from unirender_evaluation.worker_pool import WorkerPool
 from unirender_reference.processes import start_worker
 
 CODE = {  # what a rendered part depends on

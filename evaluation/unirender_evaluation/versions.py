@@ -77,7 +77,6 @@ COMMANDS = (
     "throughput*",
     "truth",
     "validation",
-    "worker_pool",
     "workers",
 )
 FROM_RECORDS = (
@@ -95,8 +94,19 @@ FROM_RECORDS = (
     "table*",
     "verdict",
 )
-# Of the shared vocabulary's folder: the command line, and what is said where a file cannot be written.
-OUTSIDE = ("__main__", "cli", "command_line", "commands", "folder_command", "options", "remarks", "shipped", "writing")
+# Of the shared vocabulary's folder: the command line, what is said where a file cannot be written, and processes.
+OUTSIDE = (
+    "__main__",
+    "cli",
+    "command_line",
+    "commands",
+    "folder_command",
+    "options",
+    "remarks",
+    "shipped",
+    "worker_pool",
+    "writing",
+)
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)

@@ -19,6 +19,7 @@ from uuid import uuid4
 
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
+from unirender.worker_pool import WorkerPool
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
@@ -30,7 +31,6 @@ from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.versions import Versions, versions
-from unirender_evaluation.worker_pool import WorkerPool
 
 AHEAD = 2  # scenes under way on a cluster for each of its workers
 PAUSE = 0.1  # seconds between two looks at what is under way there; a scene takes many
@@ -93,12 +93,10 @@ def _start(
     known: frozenset[str],
     notes: Path,
 ) -> None:
-    from unirender_reference.backend import set_threads
-    from unirender_reference.processes import exit_with_parent
-
-    exit_with_parent()
     import threadpoolctl
     import torch
+
+    from unirender_reference.backend import set_threads
 
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does

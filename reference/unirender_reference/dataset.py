@@ -23,7 +23,6 @@ from unirender_reference.faults import FileFailure, FileNotSeen
 from unirender_reference.folder_lock import locked, made_folder
 from unirender_reference.journal import Journal
 from unirender_reference.plan import SHARD_GROUPS, GroupPlan, Plan, plan_groups
-from unirender_reference.processes import exit_with_parent
 from unirender_reference.resume import check_sources, finished_shards, sources_hash
 from unirender_reference.shards import (
     Failure,
@@ -176,8 +175,7 @@ def render_group(config: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
 
 
 def start_worker() -> None:
-    """One thread per worker and everything imported; a worker ends with its parent, even if that is killed."""
-    exit_with_parent()
+    """One thread per worker and everything imported."""
     backend.set_threads(1)
     from unirender_reference import group  # noqa: F401 - warms up
 

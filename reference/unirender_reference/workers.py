@@ -2,19 +2,20 @@
 
 Every worker is a pool of one process, so it is known which task a dead worker had. That task runs once more with no
 other beside it, all the machine's memory its own; if the worker dies again, the task's future raises `WorkerDied`.
-Workers start when the executor is made: their imports run while the caller makes its plan.
+Workers start when the executor is made: their imports run while the caller makes its plan. They end with their parent,
+and at once where it is interrupted (`unirender.worker_pool`).
 """
 
-import multiprocessing
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.worker_pool import WorkerPool
 
 
 class WorkerDied(UnirenderError):
@@ -31,7 +32,9 @@ class _Task:
 
 
 class LocalWorkers:
-    """Processes of this machine behind `concurrent.futures`' `submit`; a context manager that waits for its workers.
+    """Processes of this machine behind `concurrent.futures`' `submit`.
+
+    A context manager: it waits for what its workers do, or ends them where its block is left by an exception.
 
     Args:
         workers: how many processes.
@@ -41,10 +44,9 @@ class LocalWorkers:
     def __init__(self, workers: int, start: Callable[[], None]) -> None:
         self.workers = workers
         self._start = start
-        self._context = multiprocessing.get_context("spawn")
         self._lock = threading.RLock()
-        self._pools: set[ProcessPoolExecutor] = set()
-        self._idle: list[ProcessPoolExecutor] = []
+        self._pools: set[WorkerPool] = set()
+        self._idle: list[WorkerPool] = []
         self._waiting: deque[_Task] = deque()
         self._suspects: deque[_Task] = deque()  # their worker died: to be run alone
         self._running = 0
@@ -65,6 +67,9 @@ class LocalWorkers:
 
     def shutdown(self) -> None:
         """Drops what has not begun and waits for the rest."""
+        self._close(lambda pool: pool.shutdown(wait=True, cancel_futures=True))
+
+    def _close(self, end: Callable[[WorkerPool], None]) -> None:
         with self._lock:
             self._closed = True
             for task in self._waiting:
@@ -73,21 +78,24 @@ class LocalWorkers:
                 _fail(task, CancelledError())
             pools = list(self._pools)
         with ThreadPoolExecutor(len(pools)) as threads:  # all at once: each takes a moment to end
-            list(threads.map(lambda pool: pool.shutdown(wait=True, cancel_futures=True), pools))
+            list(threads.map(end, pools))
 
     def __enter__(self) -> "LocalWorkers":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.shutdown()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.shutdown()
+        else:
+            self._close(WorkerPool.end)
 
     def _hire(self) -> None:
         """Starts a process; it is idle once it is ready."""
-        pool = ProcessPoolExecutor(1, mp_context=self._context)
+        pool = WorkerPool(1)
         self._pools.add(pool)
         pool.submit(self._start).add_done_callback(lambda started: self._started(pool, started))
 
-    def _started(self, pool: ProcessPoolExecutor, started: Future) -> None:
+    def _started(self, pool: WorkerPool, started: Future) -> None:
         with self._lock:
             if started.cancelled():
                 return
@@ -115,7 +123,7 @@ class LocalWorkers:
             else:
                 return
 
-    def _run(self, task: _Task, pool: ProcessPoolExecutor) -> None:
+    def _run(self, task: _Task, pool: WorkerPool) -> None:
         self._running += 1
         try:
             inner = pool.submit(task.function, *task.arguments)
@@ -124,7 +132,7 @@ class LocalWorkers:
             inner.set_exception(error)
         inner.add_done_callback(lambda done: self._done(task, pool, done))
 
-    def _done(self, task: _Task, pool: ProcessPoolExecutor, inner: Future) -> None:
+    def _done(self, task: _Task, pool: WorkerPool, inner: Future) -> None:
         with self._lock:
             alone, self._alone = self._alone, False
             self._running -= 1

@@ -8,8 +8,6 @@ gives equal bytes.
 """
 
 import io
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender.primaries import in_rec709
+from unirender.whole_files import replace_file
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
@@ -43,28 +42,19 @@ def write_exr(
     half: bool = True,
     attributes: Mapping[str, str] | None = None,
 ) -> None:
-    """Writes a file, moved into place when it is complete.
+    """Writes a file, moved into place when it is complete (`whole_files.replace_file`).
 
     Args:
-        path: where; its folder must exist.
+        path: where; its folder is made where there is none.
         channels: `[h w]` float arrays by channel name.
         half: store 16-bit floats; radiance above 65504 is then refused, not clipped.
         attributes: provenance; keys get the prefix `unirender:`.
 
     Raises:
         UnirenderError: shapes differ, a value is not finite, or it does not fit into half precision.
+        OSError: it cannot be written; what was there stays.
     """
-    path = Path(path)
-    data = exr_bytes(channels, half=half, attributes=attributes)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(data)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    replace_file(Path(path), exr_bytes(channels, half=half, attributes=attributes))
 
 
 def write_environment(

@@ -1,13 +1,9 @@
 """`unirender reference cost`: what a data set costs on paper, and the command on a tiny picture."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 
 from unirender.errors import UsageError
-from unirender_reference.measure import cost
 from unirender_reference.measure.cost import FILES, PARTS, Cost, Figures, plans
-from unirender_reference.processes import exit_with_parent
 
 
 def unit(**changed: float) -> Figures:
@@ -37,20 +33,6 @@ def test_the_command_prints_what_it_measured(capsys: pytest.CaptureFixture[str])
     assert "Seconds of one core at 4 spp" in printed
     assert "1,000 objects x 121 pairs, 16 groups a shard" in printed
     assert printed.count("sweep, one light") == 2
-
-
-def test_workers_end_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    started = []
-
-    class Pool(ThreadPoolExecutor):
-        def __init__(self, workers: int, **options: object) -> None:
-            started.append(options["initializer"])
-            super().__init__(workers)
-
-    monkeypatch.setattr(cost, "ProcessPoolExecutor", Pool)
-    monkeypatch.setattr(cost, "measure", lambda resolution, spp, scenes: unit())
-    assert Cost(resolutions=(16, 32)).run() == 0
-    assert started == [exit_with_parent] * 2
 
 
 def test_nothing_to_measure_is_a_usage_error() -> None:

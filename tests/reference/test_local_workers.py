@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender_reference.processes import exit_with_parent, time_limit
+from unirender_reference.processes import time_limit
 from unirender_reference.workers import LocalWorkers, WorkerDied
 
 
@@ -36,6 +36,22 @@ def slow(log: Path) -> None:
         stream.write("out\n")
 
 
+def ready() -> None:
+    """Nothing to do before the first task."""
+
+
+def interrupted_once(log: Path) -> str:
+    """Is interrupted as a terminal does it, and goes on."""
+    os.kill(os.getpid(), signal.SIGINT)
+    log.touch()
+    return "done"
+
+
+def endless(log: Path) -> None:
+    log.touch()
+    time.sleep(600)
+
+
 def refuse() -> None:
     raise UnirenderError("no LLVM here")
 
@@ -46,7 +62,7 @@ def fail() -> None:
 
 @pytest.fixture(scope="module")
 def workers():
-    with LocalWorkers(2, exit_with_parent) as made:
+    with LocalWorkers(2, ready) as made:
         yield made
 
 
@@ -87,11 +103,24 @@ def test_a_worker_that_cannot_start_fails_every_task() -> None:
 
 
 def test_what_has_not_begun_is_dropped(tmp_path: Path) -> None:
-    with LocalWorkers(1, exit_with_parent) as few:
+    with LocalWorkers(1, ready) as few:
         futures = [few.submit(slow, tmp_path / "log") for _ in range(8)]
         futures[0].result(30)
     assert sum(future.cancelled() for future in futures) >= 5
     assert (tmp_path / "log").read_text().count("in") == (tmp_path / "log").read_text().count("out")
+
+
+def test_workers_do_not_notice_an_interrupt_and_end_with_that_of_their_parent(tmp_path: Path) -> None:
+    began = None
+    with pytest.raises(KeyboardInterrupt), LocalWorkers(2, ready) as workers:  # noqa: PT012 - the block is the test
+        assert workers.submit(interrupted_once, tmp_path / "interrupted").result(30) == "done"
+        workers.submit(endless, tmp_path / "endless")
+        while not (tmp_path / "endless").exists():
+            time.sleep(0.01)
+        began = time.monotonic()
+        raise KeyboardInterrupt
+    assert began is not None
+    assert time.monotonic() - began < 30
 
 
 def test_work_over_its_limit_ends() -> None:

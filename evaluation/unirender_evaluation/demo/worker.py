@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender_reference.processes import exit_with_parent
+from unirender.worker_pool import exit_with_parent
 
 START_SECONDS = 300.0  # for loading a model on a busy machine
 logger = logging.getLogger(__name__)

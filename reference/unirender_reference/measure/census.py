@@ -10,16 +10,15 @@ What `mi.render` returned is looked at before the repair, what `image` returned 
 """
 
 import contextlib
-import multiprocessing
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from unirender.worker_pool import WorkerPool
 from unirender_reference import backend
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed
@@ -148,18 +147,13 @@ def run_census(renders: int, resolution: int, spp: int, seed: int, workers: int)
     counts = [RENDERS_PER_OBJECT] * (renders // RENDERS_PER_OBJECT)
     if renders % RENDERS_PER_OBJECT:
         counts.append(renders % RENDERS_PER_OBJECT)
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
+    with WorkerPool(workers, start_worker) as pool:
         futures = [
             pool.submit(census_of_object, seed * 1_000_000 + index, count, resolution, spp)
             for index, count in enumerate(counts)
         ]
-        try:
-            for future in futures:
-                yield future.result()
-        finally:
-            for future in futures:
-                future.cancel()
+        for future in futures:
+            yield future.result()
 
 
 @contextlib.contextmanager

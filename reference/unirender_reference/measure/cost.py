@@ -9,14 +9,13 @@ are CPU seconds of that process (a busy machine does not add to them), compilati
 """
 
 import math
-import multiprocessing
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
+from unirender.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
     from unirender_reference.render import Renderer
@@ -46,16 +45,14 @@ class Cost:
         from rich.table import Table
 
         from unirender_reference.plan import SHARD_GROUPS
-        from unirender_reference.processes import exit_with_parent
 
         if min((*self.resolutions, self.spp, self.scenes, self.objects), default=0) < 1 or not self.resolutions:
             raise UsageError("expected at least 1 resolution, sample, scene and object")
         console = Console(width=132)
         parts = Table("px", *(f"{part} s" for part in PARTS), *(f"{file} kB" for file in FILES), "peak MB")
         whole = Table("px", "data set", "core-hours", "TB", "groups", "shards", "GB a shard")
-        context = multiprocessing.get_context("spawn")
         for resolution in self.resolutions:
-            with ProcessPoolExecutor(1, mp_context=context, initializer=exit_with_parent) as pool:
+            with WorkerPool(1) as pool:
                 found = pool.submit(measure, resolution, self.spp, self.scenes).result()
             parts.add_row(
                 str(resolution),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
+from unirender.worker_pool import WorkerPool
 from unirender_reference.processes import start_worker
 
 if TYPE_CHECKING:
@@ -154,16 +155,14 @@ class NoiseFloor:
 
     def _rows(self) -> Iterator[FloorRow]:
         """Rows in the order of their numbers, until enough are measured."""
-        import multiprocessing
-        from concurrent.futures import Future, ProcessPoolExecutor
+        from concurrent.futures import Future
 
         workers = self.workers or os.cpu_count() or 1
         jobs = (
             FloorJob(self.seed + i, self.floor, self.factor, self.resolution, self.limit)
             for i in range(MOST_SKIPPED * self.images)
         )
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker) as pool:
+        with WorkerPool(workers, start_worker) as pool:
             under_way: deque[Future[FloorRow]] = deque()
             measured = 0
             for job in jobs:

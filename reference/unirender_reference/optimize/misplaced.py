@@ -1,11 +1,12 @@
 """Why a mesh is not where the masks are: what can be told from the two, as a hint for whoever gave them.
 
-Tried in turn: cameras that look away, another axis that is up, meshes turned by quarters, principal points far from the
-middle, and another size or place than the masks show.
+Tried in turn: poses of another convention, cameras that look away, another axis that is up, meshes turned by quarters,
+principal points far from the middle, and another size or place than the masks show.
 """
 
+import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -26,6 +27,13 @@ OPENCV = (
     "are the poses in OpenCV's axes (+z forward)? negate columns 2 and 3 of each transform_matrix; or world to camera? "
     "invert them"
 )
+FORWARD = np.diag([1.0, -1.0, -1.0, 1.0])  # from a camera with +z forward and +y down
+CONVENTIONS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
+    "in OpenCV's axes (+z forward)? then negate columns 2 and 3 of each transform_matrix": lambda pose: pose @ FORWARD,
+    "world to camera? then invert each transform_matrix": np.linalg.inv,
+    "world to camera in OpenCV's axes, as COLMAP's images.txt has them? then invert each transform_matrix and negate "
+    "columns 2 and 3 of what comes out": lambda pose: np.linalg.inv(pose) @ FORWARD,
+}
 BELONG = "do its units and axes, and the masks, belong to the poses?"
 
 
@@ -42,6 +50,8 @@ def likely_cause(
         up: which way is up in the poses, as it was given.
         shown: the sphere that the masks show, in the same world as the views; None: not known.
     """
+    if convention := _other_convention(views, obj, least, place, up):
+        return convention
     away = sum(float(view.pose[:3, 2] @ view.pose[:3, 3]) <= 0 for view in views)  # the object is at the origin
     if 2 * away > len(views):
         return f"{away} of {len(views)} cameras look away from it: {OPENCV}"
@@ -53,9 +63,31 @@ def likely_cause(
     )
 
 
+def _other_convention(views: Sequence[View], obj: MeshObject, least: float, place: Sphere, up: Up) -> str | None:
+    """A convention of poses under which the mesh is where the masks are."""
+    few = _few(views)
+    world = np.eye(4) if up == "y" else Y_UP
+    for said, camera_to_world in CONVENTIONS.items():
+        changed = []
+        for view in few:
+            pose = view.pose.astype(np.float64)
+            pose[:3, 3] = place.center + place.radius * pose[:3, 3]
+            pose = world @ camera_to_world(world.T @ pose)
+            pose[:3, 3] = place.to_unit(pose[:3, 3])
+            changed.append(dataclasses.replace(view, pose=pose.astype(np.float32)))
+        iou = _Sampled(changed, obj).iou(np.eye(3), np.zeros(3))
+        if iou >= least:
+            return f"are the poses {said}: it would be {iou:.2f}"
+    return None
+
+
+def _few(views: Sequence[View]) -> Sequence[View]:
+    return views[:: -(-len(views) // MOST_VIEWS)]
+
+
 def _other_axes(views: Sequence[View], obj: MeshObject, least: float, place: Sphere, up: Up) -> str | None:
     """A turn of the mesh about the origin of the poses' world that puts it where the masks are."""
-    sampled = _Sampled(views[:: -(-len(views) // MOST_VIEWS)], obj)
+    sampled = _Sampled(_few(views), obj)
     toggled = Y_UP[:3, :3].T if up == "y" else Y_UP[:3, :3]
     origin = place.center / place.radius
     found = [(sampled.iou(turn, turn @ origin - origin), turn) for turn in _turns()]

@@ -57,7 +57,7 @@ class Observations:
     @property
     def sums(self) -> sp.csr_matrix:
         """(P, N): sums over patches."""
-        return self._incidence  # type: ignore[attr-defined]  - set in __post_init__
+        return self._incidence  # pyright: ignore[reportAttributeAccessIssue] - set in __post_init__
 
 
 def observe(

@@ -5,6 +5,9 @@
 Poses are camera to world with +x right, +y up and +z towards the viewer, as everywhere here. The field of view is
 `camera_angle_x` (radians, across the width) or the focal length `fl_x`, `fl_y` in pixels with `cx`, `cy`; each of them
 stands at the top or, for one picture, in its frame. Pixels count in a picture of `w` x `h`, where these are given.
+
+A frame is held out where it says `"held_out": true`, and where the file has nerfstudio's lists of a split: those of
+`val_filenames` and `test_filenames`, and with `train_filenames` all that these do not name.
 """
 
 import json
@@ -25,6 +28,7 @@ Up = Literal["y", "z"]
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.float64)  # from a world with +z up
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp")  # tried where a path of a picture has none
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
+SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 ASPECT_TOLERANCE = 0.01  # of the proportions: whole pixels
 FOCAL_TOLERANCE = 0.002  # of fl_x and fl_y: less than a pixel at the edge of 800
@@ -93,15 +97,22 @@ class Frame:
                     "pixels); resample the picture"
                 )
             return focal_y
-        for key, side in (("camera_angle_x", width), ("camera_angle_y", height)):
-            if key in self.values:
-                angle = self._number(key, 0.0)
-                if not 0 < angle < math.pi:
-                    raise UnirenderError(
-                        f"{self.name}: {key} {angle:g}, expected radians between 0 and pi; is it in degrees?"
-                    )
-                return side / (2 * math.tan(angle / 2))
-        raise UnirenderError(f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y)")
+        sides = {"camera_angle_x": width, "camera_angle_y": height}
+        found = [self._focal_of_angle(key, side) for key, side in sides.items() if key in self.values]
+        if not found:
+            raise UnirenderError(f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y)")
+        if abs(found[0] / found[-1] - 1) > FOCAL_TOLERANCE:
+            raise UnirenderError(
+                f"{self.name}: camera_angle_x and camera_angle_y make focal lengths of {found[0]:g} and {found[1]:g} "
+                f"pixels in a picture of {width:g} x {height:g}, expected one (square pixels); leave one of them out"
+            )
+        return found[0]
+
+    def _focal_of_angle(self, key: str, side: float) -> float:
+        angle = self._number(key, 0.0)
+        if not 0 < angle < math.pi:
+            raise UnirenderError(f"{self.name}: {key} {angle:g}, expected radians between 0 and pi; is it in degrees?")
+        return side / (2 * math.tan(angle / 2))
 
     def _check_lens(self) -> None:
         model = self.values.get("camera_model", "PINHOLE")
@@ -133,7 +144,7 @@ def read_transforms(path: Path) -> list[Frame]:
         UnirenderError: the file is missing or no such JSON, has no frames, or one of them lacks something.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # editors of Windows write a byte order mark
     except OSError as error:
         raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected a transforms.json") from error
     except (ValueError, RecursionError) as error:
@@ -142,14 +153,24 @@ def read_transforms(path: Path) -> list[Frame]:
     if not isinstance(frames, list) or not frames:
         raise UnirenderError(f"{path}: has no frames, expected a list of file_path and transform_matrix under 'frames'")
     shared = {key: value for key, value in content.items() if key != "frames"}
-    return [_frame(path, index, entry, shared) for index, entry in enumerate(frames)]
+    splits = {key: _split(path, key, content[key]) for key in SPLITS if key in content}
+    return [_frame(path, index, entry, shared, splits) for index, entry in enumerate(frames)]
 
 
-def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any]) -> Frame:
+def _split(path: Path, key: str, names: Any) -> set[Path]:
+    """The pictures that a split lists, as their frames name them."""
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise UnirenderError(f"{path}: {key} is {names!r:.60}, expected a list of file_path as the frames have them")
+    return {Path(name) for name in names}
+
+
+def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits: Mapping[str, set[Path]]) -> Frame:
     where = f"{path}: frames[{index}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise UnirenderError(f"{where} has no file_path, expected the path of a picture")
-    held_out = entry.get("held_out", False)
+    own = Path(entry["file_path"])
+    unseen = any(own in splits.get(key, ()) for key in SPLITS[1:]) or own not in splits.get(SPLITS[0], {own})
+    held_out = entry.get("held_out", unseen)
     if not isinstance(held_out, bool):
         raise UnirenderError(f"{where}: held_out is {held_out!r}, expected true or false")
     mask = entry.get("mask_path")

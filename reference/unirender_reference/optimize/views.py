@@ -73,9 +73,10 @@ class Views:
     def __post_init__(self) -> None:
         if not self.seen:
             raise UnirenderError("views: got none, expected at least one picture with its camera")
-        sizes = {view.image.shape for view in (*self.seen, *self.held_out)}
+        sizes = {view.image.shape: view.name for view in (*self.seen, *self.held_out)}
         if len(sizes) > 1:
-            raise UnirenderError(f"views: got pictures of sizes {sorted(sizes)}, expected one size; resample them")
+            named = ", ".join(f"{width} x {height} ({name})" for (height, width, _), name in sorted(sizes.items()))
+            raise UnirenderError(f"views: got pictures of sizes {named}, expected one size; resample them")
         for view in (*self.seen, *self.held_out):
             if not self.hdr and view.image.max() > 1 + RANGE_TOLERANCE:
                 raise UnirenderError(

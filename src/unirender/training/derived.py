@@ -12,10 +12,8 @@ their full resolution, and stored beside its packed form: `${UNIRENDER_CACHE}/de
 """
 
 import logging
-import multiprocessing
 import os
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,6 +29,7 @@ from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.groups import Group, Shard, mapped, read_environments, store
+from unirender.worker_pool import WorkerPool
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +69,7 @@ def open_derived(
         groups = sum(len(shard.groups) for _, shard in missing)
         logger.warning("deriving the light of %d groups of %d shards once, 1 or 2 seconds each", groups, len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
+        with WorkerPool(workers, one_thread) as pool:
             for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
                 if progress is not None:
                     progress(done, len(missing))

@@ -10,10 +10,8 @@ cosine is integrated in units of a mean texel of `DIRECTIONS`.
 
 import io
 import logging
-import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +28,7 @@ from unirender.pipelines.self_shadow import SelfShadow
 from unirender.training.derived import one_thread
 from unirender.training.groups import list_shards, read_groups
 from unirender.whole_files import file_sha256
+from unirender.worker_pool import WorkerPool
 
 VERSION = 1  # part of the cache's path: raise it when the masks or the bins change
 DIRECTIONS = (16, 32)  # of the traced rays: texels of a lat-long map
@@ -110,7 +109,7 @@ def read_items(
     if missing:
         logger.warning("looking at the objects of %d shards once, about a second each", len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
-        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), one_thread) as pool:
+        with WorkerPool(workers, one_thread) as pool:
             for done, _ in enumerate(pool.map(_prepare, *zip(*missing, strict=True)), start=1):
                 if progress is not None:
                     progress(done, len(missing))

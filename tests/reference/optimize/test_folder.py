@@ -117,6 +117,27 @@ def test_held_out_by_mark_and_by_number(folder: Path):
     assert [view.name for view in read_views(folder, most_views=2).seen] == ["images/0000.png", "images/0002.png"]
 
 
+def test_the_split_of_nerfstudio_is_kept(folder: Path):
+    """What a split does not train on is not fitted; names compare as paths, and a frame's own word counts first."""
+    names = [f"images/000{index}.png" for index in range(4)]
+
+    def held_out() -> list[str]:
+        return [view.name for view in read_views(folder).held_out]
+
+    edited(folder, lambda content: content.update(val_filenames=["./" + names[2]], test_filenames=[names[3]]))
+    assert held_out() == names[2:]
+    edited(folder, lambda content: content.update(train_filenames=names[1:2]))
+    assert held_out() == [names[0], *names[2:]]
+    edited(folder, lambda content: content["frames"][2].update(held_out=False))
+    assert held_out() == [names[0], names[3]]
+
+
+def test_a_byte_order_mark_is_no_error(folder: Path):
+    path = folder / "transforms.json"
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert len(read_views(folder).seen) == 4
+
+
 def test_mask_files_stand_in_for_alpha(folder: Path):
     views = read_views(folder)
     for index, view in enumerate(views.seen):
@@ -279,6 +300,16 @@ BAD = {
         broken(lambda c: [[f.pop(k) for k in ("fl_x", "fl_y")] for f in c["frames"]] and c.update(camera_angle_x=36)),
         "is it in degrees",
     ),
+    "two angles": (
+        broken(
+            lambda c: (
+                [[f.pop(k) for k in ("fl_x", "fl_y")] for f in c["frames"]],
+                c.update(camera_angle_x=0.69, camera_angle_y=0.69),
+            )
+        ),
+        r"focal lengths of 22\.\d+ and 16\.\d+ pixels in a picture of 16 x 12, expected one",
+    ),
+    "split as text": (broken(lambda c: c.update(test_filenames="images/0000.png")), "test_filenames is 'images/0000"),
     "focal 0": (first(fl_x=0, fl_y=0), "expected one positive focal length"),
     "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
     "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
@@ -306,7 +337,7 @@ BAD = {
     "cut picture": (cut, "not a readable picture"),
     "mixed kinds": (mixed, "has EXR beside other pictures"),
     "negative radiance": (negative_exr, "2.exr: has negative, infinite or NaN"),
-    "other size": (other_size, "expected one size"),
+    "other size": (other_size, r"16 x 12 \(images/0003.png\), 32 x 24 \(images/0000.png\), expected one size"),
 }
 
 

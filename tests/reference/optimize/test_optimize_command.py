@@ -313,6 +313,27 @@ def test_normals_of_the_pictures_own_size_are_reduced_with_it(tmp_path: Path):
         read_picture_input(tmp_path / "one.png", normal=tmp_path / "other.png", longest_side=16)
 
 
+def test_normals_in_other_axes_are_noticed(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Of a ball: towards the camera is told from away by most pixels, right and up by the outline."""
+    y, x = (1 - 2 * (np.indices((24, 24)) + 0.5) / 24) / 0.8
+    inside = x**2 + y**2 < 1
+    ball = np.stack([-x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)
+    write_png(tmp_path / "one.png", np.concatenate([np.full((24, 24, 3), 0.5), inside[..., None]], axis=-1))
+
+    def said(*signs: int) -> str:
+        write_png(tmp_path / "normal.png", ball * signs / 2 + 0.5)
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "unirender"):
+            read_picture_input(tmp_path / "one.png", fov_deg=36.0, normal=tmp_path / "normal.png")
+        return caplog.text
+
+    assert not said(1, 1, 1)
+    assert "point inwards along y; expected +x right, +y up: negate y?" in said(1, -1, 1)
+    assert "point inwards along x;" in said(-1, 1, 1)
+    with pytest.raises(UnirenderError, match=r"\d+% of the object's normals look away .* negate z \(OpenCV's axes: y"):
+        said(1, -1, -1)
+
+
 @pytest.mark.parametrize(
     ("value", "message"),
     [(0.0, "black wherever its mask covers it"), (1.0, "100% of the object's values are saturated")],

@@ -187,12 +187,42 @@ def test_a_mesh_passes_with_masks_that_are_slightly_wrong(solution: Solution, ch
 
 
 def test_poses_in_the_axes_of_opencv_are_named(views: Views, solution: Solution):
-    with pytest.raises(UnirenderError, match=r"6 of 6 cameras look away from it: .*negate columns 2 and 3"):
+    with pytest.raises(UnirenderError, match=r"OpenCV's axes .*negate columns 2 and 3 .*: it would be"):
         check_alignment(from_opencv(views), solution.obj)
+    with pytest.raises(UnirenderError, match=r"6 of 6 cameras look away from it: .*negate columns 2 and 3"):
+        check_alignment(with_masks(from_opencv(views), lambda mask: np.roll(mask, 20, axis=1)), solution.obj)
     with pytest.raises(UnirenderError, match=r"behind 6 of 6 cameras .*negate columns 2 and 3"):
         sphere_of_masks(from_opencv(views))
     with pytest.raises(UnirenderError, match="no point of the unit sphere lies inside all 6 masks"):
         visual_hull(np.stack([view.mask[..., 0] for view in views.seen]), Cameras(from_opencv(views).seen), 16)
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_poses_of_another_convention_are_named(views: Views, solution: Solution, up: Up):
+    """Of a mesh that stands away from the origin, in a world whose unit is not its radius."""
+    place = Sphere(np.array([0.3, -0.2, 0.5]), 2.5)
+    world = np.eye(4) if up == "y" else Y_UP
+    flip = np.diag([1, -1, -1, 1])
+
+    def given(convention: Callable[[np.ndarray], np.ndarray]) -> Views:
+        """The views as they are read from poses of a convention."""
+
+        def pose(view: View) -> np.ndarray:
+            own = view.pose.astype(np.float64)
+            own[:3, 3] = place.center + place.radius * own[:3, 3]
+            return (world @ convention(world.T @ own)).astype(np.float32)
+
+        seen = tuple(dataclasses.replace(view, pose=pose(view)) for view in views.seen)
+        return placed(dataclasses.replace(views, seen=seen), place)
+
+    check_alignment(given(lambda pose: pose), solution.obj, place, up)
+    for convention, said in (
+        (lambda pose: pose @ flip, r"OpenCV's axes \(\+z forward\)\? then negate .*: it would be"),
+        (np.linalg.inv, r"world to camera\? then invert each transform_matrix: it would be"),
+        (lambda pose: flip @ np.linalg.inv(pose), r"as COLMAP's images.txt has them\? then invert"),
+    ):
+        with pytest.raises(UnirenderError, match=said):
+            check_alignment(given(convention), solution.obj, place, up)
 
 
 def test_a_view_without_the_object_does_not_move_its_place(views: Views):

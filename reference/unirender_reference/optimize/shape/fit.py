@@ -101,7 +101,7 @@ class MeshFit:
             return total + sum(matrix.T @ (matrix @ direction) for _, matrix in terms)
 
         system, jacobi = (
-            LinearOperator((self.vertices.size,) * 2, matvec=function, dtype=np.float64)  # type: ignore[call-arg] - scipy's stubs want another constructor
+            LinearOperator((self.vertices.size,) * 2, matvec=function, dtype=np.float64)  # pyright: ignore[reportCallIssue] - scipy's stubs want another constructor
             for function in (curvature, lambda direction: direction / diagonal)
         )
         move, _ = cg(system, -gradient, rtol=1e-3, maxiter=ITERATIONS, M=jacobi)

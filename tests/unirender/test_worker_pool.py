@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from unirender_reference.processes import exit_with_parent
+from unirender.worker_pool import exit_with_parent
 
 PARENT = """
 import multiprocessing, os, sys, time
 from concurrent.futures import ProcessPoolExecutor
-from unirender_reference.processes import exit_with_parent
+from unirender.worker_pool import WorkerPool, exit_with_parent
 
 def hang():
     print(os.getpid(), flush=True)
@@ -23,7 +23,9 @@ def hang():
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")
     initializer = exit_with_parent if sys.argv[2] == "guarded" else None
-    if sys.argv[1] == "executor":
+    if sys.argv[1] == "ours":
+        WorkerPool(1).submit(hang).result()
+    elif sys.argv[1] == "executor":
         pool = ProcessPoolExecutor(1, mp_context=context, initializer=initializer)
         pool.submit(hang).result()
     else:
@@ -60,7 +62,7 @@ def ends(pid: int, seconds: float) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="needs /proc")
-@pytest.mark.parametrize("pool", ["executor", "pool"])
+@pytest.mark.parametrize("pool", ["ours", "executor", "pool"])
 def test_a_guarded_worker_ends_with_its_parent(pool: str, tmp_path: Path) -> None:
     assert ends(orphan(tmp_path, pool, "guarded"), 10)
 
