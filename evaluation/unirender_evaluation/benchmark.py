@@ -41,7 +41,7 @@ from unirender_evaluation.results_data import NAME as RESULTS
 from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
-from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
+from unirender_evaluation.run_folder import missing_answers, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEPT, Job, Store
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
@@ -93,6 +93,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
+    say_rows_without_values(here.rows, records, say)
     if others := store.of_other_code():
         say(f"{others} records of other code are not used; {store.unused_path} keeps the last {KEPT} of each")
     info = _run_info(config, here, check, records)

@@ -39,6 +39,7 @@ class Comparison:
     difference: Estimate
     a_beats_b: bool
     b_beats_a: bool
+    equal: bool  # all pairs, but for rounding
 
     @property
     def decided(self) -> bool:
@@ -49,7 +50,9 @@ class Comparison:
     def verdict(self) -> str:
         if not self.decided:
             return "is not comparable on one object with"
-        return "beats" if self.a_beats_b else "is beaten by" if self.b_beats_a else "is level with"
+        if self.a_beats_b or self.b_beats_a:
+            return "beats" if self.a_beats_b else "is beaten by"
+        return "is level with" if self.equal else "is not told from"
 
 
 def values_of(records: Iterable[Record], method: str, key: str) -> dict[str, float]:
@@ -99,6 +102,7 @@ def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str)
         difference=paired_difference(values[a], values[b], clusters),
         a_beats_b=beats(values[a], settled, higher_is_better=better, clusters=clusters),
         b_beats_a=beats(settled, values[a], higher_is_better=better, clusters=clusters),
+        equal=all(values[a][sample] == settled[sample] for sample in values[a].keys() & settled.keys()),
     )
 
 

@@ -7,6 +7,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float
+
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.conventions import FILE, Conventions
@@ -19,6 +22,7 @@ from unirender_evaluation.tasks import PROTOCOLS, tasks
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
 NEAR = 0.7  # likeness of names, of `difflib`: that of `convention` is 0.95, that of `config` 0.47
+SAME = 1e-3  # difference of two channels, below that of 8 bits
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
 GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
@@ -204,6 +208,13 @@ def _file_problems(predictions: PredictionFolder, path: Path, question: Question
         elif path.stem in question.answers:
             predictions.read_picture(path, question.mask)
         else:
-            predictions.read_maps(path, question.mask, question.camera)
+            normal = predictions.read_maps(path, question.mask, question.camera).get("normal")
+            if normal is not None and _is_grey(normal[question.mask[..., 0] > 0]):
+                yield f"{path}: the three channels of its normal are equal, expected x, y and z; write it in colour"
     except UnirenderError as error:
         yield str(error).removeprefix("predictions: ")
+
+
+def _is_grey(normals: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether directions were made from one channel."""
+    return bool(normals.any()) and float(np.ptp(np.abs(normals), axis=-1).max()) < SAME

@@ -3,7 +3,7 @@
     records.jsonl records.csv           every value, with its content key
     run.json                            the rows
     tables.md tables.tex tables.json    with the protocol line
-    missing.txt                         what a folder of predictions has no answer to, a line each
+    missing.txt                         what a folder of predictions has no answer to, a line each, if the run has one
 
 Running the same command again reuses what is done: a record depends on the content of its sample's files, the row's
 configuration, the resolution and the code that measures.
@@ -15,6 +15,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -28,7 +29,7 @@ from unirender_evaluation.public_sets import PublicSet, Sample
 from unirender_evaluation.public_tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
-from unirender_evaluation.run_folder import writing_run
+from unirender_evaluation.run_folder import say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
@@ -114,6 +115,8 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
         for row in what.rows
         if row.predictions is not None
     }
+    say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
+    write_missing(what.out, {label: (names, len(samples)) for label, names in missing.items()}, say)
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     contents, computed = [], 0
@@ -127,8 +130,6 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     info = _info(what, records, contents)
     write_run(what.out / "run.json", info)
     write_csv(what.out / "records.csv", records)
-    lines = [f"{label}: {name}\n" for label, names in missing.items() for name in names]
-    replace_file(what.out / "missing.txt", "".join(lines))
     tables = public_tables(what.public, records, info, missing)
     replace_file(what.out / "tables.md", "\n\n".join(map(to_markdown, tables)) + "\n")
     replace_file(what.out / "tables.tex", "\n\n".join(map(to_latex, tables)) + "\n")
@@ -137,7 +138,8 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
         print_table(console, table)
     absent = [spec.name for spec in what.public.tables if spec.name not in {record.table for record in records}]
     for line in filter(None, map(what.public.why_absent, absent)):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(line)
+    say_rows_without_values(what.rows, records, say)
     console.print(f"{computed} new records of {len(records)}; {what.out / 'tables.md'}, .tex, .json", highlight=False)
     return PublicResult(tuple(records), tuple(tables), missing, computed)
 

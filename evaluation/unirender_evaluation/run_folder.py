@@ -1,5 +1,5 @@
-"""What a run's folder says beside its results: which answers a folder of predictions lacks, and why a file cannot be
-written."""
+"""What a run says beside its results: which answers a folder of predictions lacks, which plug-in has none, and why a
+file cannot be written."""
 
 import contextlib
 import errno
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
+from unirender_evaluation.records import Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import PROTOCOLS, tasks
@@ -61,3 +62,14 @@ def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]], sa
     for label, (questions, asked) in missing.items():
         listed = f"; the others: {folder / MISSING}" if questions else ""
         say(f"{label}: answers {asked - len(questions)} of {asked} questions{listed}")
+
+
+def say_rows_without_values(rows: Sequence[Row], records: Sequence[Record], say: Callable[[str], None]) -> None:
+    """Says which plug-ins stand in no table, since all that they returned is empty."""
+    used = {record.method for record in records}
+    for row in rows:
+        if row.info.kind == "external" and row.predictions is None and row.info.key not in used:
+            say(
+                f"{row.info.label}: is in no table, its answers had no map that is scored; expected an Intrinsics with "
+                "some of them from `decompose` (albedo, normal, roughness, metallic, environment)"
+            )

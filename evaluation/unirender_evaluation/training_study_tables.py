@@ -33,9 +33,10 @@ COLUMNS = (
 )
 NOTE = (
     f"Mean over scenes; in brackets the paired difference from the first row, ± half of its {CONFIDENCE:.0%} "
-    "interval over objects; **bold** where the interval excludes 0. Masked, sRGB. Own maps: the network's "
-    "decomposition (not closed), rendered by the network and shaded by Mitsuba, against the picture. The networks are "
-    "far from fully trained: the table says what helps early, at this size."
+    "interval over objects; **bold** where the interval excludes 0, each number by itself: of equal rows one in twenty "
+    "or more does by chance. Masked, sRGB. Own maps: the network's decomposition (not closed), rendered by the network "
+    "and shaded by Mitsuba, against the picture. The networks are far from fully trained: the table says what helps "
+    "early, at this size."
 )
 
 

@@ -224,6 +224,20 @@ def test_channels_that_nothing_reads_are_problems(suite: Suite, tmp_path: Path, 
     assert problem.startswith(f"{path}: EXR channels albedo.R missing")
 
 
+def test_grey_normals_are_a_problem(suite: Suite, tmp_path: Path) -> None:
+    """One channel is no direction: read in grey, or the wrong file."""
+    task = first(suite, "inverse", "single-image")
+    path = tmp_path / task.folder / "normal.png"
+    path.parent.mkdir()
+    normal = suite.intrinsics(task.scene, task.scene.materials[0]).require("normal")["normal"]
+    picture = Image.fromarray(np.round((normal + 1) / 2 * 255).astype(np.uint8))
+    picture.save(path)
+    assert problems_of(suite, tmp_path) == ()
+    picture.convert("L").save(path)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: the three channels of its normal are equal, expected x, y and z")
+
+
 @pytest.mark.parametrize("colour", ["linear", "srgb"])
 def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, colour: str) -> None:
     """What the check lets through is scored with numbers."""

@@ -1,4 +1,4 @@
-"""What a run's folder says beside its results: which answers are missing, and why a file cannot be written."""
+"""What a run says beside its results: which answers are missing, and why a file cannot be written."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.methods import UneditedInput
 from unirender_evaluation.records import Record, append_record, write_records
 from unirender_evaluation.rows import make_row, prediction_rows
-from unirender_evaluation.run_folder import missing_answers, write_missing, writing_run
+from unirender_evaluation.run_folder import missing_answers, say_rows_without_values, write_missing, writing_run
 
 
 def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
@@ -34,6 +34,17 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     assert not any("m100_r050" in line for line in lines if line.startswith("mine: rendering/from-image/"))
     write_missing(tmp_path, {}, said.append)
     assert not (tmp_path / "missing.txt").exists(), "that of an earlier run says nothing of this one"
+
+
+def test_a_plugin_that_stands_in_no_table_is_named() -> None:
+    rows = [make_row(UneditedInput(), kind, kind) for kind in ("external", "trivial")]
+    said: list[str] = []
+    say_rows_without_values(rows, [], said.append)
+    assert len(said) == 1
+    assert said[0].startswith("external: is in no table")
+    record = Record("rendering", "from-image", rows[0].info.key, "s", "o", {})
+    say_rows_without_values(rows, [record], said.append)
+    assert len(said) == 1
 
 
 @pytest.mark.parametrize(

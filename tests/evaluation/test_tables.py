@@ -507,7 +507,7 @@ def test_rounding_on_another_machine_beats_nothing(by: float, verdict: str) -> N
     assert found.verdict == verdict
 
 
-@pytest.mark.parametrize(("differing", "verdict"), [(1, "is level with"), (12, "beats")])
+@pytest.mark.parametrize(("differing", "verdict"), [(0, "is level with"), (1, "is not told from"), (12, "beats")])
 def test_rounding_does_not_add_to_a_difference(differing: int, verdict: str) -> None:
     """One object of twenty that differs decides nothing, whichever way the others were rounded."""
     key = metric_key("albedo", "psnr")

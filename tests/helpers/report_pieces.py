@@ -33,7 +33,7 @@ RUN = RunInfo(
 VERDICT = """Verdict on suite tiny (paired 95 % intervals over objects)
   HOLDS  inverse/single-image albedo PSNR: ours beats input, difference +8 [+7, +9] dB (n 6, 3 objects)
   FAILS  ours exceeds the noise ceiling on <this> by at least 0.10 dB
-  stated inverse/single-image albedo PSNR: ours is level with input
+  stated inverse/single-image albedo PSNR: ours is not told from input
   not run inverse/single-image normal cos: ours against mean-normal
          (a line that goes on)
 """

@@ -157,8 +157,9 @@ def test_a_sample_opens_to_every_rows_numbers_and_its_pictures(desk: Browser) ->
     assert desk.ask("return document.querySelectorAll('#sample-rows .details').length") == 0
     desk.click("#sample-rows tr[data-sample='s0'] .open")
     inside = "return [...document.querySelectorAll('.opened ' + arguments[0])].map(e => e.textContent)"
-    assert desk.ask(inside, "tbody td:first-child") == ["Ours <mean>", "Input as albedo", "Noise ceiling"] * 2
+    assert desk.ask(inside, "tbody th") == ["Ours <mean>", "Input as albedo", "Noise ceiling"] * 2
     assert desk.ask(inside, "caption") == ["inside the mask", "whole frame"]
+    assert desk.ask("return document.querySelectorAll('#sample-rows th:not([scope])').length") == 0
     assert desk.ask(inside, "tbody td:nth-child(2)") == ["20.00", "12.00", "45.00"] * 2
     assert desk.ask("return document.querySelector('.opened .sheet img').naturalWidth") == 48
     desk.click("#sample-rows tr[data-sample='s0'] .open")

@@ -17,7 +17,7 @@
 
   const heading = (label, by, kind) => {
     const button = make("button", { type: "button", textContent: label });
-    const head = make("th", {}, button);
+    const head = make("th", { scope: "col" }, button);
     if (kind) button.prepend(make("span", { className: `dot k-${kind}` }));
     if (sorted.by === by) head.setAttribute("aria-sort", sorted.descending ? "descending" : "ascending");
     button.addEventListener("click", () => {
@@ -46,12 +46,12 @@
       if (!rows.length) continue;
       inner.append(make("table", { className: "data" },
         make("caption", { textContent: variant }),
-        make("thead", {}, make("tr", {}, make("th", { textContent: "Method" }), ...used.map((i) => {
+        make("thead", {}, make("tr", {}, make("th", { scope: "col", textContent: "Method" }), ...used.map((i) => {
           const view = section.columns[i];
-          return make("th", { title: view.key, textContent: `${view.text}${view.unit ? ` (${view.unit})` : ""} ${view.arrow}` });
+          return make("th", { scope: "col", title: view.key, textContent: `${view.text}${view.unit ? ` (${view.unit})` : ""} ${view.arrow}` });
         }))),
         make("tbody", {}, ...rows.map(([method, row]) => make("tr", {},
-          make("td", {}, make("span", { className: `dot k-${method.kind}` }), method.label),
+          make("th", { scope: "row" }, make("span", { className: `dot k-${method.kind}` }), method.label),
           ...used.map((i) => make("td", { textContent: text(row[i], section.columns[i]) })))))));
     }
     return inner;
@@ -60,7 +60,7 @@
   const line = (sample, methods) => {
     const open = make("button", { type: "button", className: "open", textContent: sample.id });
     open.setAttribute("aria-expanded", "false");
-    const row = make("tr", { data: { sample: sample.id } }, make("td", {}, open), ...methods.map((m) => {
+    const row = make("tr", { data: { sample: sample.id } }, make("th", { scope: "row" }, open), ...methods.map((m) => {
       const value = sample.values[m]?.[column];
       return make("td", { textContent: text(value, section.columns[column]), data: { v: String(number(value)) } });
     }));
