@@ -249,6 +249,14 @@ def test_what_lies_outside_the_models_range_is_reported(
     assert "display white" not in lines
 
 
+def test_an_edit_is_the_same_from_the_command_line_and_from_python(ball: Path, tmp_path: Path) -> None:
+    change = ["--roughness", "0.9", "--metallic", "1", "--dtype", "float32"]
+    assert run("edit", ball, *change, "--output", tmp_path / "edited") == 0
+    written = channels_rgb(read_exr(tmp_path / "edited" / "image.exr")[0])
+    edited = UniRenderPipeline.from_pretrained().edit(Image.open(ball), roughness=0.9, metallic=1.0)
+    np.testing.assert_allclose(written, edited.image_linear, rtol=0, atol=6e-4)  # of half precision
+
+
 def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:
     assert run("edit", ball, "--output", tmp_path / "same", "--no-anchored", "--roughness", "0.5") == 0
     assert run("edit", ball, "--output", tmp_path / "rough", "--roughness", "0.9", "--metallic", "1") == 0

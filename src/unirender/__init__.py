@@ -10,18 +10,30 @@ if TYPE_CHECKING:
     from unirender.camera import Camera as Camera
     from unirender.errors import UnirenderError as UnirenderError
     from unirender.intrinsics import Intrinsics as Intrinsics
+    from unirender.pipelines.results import Decomposition as Decomposition
+    from unirender.pipelines.results import EditResult as EditResult
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline as UniRenderPipeline
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "Camera": "unirender.camera",
+    "Decomposition": "unirender.pipelines.results",
+    "EditResult": "unirender.pipelines.results",
     "Intrinsics": "unirender.intrinsics",
     "UniRenderPipeline": "unirender.pipelines.unirender_pipeline",
     "UnirenderError": "unirender.errors",
 }
 
-__all__ = ["Camera", "Intrinsics", "UniRenderPipeline", "UnirenderError", "__version__"]
+__all__ = [
+    "Camera",
+    "Decomposition",
+    "EditResult",
+    "Intrinsics",
+    "UniRenderPipeline",
+    "UnirenderError",
+    "__version__",
+]
 
 
 def __getattr__(name: str) -> Any:

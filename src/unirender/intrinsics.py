@@ -36,11 +36,12 @@ SHORTEST_NORMAL = 1e-3  # a shorter mean of normals has no direction
 UNIT_TOLERANCE = 1e-3  # of a length: half precision rounds it by up to 0.0005
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Intrinsics:
     """The intrinsic attributes of one picture (or of a batch, with leading axes). Any map may be None: not known.
 
-    Shapes are `[..., H, W, C]` with C of `MAPS`; whatever does not fit is refused here, with a reason.
+    Shapes are `[..., H, W, C]` with C of `MAPS`; whatever does not fit is refused here, with a reason. Like arrays of
+    a program, two with the same values are two (`==` asks whether they are one).
 
     Attributes:
         albedo: principled `base_color`, linear, [0, 1].
@@ -95,6 +96,12 @@ class Intrinsics:
                     )
                 size = value.shape[:-1]
             _check_range(name, value)
+
+    def __repr__(self) -> str:
+        maps = [
+            f"{name} {list(value.shape)} in [{value.min():.3g}, {value.max():.3g}]" for name, value in self.maps.items()
+        ]
+        return f"Intrinsics({', '.join([*maps, repr(self.camera)])})"
 
     @property
     def present(self) -> tuple[str, ...]:

@@ -129,7 +129,7 @@ class ModelOptions:
             "num_inference_steps": self.steps if sampled else None,
             "sampler": self.sampler,
             "size": self.size,
-            "generator": self.generators(1)[0],
+            "generator": self.generators(1)[0] if sampled or self.seed else None,  # as a call of the API without one
         }
 
     def generators(self, count: int) -> list["torch.Generator"]:

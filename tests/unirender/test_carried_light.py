@@ -1,11 +1,14 @@
 """What s and d have beyond their own light, under another one."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
+from unirender.pipelines import carried_light
 from unirender.pipelines.carried_light import MOST_RATIO, agreement, with_carried_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
@@ -107,6 +110,25 @@ def test_the_light_at_hand_is_taken_as_it_is() -> None:
     by_hand = with_carried_light(before.replace(environment=None), after, NAMES, OWN)
     assert error(given, before) < error(searched, before) + 0.02
     assert np.array_equal(given.require("diffuse")["diffuse"], by_hand.require("diffuse")["diffuse"])
+
+
+def test_what_its_own_light_gives_is_derived_once_for_many_lights(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, lights = found(), []
+    light = agreeing_light(before)
+    after = [under_light(before, environment, "keep", mirrors=False) for environment in (OPPOSITE, lamp(1, 0, 1))]
+
+    def counted(intrinsics: Intrinsics, environment: np.ndarray, *args: Any, **kwargs: Any) -> Any:
+        lights.append(environment)
+        return derived_light(intrinsics, environment, *args, **kwargs)
+
+    monkeypatch.setattr(carried_light, "derived_light", counted)
+    *_, fresh = (with_carried_light(before, lit, NAMES, light) for lit in after)
+    assert len(lights) == 1
+    normal = before.require("normal")["normal"]
+    normal[..., :2] *= -1  # in the same array
+    turned = with_carried_light(before, after[1], NAMES, light)
+    assert len(lights) == 2
+    assert error(turned, fresh) > 1e-3
 
 
 def test_lights_agree_whatever_their_power_and_tint_and_not_where_they_come_from_other_sides() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file, save_file
 from tiny_models import make_pipeline
 
@@ -72,6 +73,16 @@ def test_weights_that_are_missing_are_refused(folder: Path, quickly: bool) -> No
     lose_a_weight(folder / WEIGHTS)
     with pytest.raises(UnirenderError, match=r"dual_stream: 1 weights are missing, the first is attribute_.*copy the"):
         UniRenderPipeline.from_pretrained(folder, low_cpu_mem_usage=quickly)
+
+
+def test_a_pipeline_keeps_its_weights_when_the_files_are_written_anew(folder: Path) -> None:
+    pipeline = UniRenderPipeline.from_pretrained(folder)
+    before = {name: value.clone() for name, value in pipeline.dual_stream.state_dict().items()}
+    file = folder / WEIGHTS
+    with file.open("r+b") as written:
+        written.write(bytes(file.stat().st_size))
+    for name, value in pipeline.dual_stream.state_dict().items():
+        assert torch.equal(value, before[name]), name
 
 
 def test_weights_in_another_format_are_not_missing(folder: Path) -> None:

@@ -199,7 +199,7 @@ def test_a_decomposition_at_hand_must_be_of_this_picture(pipeline: UniRenderPipe
         changed(other, mask, decomposition=pickle.loads(pickle.dumps(copy.deepcopy(found))))
     eight_bits = (np.round(255 * image + 0.2 * np.sin(np.arange(SIZE))[:, None, None]) / 255).astype(np.float32)
     behind = np.where(mask > 0, eight_bits, 1.0).astype(np.float32)
-    by_hand = dataclasses.replace(found, thumbnail=None)
+    by_hand = dataclasses.replace(found, thumbnail=None, made_with=None)
     for taken, own_picture in ((found, behind), (dataclasses.replace(found, roughness=0.1), image), (by_hand, other)):
         assert changed(own_picture, mask, decomposition=taken).shape == same.shape
     wrong: list[tuple[str, Any, str]] = [
@@ -209,5 +209,29 @@ def test_a_decomposition_at_hand_must_be_of_this_picture(pipeline: UniRenderPipe
         ("material", "map", "material: got 'map' beside a decomposition"),
     ]
     for name, value, words in wrong:
-        with pytest.raises(UnirenderError, match=words):
-            changed(image, mask, decomposition=found, **{name: value})
+        for of_it in (found, by_hand):
+            with pytest.raises(UnirenderError, match=words):
+                changed(image, mask, decomposition=of_it, **{name: value})
+
+
+def test_settings_beside_a_decomposition_are_those_that_it_was_made_with(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    settings: dict[str, Any] = {"looks": 2, "closed": False, "material": "map", "tile": False}
+    found = pipeline.decompose(image, mask, **settings)
+    same = pipeline.edit(image, mask, metallic=1.0, decomposition=found)
+    again = pipeline.edit(image, mask, metallic=1.0, decomposition=found, **settings)
+    np.testing.assert_array_equal(again.image_linear, same.image_linear)
+    with pytest.raises(
+        UnirenderError, match="looks: got 1 beside a decomposition, which is taken as it is, expected 2"
+    ):
+        pipeline.edit(image, mask, metallic=1.0, decomposition=found, looks=1)
+
+
+def test_results_are_told_apart_and_shown_in_short(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    found = pipeline.decompose(image, mask, mode="sample", num_inference_steps=2, num_samples=2)
+    other, edited = copy.deepcopy(found), pipeline.edit(image, mask, metallic=1.0, decomposition=found)
+    assert len({found, other, found.intrinsics, other.intrinsics}) == 4
+    assert found != other
+    assert f"Intrinsics(albedo [{SIZE}, {SIZE}, 3] in [0, " in repr(found)
+    assert "array(" not in repr(found) + repr(edited)

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -286,3 +287,26 @@ def test_the_sampler_by_name_and_by_component(monkeypatch: pytest.MonkeyPatch) -
         pipeline.decompose(image, sampler="unipc")
     with pytest.raises(UnirenderError, match="'euler'"):
         albedo(sampler="euler")
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_calls_at_the_same_time_do_not_share_their_steps(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = make_pipeline()
+    pipeline.scheduler = make_sampler(name, pipeline.scheduler)
+    image = np.random.default_rng(0).uniform(0, 1, (SIZE, SIZE, 3)).astype(np.float32)
+
+    def sampled(steps: int) -> np.ndarray:
+        settings: dict[str, Any] = {"mode": "sample", "num_inference_steps": steps, "num_samples": 1, "closed": False}
+        result = pipeline.decompose(image, generator=torch.Generator().manual_seed(0), **settings)
+        return result.intrinsics.require("albedo")["albedo"]
+
+    def interrupted(steps: Iterable[Any]) -> Iterator[Any]:
+        first, *others = steps
+        yield first
+        monkeypatch.setattr(pipeline, "progress_bar", iter)
+        sampled(2)
+        yield from others
+
+    alone = sampled(4)
+    monkeypatch.setattr(pipeline, "progress_bar", interrupted)
+    np.testing.assert_array_equal(sampled(4), alone)

@@ -54,7 +54,7 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
     if mode not in ("mean", "sample"):
         raise UnirenderError(f"mode: got {mode!r}, expected 'mean' (one step, E[x0 | condition]) or 'sample'")
     if num_inference_steps is not None and (
-        not isinstance(num_inference_steps, Integral) or not 1 <= num_inference_steps <= MOST_STEPS
+        not is_whole(num_inference_steps) or not 1 <= num_inference_steps <= MOST_STEPS
     ):
         raise UnirenderError(f"num_inference_steps: got {num_inference_steps!r}, expected 1 to {MOST_STEPS}")
     if mode == "mean":
@@ -62,6 +62,11 @@ def steps_of(mode: str, num_inference_steps: int | None) -> int:
             raise UnirenderError(f"mode mean takes 1 step, got num_inference_steps {num_inference_steps}; use 'sample'")
         return 1
     return SAMPLE_STEPS if num_inference_steps is None else int(num_inference_steps)
+
+
+def is_whole(value: object) -> bool:
+    """Whether it is a whole number, Python's or NumPy's; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def make_sampler(name: str, scheduler: Any) -> Any:

@@ -13,6 +13,7 @@ ratio is what `unirender.pipelines.closure` put there, and holds for its own lig
 gets its own s and d back; under one that has nothing to do with it, nothing is carried.
 """
 
+import functools
 import math
 from collections.abc import Collection
 
@@ -22,6 +23,7 @@ from scipy.ndimage import uniform_filter1d
 
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_light
+from unirender.pipelines.maps_key import MapsKey
 from unirender.pipelines.revealed_light import agreeing_light
 
 MOST_RATIO = 3.0  # either way
@@ -57,8 +59,12 @@ def with_carried_light(
         return after
     old, mask = before.require(*names), before.require("mask")["mask"]
     new = after.require(*names)
-    light = agreeing_light(before) if light is None else light
-    explained = derived_light(before, light, names, mirrors=False, shadows=shadows)
+    surface = Intrinsics(
+        **before.require("normal", "roughness", "mask"),
+        environment=agreeing_light(before) if light is None else light,
+        camera=before.camera,
+    )
+    explained = _explained(MapsKey(surface), tuple(names), shadows)
     carried = {}
     for name in names:
         trust = agreement(new[name], explained[name], mask)
@@ -67,6 +73,13 @@ def with_carried_light(
         smooth = _smoothed(bounded, mask, SMOOTHING * (1 - trust) * math.sqrt(mask.sum()))
         carried[name] = (new[name] * np.exp(trust * smooth)).astype(np.float32)
     return after.replace(**carried)
+
+
+@functools.lru_cache(maxsize=1)
+def _explained(surface: MapsKey, names: tuple[str, ...], shadows: bool) -> dict[str, Float[np.ndarray, "h w 3"]]:
+    """D(L_0), of the last picture: one is mostly put under several lights."""
+    light = surface.intrinsics.require("environment")["environment"]
+    return derived_light(surface.intrinsics, light, names, mirrors=False, shadows=shadows)
 
 
 def agreement(

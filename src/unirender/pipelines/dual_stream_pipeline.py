@@ -3,6 +3,7 @@
 `from_pretrained`, `save_pretrained`, `to`, `torch_dtype` and progress bars are those that users of diffusers know.
 """
 
+import copy
 import logging
 import math
 from collections.abc import Iterable
@@ -21,7 +22,7 @@ from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
-from unirender.pipelines.loading import check_complete, find_pipeline, reading
+from unirender.pipelines.loading import check_complete, copy_weights, find_pipeline, reading
 from unirender.pipelines.network import Network, Overflow
 
 P = TypeVar("P", bound="DualStreamPipeline")
@@ -78,6 +79,9 @@ class DualStreamPipeline(DiffusionPipeline):
             pipeline = super().from_pretrained(str(path), **kwargs)
             if "dual_stream" not in kwargs:
                 check_complete(pipeline.dual_stream, path / "dual_stream")
+        for name, part in pipeline.components.items():
+            if isinstance(part, torch.nn.Module) and name not in kwargs:
+                copy_weights(part)
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline
@@ -110,7 +114,8 @@ class DualStreamPipeline(DiffusionPipeline):
             raise UnirenderError(f"sampler {sampler}: mode mean takes one step and no sampler; use mode 'sample'")
         if size is not None:
             self.check_size(size)
-        scheduler = self.scheduler if sampler is None else make_sampler(sampler, self.scheduler)
+        # A scheduler remembers its steps: each call has its own, so that calls at the same time do not share them.
+        scheduler = copy.deepcopy(self.scheduler) if sampler is None else make_sampler(sampler, self.scheduler)
         if mode == "sample":
             check_scheduler(scheduler)
         return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)

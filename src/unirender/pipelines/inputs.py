@@ -158,7 +158,8 @@ def check_decomposition(
         found: that decomposition.
         picture: display values.
         mask: of the picture.
-        settings: of the call; those of how a picture is taken apart have no effect here, and are refused.
+        settings: of the call; those of how a picture is taken apart have no effect here, and are refused unless they
+            are the decomposition's own, or where these are not known, the defaults.
 
     Raises:
         UnirenderError: it is no `Decomposition`, of another size, mask or picture, or a setting would have no effect.
@@ -191,11 +192,11 @@ def check_decomposition(
             f"camera: got {camera}, expected {found.intrinsics.camera}, with which the decomposition was made; leave "
             "one of them out"
         )
-    for name, default in TAKING_APART.items():
-        if settings.get(name) not in (None, default):
+    for name, own in (found.made_with or TAKING_APART).items():
+        if settings.get(name) not in (None, own):
             raise UnirenderError(
-                f"{name}: got {settings[name]!r} beside a decomposition, which is taken as it is; pass {name} to "
-                "`decompose`, or leave the decomposition out"
+                f"{name}: got {settings[name]!r} beside a decomposition, which is taken as it is, expected {own!r}; "
+                f"pass {name} to `decompose`, or leave the decomposition out"
             )
 
 

@@ -77,6 +77,17 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
         )
 
 
+def copy_weights(model: torch.nn.Module) -> None:
+    """Parts a model from the files that it was read from.
+
+    Of weights in the files' own type safetensors only maps the pages: who writes the files anew changes them, or ends
+    the process with a bus error where a file becomes shorter. And they lie in memory as in the file, off the
+    boundaries that a sum's last bit depends on.
+    """
+    for tensor in (*model.parameters(), *model.buffers()):
+        tensor.data = tensor.data.clone()
+
+
 def _check_index(file: Path) -> None:
     try:
         index = json.loads(file.read_text(encoding="utf-8"))

@@ -1,6 +1,8 @@
 """What the pipeline returns, and how predictions become `Intrinsics`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,7 +16,7 @@ from unirender.pipelines.revealed_light import agreeing_light
 PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Decomposition:
     """What a picture was taken apart into.
 
@@ -31,16 +33,18 @@ class Decomposition:
         agreeing_light: the light that `intrinsics` got in its place. Where you have put another one there, that one
             counts (`with_network_light`).
         thumbnail: of the picture (`unirender.pipelines.framing.thumbnail`), by which it is known again; or None.
+        made_with: looks, tile, material and closed, by name; None: not known.
     """
 
     intrinsics: Intrinsics
     roughness: float
     metallic: float
-    std: dict[str, np.ndarray] | None = None
+    std: dict[str, np.ndarray] | None = field(default=None, repr=False)
     samples: tuple[Intrinsics, ...] = ()
-    network_light: Float[np.ndarray, "eh ew 3"] | None = None
+    network_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
     agreeing_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
     thumbnail: Float[np.ndarray, "th tw 3"] | None = field(default=None, repr=False)
+    made_with: Mapping[str, Any] | None = None
 
     @property
     def with_network_light(self) -> Intrinsics:
@@ -54,7 +58,7 @@ class Decomposition:
         return self.agreeing_light if self.intrinsics.environment is self.agreeing_light else None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EditResult:
     """An edited picture.
 
@@ -67,11 +71,11 @@ class EditResult:
             (`unirender.pipelines.editing.too_coarse`); None where the roughness was not edited.
     """
 
-    image_linear: Float[np.ndarray, "h w 3"]
+    image_linear: Float[np.ndarray, "h w 3"] = field(repr=False)
     intrinsics: Intrinsics
     decomposition: Decomposition
     bounded: float = 0.0
-    coarse: Bool[np.ndarray, "h w 1"] | None = None
+    coarse: Bool[np.ndarray, "h w 1"] | None = field(default=None, repr=False)
 
     @property
     def coarse_share(self) -> float:

@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import NUM_SAMPLES, Generators, steps_of
+from unirender.diffusion.sampling import NUM_SAMPLES, Generators, is_whole, steps_of
 from unirender.errors import UnirenderError
 from unirender.pipelines.looks import check_looks
 
@@ -52,10 +52,13 @@ class Sampling:
         Raises:
             UnirenderError: an unknown mode, numbers that do not go with it, or a generator that is none.
         """
-        if generator is not None and not isinstance(generator, torch.Generator | Sequence):
-            raise UnirenderError(
-                f"generator: got {generator!r}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
-            )
+        given: Any = generator
+        each = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+        for own in each:
+            if given is not None and not isinstance(own, torch.Generator):
+                raise UnirenderError(
+                    f"generator: got {own!r:.60}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
+                )
         steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
         return cls(mode, steps, count, generator, check_looks(looks, mode))
 
@@ -102,14 +105,31 @@ def list_cameras(cameras: Any, count: int) -> list[Camera]:
     return each
 
 
-def check_settings(sampling: Mapping[str, Any]) -> None:
+def check_settings(sampling: Mapping[str, Any], **switches: Any) -> None:
     """Looks at the settings that `edit` and `relight` hand on: with a decomposition at hand nothing else would.
+
+    Args:
+        sampling: those settings.
+        **switches: their own, as for `check_switches`.
 
     Raises:
         TypeError: there is no such setting, as Python has it of an argument.
+        UnirenderError: as `check_switches`.
     """
     if unknown := sorted(set(sampling) - set(SETTINGS)):
         raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}, expected some of {', '.join(SETTINGS)}")
+    check_switches(**switches)
+
+
+def check_switches(**switches: Any) -> None:
+    """Looks at arguments that are on or off: of a text, any would count as on.
+
+    Raises:
+        UnirenderError: one is neither True nor False.
+    """
+    for name, value in switches.items():
+        if not isinstance(value, bool | np.bool_):
+            raise UnirenderError(f"{name}: got {value!r:.60}, expected True or False")
 
 
 def same_noise(seed: int, count: int) -> list[torch.Generator]:
@@ -118,8 +138,8 @@ def same_noise(seed: int, count: int) -> list[torch.Generator]:
 
 
 def _sample_count(mode: str, num_samples: int | None) -> int:
-    if num_samples is not None and (not isinstance(num_samples, Integral) or num_samples < 1):
+    if num_samples is not None and (not is_whole(num_samples) or num_samples < 1):
         raise UnirenderError(f"num_samples: got {num_samples!r}, expected a whole number, at least 1")
     if mode == "mean" and num_samples not in (None, 1):
         raise UnirenderError(f"mode mean gives 1 sample, got num_samples {num_samples}; use mode 'sample'")
-    return 1 if mode == "mean" else num_samples or NUM_SAMPLES
+    return 1 if mode == "mean" else int(num_samples or NUM_SAMPLES)

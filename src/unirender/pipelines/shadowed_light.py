@@ -9,7 +9,6 @@ as far as a lobe has one light.
 """
 
 import functools
-import hashlib
 from collections.abc import Callable, Collection
 
 import numpy as np
@@ -20,6 +19,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions, texels
 from unirender.models.visibility import bin_weights, direction_bins, hidden_chance
 from unirender.pipelines.framing import Frame
+from unirender.pipelines.maps_key import MapsKey
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.surface_light import QUADRATURE_SHAPE
 
@@ -55,7 +55,7 @@ def seen_shadows(intrinsics: Intrinsics) -> "SeenShadows":
         intrinsics: as for `SeenShadows`.
     """
     surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
-    return _looked_at(_Surface(surface.with_unit_normals()))
+    return _looked_at(MapsKey(surface.with_unit_normals()))
 
 
 def forget_shadows() -> None:
@@ -169,22 +169,6 @@ def _distribution(
     return 1 / np.square(1 - np.minimum(squared, 1) * (1 - np.square(alpha)))
 
 
-class _Surface:
-    """Normal, mask and camera, equal to others with the same values."""
-
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        self.intrinsics = intrinsics
-        maps = intrinsics.maps.values()
-        digests = ((value.shape, value.dtype.str, hashlib.sha256(value.tobytes()).digest()) for value in maps)
-        self._key = (intrinsics.camera, *digests)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Surface) and self._key == other._key
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-
 @functools.lru_cache(maxsize=KEPT)
-def _looked_at(surface: _Surface) -> SeenShadows:
+def _looked_at(surface: MapsKey) -> SeenShadows:
     return SeenShadows(surface.intrinsics)

@@ -6,7 +6,7 @@ image* that comes back is premultiplied. Any size: pictures are brought to the m
 of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` component, or named in a call.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from typing import Any, overload
 
@@ -37,9 +37,11 @@ from unirender.pipelines.inputs import (
 from unirender.pipelines.network import Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
-from unirender.pipelines.settings import Sampling, check_settings, list_cameras, same_noise
+from unirender.pipelines.settings import Sampling, check_settings, check_switches, list_cameras, same_noise
 
-Picture = np.ndarray | Image.Image  # shapes and ranges are checked in `unirender.pipelines.inputs`
+# Shapes and ranges are checked in `unirender.pipelines.inputs`.
+Picture = np.ndarray | Image.Image
+Material = np.ndarray | np.floating | float
 
 
 class UniRenderPipeline(DualStreamPipeline):
@@ -118,10 +120,10 @@ class UniRenderPipeline(DualStreamPipeline):
 
     def decompose_batch(
         self,
-        images_srgb: Sequence[Picture],
-        masks: Sequence[Picture | None] | None = None,
+        images_srgb: Iterable[Picture],
+        masks: Iterable[Picture | None] | None = None,
         *,
-        cameras: Camera | Sequence[Camera] | None = None,
+        cameras: Camera | Iterable[Camera] | None = None,
         mode: str = "mean",
         num_inference_steps: int | None = None,
         num_samples: int | None = None,
@@ -154,6 +156,7 @@ class UniRenderPipeline(DualStreamPipeline):
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
+        check_switches(tile=tile, closed=closed)
         images_srgb = list(images_srgb)
         masks = [None] * len(images_srgb) if masks is None else list(masks)
         cameras = list_cameras(cameras, len(images_srgb))
@@ -174,7 +177,10 @@ class UniRenderPipeline(DualStreamPipeline):
             thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
         found = decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
-        return [replace(each, thumbnail=small) for each, small in zip(found, thumbnails, strict=True)]
+        made_with = {"looks": how.looks, "tile": bool(tile), "material": material, "closed": bool(closed)}
+        return [
+            replace(each, thumbnail=small, made_with=made_with) for each, small in zip(found, thumbnails, strict=True)
+        ]
 
     def render(
         self,
@@ -215,6 +221,7 @@ class UniRenderPipeline(DualStreamPipeline):
         """
         derived = (derived,) if isinstance(derived, str) else derived
         check_rendered(intrinsics, derived)
+        check_switches(shadows=shadows)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
         return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
@@ -239,8 +246,8 @@ class UniRenderPipeline(DualStreamPipeline):
         image_srgb: Picture,
         mask: Picture | None = None,
         *,
-        roughness: Float[np.ndarray, "h w 1"] | float | None = None,
-        metallic: Float[np.ndarray, "h w 1"] | float | None = None,
+        roughness: Material | None = None,
+        metallic: Material | None = None,
         anchored: bool = True,
         decomposition: Decomposition | None = None,
         **sampling: Any,
@@ -250,11 +257,11 @@ class UniRenderPipeline(DualStreamPipeline):
         Args:
             image_srgb: as for `decompose`.
             mask: as for `decompose`.
-            roughness: new value or map, [0, 1]; None: unchanged.
-            metallic: new value or map, [0, 1]; None: unchanged.
+            roughness: new value or map [h w 1] or [h w], in [0, 1]; None: unchanged.
+            metallic: the same.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
-                tile, material and closed are its own.
+                tile, material and closed are its own; others are refused.
             **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
                 and closed, as for `decompose`.
 
@@ -262,9 +269,9 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does
                 not fit.
         """
+        check_settings(sampling, anchored=anchored)
         if roughness is None and metallic is None:
             raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
-        check_settings(sampling)
         picture, cover = as_picture(image_srgb, mask)
         decomposition = self._decomposition(picture, cover, decomposition, sampling)
         before = decomposition.with_network_light
@@ -316,9 +323,9 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `decompose`; or neither a light nor both s and d are given; or a decomposition that does
                 not fit.
         """
+        check_settings(sampling, anchored=anchored, shadows=shadows)
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
-        check_settings(sampling)
         check_exposure(exposure)
         picture, cover = as_picture(image_srgb, mask)
         if environment is not None:
