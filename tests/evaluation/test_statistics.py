@@ -48,6 +48,7 @@ def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
     estimate = mean_estimate(values)
     low, high = scipy.stats.t.interval(0.95, 3, loc=np.mean(values), scale=scipy.stats.sem(values))
     assert (estimate.low, estimate.high) == pytest.approx((low, high))
+    assert estimate.half_width == pytest.approx(scipy.stats.sem(values) * scipy.stats.t.ppf(0.975, 3))
 
 
 def test_the_estimate_is_the_mean_over_samples_not_over_objects() -> None:
@@ -90,6 +91,16 @@ def test_pairing_sees_a_difference_that_intervals_of_the_means_hide() -> None:
     assert beats(a, b, higher_is_better=True)
     assert not beats(b, a, higher_is_better=True)
     assert beats(b, a, higher_is_better=False)
+
+
+def test_of_two_objects_many_samples_prove_nothing() -> None:
+    """The difference is drawn by object in the paired test, too; the twin draws samples."""
+    a, b = ({f"s{i}": value + i % 2 * shift for i in range(60)} for value, shift in ((21.0, 4.0), (20.0, 0.0)))
+    objects = {f"s{i}": i % 2 for i in range(60)}
+    difference = paired_difference(a, b, objects)
+    assert (difference.mean, difference.n, difference.clusters) == (3.0, 60, 2)
+    assert not beats(a, b, higher_is_better=True, clusters=objects)
+    assert beats(a, b, higher_is_better=True)
 
 
 def test_a_method_does_not_beat_itself_or_an_equal() -> None:

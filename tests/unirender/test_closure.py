@@ -1,6 +1,7 @@
 """Closing a decomposition: its rendering becomes the picture, true maps stay, clipped pixels are never made darker."""
 
 import numpy as np
+import pytest
 
 from unirender.composite import composite_image
 from unirender.intrinsics import Intrinsics
@@ -44,6 +45,10 @@ def test_the_change_is_bounded_and_shared() -> None:
     a, d = (getattr(closed, name)[2:] / getattr(maps, name)[2:] for name in ("albedo", "diffuse"))
     assert a.max() <= np.sqrt(MAX_GAIN) + 1e-4
     np.testing.assert_allclose(a, d, rtol=1e-4)
+    darkened = close_decomposition(maps, 0 * composite_image(maps), composite_image(maps))
+    a, s = (getattr(darkened, name)[2:] / getattr(maps, name)[2:] for name in ("albedo", "specular"))
+    assert a.min() == pytest.approx(np.sqrt(1 / MAX_GAIN), rel=1e-4)
+    np.testing.assert_allclose(a, s, rtol=1e-4)
 
 
 def test_a_clipped_picture_is_only_a_lower_bound() -> None:
