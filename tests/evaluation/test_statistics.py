@@ -51,6 +51,19 @@ def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
     assert estimate.half_width == pytest.approx(scipy.stats.sem(values) * scipy.stats.t.ppf(0.975, 3))
 
 
+def test_of_many_objects_it_is_as_wide_as_their_spread_says() -> None:
+    """Away from 0, where an interval of a wrong scale would hold the mean as often; objects differ in their samples."""
+    rng = np.random.default_rng(3)
+    sizes = rng.integers(1, 9, size=300)
+    of = np.repeat(np.arange(300), sizes)
+    values = 20 + 3 * rng.normal(size=300)[of] + rng.normal(size=len(of))
+    residuals = np.bincount(of, weights=values - values.mean())
+    error = math.sqrt(300 / 299 * np.square(residuals).sum()) / len(of)
+    estimate = mean_estimate(values, of.tolist())
+    for end in (estimate.mean - estimate.low, estimate.high - estimate.mean):
+        assert end == pytest.approx(scipy.stats.norm.ppf(0.975) * error, rel=0.06)
+
+
 def test_the_estimate_is_the_mean_over_samples_not_over_objects() -> None:
     estimate = mean_estimate([1.0, 1.0, 1.0, 5.0], ["a", "a", "a", "b"])
     assert (estimate.mean, estimate.n, estimate.clusters) == (2.0, 4, 2)
@@ -62,7 +75,10 @@ def test_the_same_seed_gives_the_same_interval() -> None:
     assert mean_estimate(values) != mean_estimate(values, seed=1)
 
 
-@pytest.mark.parametrize(("values", "labels"), [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None)])
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None), ([1.0] * FEW + [math.inf], None)],
+)
 def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | None) -> None:
     estimate = mean_estimate(values, labels)
     assert math.isnan(estimate.low)

@@ -43,6 +43,12 @@ def test_impossible_field_of_view(fov: float) -> None:
         Camera(fov_deg=fov)
 
 
+@pytest.mark.parametrize("principal", [(0.5, math.nan), (math.inf, 0.5)])
+def test_impossible_principal_point(principal: tuple[float, float]) -> None:
+    with pytest.raises(UnirenderError, match="principal point"):
+        Camera(principal=principal)
+
+
 @pytest.mark.parametrize("camera", [Camera(), Camera(1 / 3 * 100, (-1e-7, 2 / 3)), Camera(50, (0.4, 0.6))])
 def test_a_described_camera_reads_back(camera: Camera) -> None:
     assert Camera.parse(camera.describe()) == camera
