@@ -6,20 +6,12 @@ annotation in a signature is checked by beartype at each call. A wrong shape in 
 
 import os
 import signal
-import sys
 import tempfile
-import types
 from collections.abc import Iterator
 
-from beartype import BeartypeConf, beartype
-from jaxtyping import install_import_hook
+import shape_checks
 
-PACKAGES = ("unirender", "unirender_reference", "unirender_evaluation")
-# An int is a float, as it is to Python and to pyright; the hook wants the checker by its dotted name.
-_checker = types.ModuleType("unirender_test_checker")
-_checker.check = beartype(conf=BeartypeConf(is_pep484_tower=True))  # type: ignore[attr-defined] - made on the spot
-sys.modules[_checker.__name__] = _checker
-install_import_hook(PACKAGES, "unirender_test_checker.check")
+shape_checks.install("unirender", "unirender_reference", "unirender_evaluation")
 
 os.environ["HF_HUB_OFFLINE"] = "1"
 # Neither read nor write what the user has in the real cache (checkpoints, converted weights, data).

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
+import shape_checks
+from beartype import beartype
+from jaxtyping import Float, TypeCheckError
 
-from unirender.color import luminance
+from unirender.color import luminance, unpremultiply
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = [
@@ -67,3 +69,28 @@ def test_array_shapes_are_checked_while_the_tests_run() -> None:
     with pytest.raises(TypeCheckError):
         luminance("not an array")  # pyright: ignore[reportArgumentType] - the point of the test
     assert np.isclose(luminance(np.ones((2, 2, 3), np.float32)), 1.0).all()
+
+
+def test_an_axis_has_one_size_in_the_arguments_and_the_result_of_a_call() -> None:
+    image, mask = np.ones((2, 2, 3), np.float32), np.ones((2, 2, 1), np.float32)
+    with pytest.raises(TypeCheckError):
+        unpremultiply(image, mask[:1])
+    assert unpremultiply(image[:1], mask[:1]).shape == (1, 2, 3)  # the size of the call before is forgotten
+
+    def every(x: Float[np.ndarray, " n"], step: int) -> Float[np.ndarray, " n"]:
+        return x[::step]
+
+    looked_at = shape_checks.checked(typechecker=None)(every)
+    assert len(looked_at(np.ones(4), 1)) == 4
+    with pytest.raises(TypeCheckError):
+        looked_at(np.ones(4), 2)
+    with pytest.raises(TypeCheckError):
+        looked_at(np.ones(4), "1")
+
+    def rows(count: int) -> Float[np.ndarray, "{count} 3"]:
+        return np.ones((2, 3))
+
+    looked_at = shape_checks.checked(typechecker=beartype)(rows)
+    assert len(looked_at(2)) == 2
+    with pytest.raises(TypeCheckError):
+        looked_at(3)

@@ -88,6 +88,7 @@ def test_weighted_error_by_hand() -> None:
     t = np.zeros((1, 2, 1), np.float32)
     w = np.array([[[1.0], [0.5]]], np.float32)
     assert metrics.mse(p, t, w) == pytest.approx((0.25 + 0.5 * 0.04) / 1.5)
+    assert metrics.mse(p, t, w / 8) == metrics.mse(p, t, w)  # a mask of less than a pixel, too
 
 
 def test_whole_frame_exceeds_masked_by_the_coverage() -> None:
@@ -182,9 +183,11 @@ def test_what_the_option_asks_for() -> None:
         chosen_variants(["all", "none"])
 
 
-def test_a_perfect_value_is_better_than_any_other() -> None:
-    for metric in METRICS.values():
-        worse = metric.perfect - 1 if metric.higher_is_better else metric.perfect + 1
-        if math.isfinite(metric.perfect):
-            assert metric.better(metric.perfect, worse)
-            assert not metric.better(worse, metric.perfect)
+def test_what_is_nearer_to_perfect_is_better() -> None:
+    higher = {"psnr", "ssim", "iou", "cosine"}
+    for name, metric in METRICS.items():
+        near, far = (30.0, 20.0) if math.isinf(metric.perfect) else (abs(metric.perfect - x) for x in (0.1, 0.5))
+        assert metric.better(near, far), name
+        assert not metric.better(far, near), name
+        assert not metric.better(near, near), name
+        assert metric.arrow == ("↑" if name in higher else "↓")

@@ -48,6 +48,20 @@ def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
     estimate = mean_estimate(values)
     low, high = scipy.stats.t.interval(0.95, 3, loc=np.mean(values), scale=scipy.stats.sem(values))
     assert (estimate.low, estimate.high) == pytest.approx((low, high))
+    assert estimate.half_width == pytest.approx(scipy.stats.sem(values) * scipy.stats.t.ppf(0.975, 3))
+
+
+def test_of_many_objects_it_is_as_wide_as_their_spread_says() -> None:
+    """Away from 0, where an interval of a wrong scale would hold the mean as often; objects differ in their samples."""
+    rng = np.random.default_rng(3)
+    sizes = rng.integers(1, 9, size=300)
+    of = np.repeat(np.arange(300), sizes)
+    values = 20 + 3 * rng.normal(size=300)[of] + rng.normal(size=len(of))
+    residuals = np.bincount(of, weights=values - values.mean())
+    error = math.sqrt(300 / 299 * np.square(residuals).sum()) / len(of)
+    estimate = mean_estimate(values, of.tolist())
+    for end in (estimate.mean - estimate.low, estimate.high - estimate.mean):
+        assert end == pytest.approx(scipy.stats.norm.ppf(0.975) * error, rel=0.06)
 
 
 def test_the_estimate_is_the_mean_over_samples_not_over_objects() -> None:
@@ -61,7 +75,10 @@ def test_the_same_seed_gives_the_same_interval() -> None:
     assert mean_estimate(values) != mean_estimate(values, seed=1)
 
 
-@pytest.mark.parametrize(("values", "labels"), [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None)])
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [([1.0], None), ([1.0, 2.0], ["a", "a"]), ([1.0, math.inf], None), ([1.0] * FEW + [math.inf], None)],
+)
 def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | None) -> None:
     estimate = mean_estimate(values, labels)
     assert math.isnan(estimate.low)
@@ -90,6 +107,16 @@ def test_pairing_sees_a_difference_that_intervals_of_the_means_hide() -> None:
     assert beats(a, b, higher_is_better=True)
     assert not beats(b, a, higher_is_better=True)
     assert beats(b, a, higher_is_better=False)
+
+
+def test_of_two_objects_many_samples_prove_nothing() -> None:
+    """The difference is drawn by object in the paired test, too; the twin draws samples."""
+    a, b = ({f"s{i}": value + i % 2 * shift for i in range(60)} for value, shift in ((21.0, 4.0), (20.0, 0.0)))
+    objects = {f"s{i}": i % 2 for i in range(60)}
+    difference = paired_difference(a, b, objects)
+    assert (difference.mean, difference.n, difference.clusters) == (3.0, 60, 2)
+    assert not beats(a, b, higher_is_better=True, clusters=objects)
+    assert beats(a, b, higher_is_better=True)
 
 
 def test_a_method_does_not_beat_itself_or_an_equal() -> None:

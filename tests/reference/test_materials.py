@@ -187,9 +187,10 @@ def test_surfaces_are_shaded_at_the_mapped_normal(mirrored: bool, front_light: n
         "diffuse": lambda renderer, seed: renderer.diffuse(front_light, 512, seed),
     }
     for name, draw in draws.items():
-        result = compare(draw(mapped, 1), draw(bent, 2), mask)
+        right = draw(bent, 2)
+        result = compare(draw(mapped, 1), right, mask)
         assert result.passed, f"{name}: {result}"
-        assert not compare(draw(twin, 1), draw(bent, 2), mask).passed, name
+        assert not compare(draw(twin, 1), right, mask).passed, name
 
 
 def facing_hit() -> Any:

@@ -365,29 +365,27 @@ def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(rend
     assert {"mitsuba", "variant", "spp", "seed", "camera", "nan_pixels"} <= set(sample.provenance)
 
 
-@pytest.mark.parametrize("other", ["maps", "camera", "resolution"])
 @pytest.mark.parametrize("to_floor", [False, True], ids=["spp", "floor"])
-def test_a_renderer_of_another_scene_is_refused(other: str, to_floor: bool) -> None:
+def test_a_renderer_of_another_scene_is_refused(to_floor: bool) -> None:
     """An object with maps has the name of the one without, and is another object."""
     obj, light = make_object(1, "train"), scenes.light(1)
     renderer = Renderer(obj, resolution=8)
     spec = SceneSpec(obj, light, 0.3, 0.6, resolution=8)
-    changes: dict[str, dict[str, Any]] = {
-        "maps": {"obj": make_object(1, "train", maps=True)},
-        "camera": {"camera": Camera(20.0)},
-        "resolution": {"resolution": 9},
-    }
-    wrong = dataclasses.replace(spec, **changes[other])
-    assert wrong.obj.name == obj.name
-    assert scene_hash(wrong) != scene_hash(spec)
 
     def render(spec: SceneSpec) -> Sample:
         return render_sample_to_floor(spec, 20, 0, renderer) if to_floor else render_sample(spec, 16, 0, renderer)
 
-    with pytest.raises(
-        UnirenderError, match=f"another: {'object' if other == 'maps' else other}.*leave `renderer` out"
-    ):
-        render(wrong)
+    changes: dict[str, dict[str, Any]] = {
+        "object": {"obj": make_object(1, "train", maps=True)},
+        "camera": {"camera": Camera(20.0)},
+        "resolution": {"resolution": 9},
+    }
+    for other, change in changes.items():
+        wrong = dataclasses.replace(spec, **change)
+        assert wrong.obj.name == obj.name
+        assert scene_hash(wrong) != scene_hash(spec)
+        with pytest.raises(UnirenderError, match=f"another: {other}.*leave `renderer` out"):
+            render(wrong)
     copied = dataclasses.replace(spec, obj=dataclasses.replace(obj, vertices=obj.vertices.copy()))
     assert render(copied).provenance["scene"] == scene_hash(spec)
 

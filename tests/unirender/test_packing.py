@@ -258,7 +258,8 @@ def test_a_full_disk_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
     write_shard(tmp_path / "shard-000000.tar", {"a": members()})
     script = "import sys; from unirender.training.data import GroupDataset; GroupDataset(sys.argv[1])"
-    limited = f"ulimit -f 1; exec {sys.executable} -c '{script}' {tmp_path}"  # kilobytes of a file
+    # Kilobytes of a file; without -B Python cuts its bytecode off as well, and nothing imports the modules again.
+    limited = f"ulimit -f 1; exec {sys.executable} -B -c '{script}' {tmp_path}"
     ended = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)
     assert re.search(r"cannot be written \(\w.*\); free some space or set UNIRENDER_CACHE", ended.stderr)
     assert "(None)" not in ended.stderr
