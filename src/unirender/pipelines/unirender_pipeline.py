@@ -73,6 +73,7 @@ class UniRenderPipeline(DualStreamPipeline):
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
+        flat: bool = False,
     ) -> Decomposition:
         """Inverse rendering.
 
@@ -95,6 +96,8 @@ class UniRenderPipeline(DualStreamPipeline):
             closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`), and
                 the light so that it agrees with s and d (`unirender.pipelines.revealed_light`); False gives what the
                 network predicts (materials by the checkpoint's calibration, if it has one).
+            flat: make the albedo even between its edges, and move the detail that it loses into s and d
+                (`unirender.pipelines.flat_albedo`).
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
@@ -113,6 +116,7 @@ class UniRenderPipeline(DualStreamPipeline):
             tile=tile,
             material=material,
             closed=closed,
+            flat=flat,
         )
         return result
 
@@ -132,6 +136,7 @@ class UniRenderPipeline(DualStreamPipeline):
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
+        flat: bool = False,
     ) -> list[Decomposition]:
         """Inverse rendering of several pictures of any sizes in one batch of the network (and one more to close them).
 
@@ -150,6 +155,7 @@ class UniRenderPipeline(DualStreamPipeline):
             tile: add the detail of tiles.
             material: one number per object or maps.
             closed: change albedo, s, d and the light, as for `decompose`.
+            flat: make the albedo even, likewise.
 
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
@@ -173,7 +179,9 @@ class UniRenderPipeline(DualStreamPipeline):
             views.append(View(srgb_decode(picture) * cover, cover, camera))
             thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
-        found = decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
+        found = decompose_views(
+            network, views, how, material=material, closed=closed, flat=flat, tile=tile, calibration=lines
+        )
         return [replace(each, thumbnail=small) for each, small in zip(found, thumbnails, strict=True)]
 
     def render(
@@ -254,9 +262,9 @@ class UniRenderPipeline(DualStreamPipeline):
             metallic: new value or map, [0, 1]; None: unchanged.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
-                tile, material and closed are its own.
-            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
-                and closed, as for `decompose`.
+                tile, material, closed and flat are its own.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material,
+                closed and flat, as for `decompose`.
 
         Raises:
             UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does
