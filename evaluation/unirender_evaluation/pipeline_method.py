@@ -26,6 +26,7 @@ class PipelineMethod:
         closed: albedo, s and d are changed so that their rendering is the picture.
         device: where the pipeline runs: another one rounds otherwise.
         looks: at each picture that is taken apart.
+        flat: the albedo is made even between its edges.
     """
 
     def __init__(
@@ -42,9 +43,10 @@ class PipelineMethod:
         closed: bool = True,
         device: str = "cpu",
         looks: int = 1,
+        flat: bool = False,
     ) -> None:
         self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
-        self.closed, self.device, self.looks = closed, device, looks
+        self.closed, self.device, self.looks, self.flat = closed, device, looks, flat
         self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
         self._decompositions = Decompositions[Any]() if decompositions is None else decompositions
 
@@ -61,6 +63,7 @@ class PipelineMethod:
             "seed": self.seed,
             "device": self.device,
             **({"looks": self.looks} if self.looks > 1 else {}),
+            **({"flat": True} if self.flat else {}),
         }
 
     def _options(self) -> dict[str, Any]:
@@ -78,7 +81,7 @@ class PipelineMethod:
 
     def _decomposition(self, image_srgb: Image, mask: Mask, camera: Camera) -> Any:
         """Of a picture, computed once: the rows that share it differ in what they do with it."""
-        options = {**self._options(), "closed": self.closed, "looks": self.looks}
+        options = {**self._options(), "closed": self.closed, "looks": self.looks, "flat": self.flat}
         make = partial(self.pipeline.decompose, image_srgb, mask=mask, camera=camera, **options)
         return self._decompositions.of(image_srgb, mask, camera, make)[0]
 

@@ -37,6 +37,7 @@ from unirender_evaluation.versions import LPIPS, MODEL
 T = TypeVar("T")
 SAMPLE_STEPS, SAMPLE_COUNT = 20, 5
 LOOKS = 6
+FLAT_ALBEDO = "albedo made even between its edges"
 MEAN_OF_LOOKS = "mean of looks at the picture, mirrored and with exchanged channels"
 KEY_LETTERS = "a letter from a to z or a digit: its key is made of them"
 
@@ -163,7 +164,7 @@ def trivial_rows() -> list[Row]:
 def our_rows(
     pipeline: Any, weights: str, seed: int = 0, sample_scenes: int | None = None, device: str = "cpu"
 ) -> list[Row]:
-    """Our rows: `mean` plain, anchored, of several looks and not closed, composites of its decomposition, `sample` on a
+    """Our rows: `mean` plain, anchored, of several looks, with a flat albedo and not closed, composites of its decomposition, `sample` on a
     subset of scenes.
 
     Args:
@@ -185,6 +186,7 @@ def our_rows(
     mean = ours("Ours (mean)", decompositions=shared)
     anchored = ours("Ours (mean, anchored)", anchored=True, decompositions=shared)
     looked = ours(f"Ours (mean, {LOOKS} looks)", looks=LOOKS)
+    flat = ours("Ours (mean, flat albedo)", flat=True)
     open_mean = ours("Ours (mean, not closed)", closed=False)
     composites = [CompositeOf(mean, anchored=carried, edited=edited) for carried in (False, True)]
     decomposes = from_image | {("inverse", "single-image"), LIGHT}
@@ -194,6 +196,7 @@ def our_rows(
         make_row(mean, "ours", published="Ours", **one),
         make_row(anchored, "ours", protocols=from_image, **one),
         make_row(looked, "ours", protocols=decomposes, note=MEAN_OF_LOOKS, **one),
+        make_row(flat, "ours", protocols=decomposes, note=FLAT_ALBEDO, **one),
         make_row(open_mean, "ours", protocols=decomposes, note="maps as the network predicts them", **one),
         *(make_row(composite, "baseline", protocols=from_image, **one) for composite in composites),
     ]

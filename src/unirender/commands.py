@@ -42,6 +42,8 @@ class Decompose:
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    flat: bool = False
+    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
     looks: int = 1
     """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
     longer; 6 give most of it."""
@@ -57,7 +59,7 @@ class Decompose:
     @property
     def options(self) -> dict[str, Any]:
         """How a picture is taken apart, as keyword arguments of the pipeline and for `meta.json`."""
-        return {"looks": self.looks, "closed": self.closed, "tile": self.tile}
+        return {"looks": self.looks, "closed": self.closed, "flat": self.flat, "tile": self.tile}
 
     def run(self) -> int:
         """Returns the exit status."""
@@ -159,6 +161,8 @@ class Edit:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    flat: bool = False
+    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
     looks: int = 1
     """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
     longer; 6 give most of it."""
@@ -180,7 +184,8 @@ class Edit:
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
+        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "flat": self.flat}
+        options |= {"tile": self.tile}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
             picture = with_parts_remark(picture, self.model.side(pipeline))
@@ -212,6 +217,8 @@ class Relight:
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
     closed: bool = True
     """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    flat: bool = False
+    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
     looks: int = 1
     """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
     longer; 6 give most of it."""
@@ -230,7 +237,8 @@ class Relight:
         check_looks_option(self.looks, self.model.mode)
         check_stops(self.exposure)
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "tile": self.tile}
+        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "flat": self.flat}
+        options |= {"tile": self.tile}
         options |= {"shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)

@@ -36,7 +36,7 @@ RARE_SUFFIXES = (".avif", ".gif", ".j2k", ".jfif", ".jp2", ".mpo", ".pbm", ".pgm
 FIGURES = ("roughness_mean", "metallic_mean", "clipped", "remarks", "std_max")  # of `meta.json`, for the summary
 INPUT_SHA256 = "input_sha256"
 ELSEWHERE = ("device", "input")  # of `meta.json`: another machine or another path to the picture is no other setting
-ADDED = {"looks": 1}  # settings that an older `meta.json` does not name, and what they were
+ADDED = {"looks": 1, "flat": False}  # settings that an older `meta.json` does not name, and what they were
 AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # looks at pictures of one batch of the network, and pixels of the pictures
 
 Read = Callable[[Path, Path | None], Picture]

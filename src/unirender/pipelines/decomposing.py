@@ -9,6 +9,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.pipelines.calibration import Lines, calibrated
 from unirender.pipelines.closure import close_decomposition
+from unirender.pipelines.flat_albedo import with_flat_albedo
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
 from unirender.pipelines.rendering import render_any_size
@@ -43,6 +44,7 @@ def decompose_views(
     *,
     material: str,
     closed: bool,
+    flat: bool,
     tile: bool,
     calibration: Lines | None = None,
 ) -> list[Decomposition]:
@@ -55,6 +57,7 @@ def decompose_views(
         material: `scalar` or `map`.
         closed: whether albedo, s and d are changed so that their rendering is the picture, one more batch, and then the
             light so that it agrees with s and d.
+        flat: whether the albedo is made even between its edges, which s and d make up for.
         tile: whether pictures larger than the network's square get the detail of tiles; a batch for every few tiles.
         calibration: lines by which roughness and metallic are read.
     """
@@ -78,6 +81,11 @@ def decompose_views(
         samples = [
             [close_decomposition(sample, view.image_linear, next(rendered)) for sample in own]
             for view, own in zip(views, samples, strict=True)
+        ]
+    if flat:
+        samples = [
+            [with_flat_albedo(sample, view.image_linear, frame) for sample in own]
+            for view, frame, own in zip(views, frames, samples, strict=True)
         ]
     combined = [combine(tuple(own)) for own in samples]
     return [with_agreeing_light(found) for found in combined] if closed else combined

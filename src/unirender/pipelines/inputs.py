@@ -24,7 +24,8 @@ MIN_SIDE = 8  # pixels
 RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
-TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True}  # of `decompose` alone, and their defaults
+# of `decompose` alone, and their defaults
+TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
 
 
 def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:

@@ -33,7 +33,7 @@ class Decomposition:
         agreeing_light: the light that `intrinsics` got in its place. Where you have put another one there, that one
             counts (`with_network_light`).
         thumbnail: of the picture (`unirender.pipelines.framing.thumbnail`), by which it is known again; or None.
-        made_with: looks, tile, material and closed, by name; None: not known.
+        made_with: looks, tile, material, closed and flat, by name; None: not known.
     """
 
     intrinsics: Intrinsics

@@ -14,7 +14,7 @@ from unirender.pipelines.looks import check_looks
 
 SETTINGS = (  # of `decompose`
     *("camera", "mode", "num_inference_steps", "num_samples", "generator"),
-    *("sampler", "size", "looks", "tile", "material", "closed"),
+    *("sampler", "size", "looks", "tile", "material", "closed", "flat"),
 )
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 

@@ -75,6 +75,7 @@ class UniRenderPipeline(DualStreamPipeline):
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
+        flat: bool = False,
     ) -> Decomposition:
         """Inverse rendering.
 
@@ -97,6 +98,8 @@ class UniRenderPipeline(DualStreamPipeline):
             closed: change albedo, s and d so that their rendering is the picture (`unirender.pipelines.closure`), and
                 the light so that it agrees with s and d (`unirender.pipelines.revealed_light`); False gives what the
                 network predicts (materials by the checkpoint's calibration, if it has one).
+            flat: make the albedo even between its edges, and move the detail that it loses into s and d
+                (`unirender.pipelines.flat_albedo`).
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
@@ -115,6 +118,7 @@ class UniRenderPipeline(DualStreamPipeline):
             tile=tile,
             material=material,
             closed=closed,
+            flat=flat,
         )
         return result
 
@@ -134,6 +138,7 @@ class UniRenderPipeline(DualStreamPipeline):
         tile: bool = False,
         material: str | None = None,
         closed: bool = True,
+        flat: bool = False,
     ) -> list[Decomposition]:
         """Inverse rendering of several pictures of any sizes in one batch of the network (and one more to close them).
 
@@ -152,6 +157,7 @@ class UniRenderPipeline(DualStreamPipeline):
             tile: add the detail of tiles.
             material: one number per object or maps.
             closed: change albedo, s, d and the light, as for `decompose`.
+            flat: make the albedo even, likewise.
 
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
@@ -176,8 +182,11 @@ class UniRenderPipeline(DualStreamPipeline):
             views.append(View(srgb_decode(picture) * cover, cover, camera))
             thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
-        found = decompose_views(network, views, how, material=material, closed=closed, tile=tile, calibration=lines)
-        made_with = {"looks": how.looks, "tile": bool(tile), "material": material, "closed": bool(closed)}
+        found = decompose_views(
+            network, views, how, material=material, closed=closed, flat=flat, tile=tile, calibration=lines
+        )
+        made_with = {"looks": how.looks, "tile": bool(tile), "material": material}
+        made_with |= {"closed": bool(closed), "flat": bool(flat)}
         return [
             replace(each, thumbnail=small, made_with=made_with) for each, small in zip(found, thumbnails, strict=True)
         ]
@@ -261,9 +270,9 @@ class UniRenderPipeline(DualStreamPipeline):
             metallic: the same.
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
-                tile, material and closed are its own; others are refused.
-            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material
-                and closed, as for `decompose`.
+                tile, material, closed and flat are its own; others are refused.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material,
+                closed and flat, as for `decompose`.
 
         Raises:
             UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does
