@@ -207,6 +207,7 @@ def test_a_decomposition_at_hand_must_be_of_this_picture(pipeline: UniRenderPipe
         ("tile", True, "tile: got True beside a decomposition, which is taken as it is"),
         ("closed", False, "closed: got False beside a decomposition"),
         ("material", "map", "material: got 'map' beside a decomposition"),
+        ("flat", True, "flat: got True beside a decomposition"),
     ]
     for name, value, words in wrong:
         for of_it in (found, by_hand):

@@ -52,6 +52,7 @@ CASES = {
     "pipeline.decompose(image, mask, mode='sample', num_samples=True)": "num_samples: got True, expected a whole",
     "pipeline.decompose(image, mask, num_inference_steps=True)": "num_inference_steps: got True, expected 1 to",
     "pipeline.decompose(image, mask, closed='no')": "closed: got 'no', expected True or False",
+    "pipeline.decompose(image, mask, flat='no')": "flat: got 'no', expected True or False",
     "pipeline.decompose(image, mask, tile=1)": "tile: got 1, expected True or False",
     "pipeline.edit(image, mask, metallic=1.0, anchored='no')": "anchored: got 'no', expected True or False",
     "pipeline.relight(image, light, mask, shadows=None)": "shadows: got None, expected True or False",

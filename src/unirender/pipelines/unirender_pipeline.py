@@ -162,7 +162,7 @@ class UniRenderPipeline(DualStreamPipeline):
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
-        check_switches(tile=tile, closed=closed)
+        check_switches(tile=tile, closed=closed, flat=flat)
         images_srgb = list(images_srgb)
         masks = [None] * len(images_srgb) if masks is None else list(masks)
         cameras = list_cameras(cameras, len(images_srgb))
