@@ -136,7 +136,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         codec: str = "pixel",  # "pixel" (space to depth) or "kl" (an AutoencoderKL beside the network)
         patch: int = 2,  # image pixels per latent pixel, one way
         environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
-        hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
+        hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: packing.HDR_CURVES
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
         light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
         derived_light: bool = False,  # s and d that were derived from a light, without shadows, have their own flag

@@ -20,8 +20,9 @@ from unirender.camera import Camera
 from unirender.diffusion.sampling import denoise, make_sampler
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, srgb_encode
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS, srgb_encode
 from unirender.models.priors import PRIORS
 from unirender.training.loss_terms import Errors, gradients, noise_like, predict, weighted_mean
 from unirender.training.presets import LossConfig

@@ -18,8 +18,9 @@ from torch import Tensor
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.added import Answers
-from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
 from unirender.pipelines.inputs import told_derived
