@@ -95,8 +95,22 @@ FROM_RECORDS = (
     "table*",
     "verdict",
 )
-# Of the shared vocabulary's folder: the command line, and what is said where a file cannot be written.
-OUTSIDE = ("__main__", "cli", "command_line", "commands", "folder_command", "options", "remarks", "shipped", "writing")
+# Of the folder of the shared vocabulary: the command line, and what is said where a file cannot be written.
+OUTSIDE = (
+    "__main__",
+    "cli",
+    "command_line",
+    "commands",
+    "folder_command",
+    "input_picture",
+    "notices",
+    "option_checks",
+    "options",
+    "process_ends",
+    "remarks",
+    "shipped",
+    "writing",
+)
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
