@@ -31,7 +31,7 @@ from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
 from unirender_evaluation.suites import Scene, material_key
-from unirender_evaluation.tasks import LIGHT, PROTOCOLS, Task
+from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")

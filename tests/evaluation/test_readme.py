@@ -14,7 +14,7 @@ from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import readme
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"

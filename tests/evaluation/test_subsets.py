@@ -13,7 +13,8 @@ from unirender_evaluation.rows import Row
 from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run
 
