@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from unirender.training.memory import TrainingBytes
     from unirender.training.processes import Processes
     from unirender.training.source import ShardSource
-    from unirender.training.trainer import Trainer
+    from unirender.training.trainer import RunConfig, Trainer
     from unirender.training.validation import Validate
 
 
@@ -62,25 +62,13 @@ def _train(
     from unirender.training.memory import training_bytes
     from unirender.training.start import read_start
     from unirender.training.trackers import make_trackers, tracking
-    from unirender.training.trainer import RunConfig, Trainer
+    from unirender.training.trainer import Trainer
 
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
     if parallel > 1:
         torch.set_num_threads(1)
-    run = RunConfig(
-        out,
-        steps=config.steps if options.steps is None and options.minutes is None else options.steps,
-        minutes=options.minutes,
-        log_every=options.log_every,
-        save_minutes=options.save_minutes,
-        refresh_minutes=options.refresh_minutes,
-        parallel=parallel,
-        accumulate=options.accumulate,
-        keep_best=options.keep_best,
-        preset=options.preset,
-        scored_on=options.scored_on,
-    )
+    run = run_config(options, config, out, parallel)
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     tell = notice if processes.is_main else lambda text: None
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
@@ -111,11 +99,31 @@ def _train(
     return pipeline
 
 
+def run_config(options: Train, config: TrainConfig, out: Path, parallel: int) -> "RunConfig":
+    """How long the run is and what it leaves behind; `parallel`: parts of a batch that run side by side."""
+    from unirender.training.trainer import RunConfig
+
+    return RunConfig(
+        out,
+        steps=config.steps if options.steps is None and options.minutes is None else options.steps,
+        minutes=options.minutes,
+        log_every=options.log_every,
+        save_minutes=options.save_minutes,
+        refresh_minutes=options.refresh_minutes,
+        parallel=parallel,
+        accumulate=options.accumulate,
+        keep_best=options.keep_best,
+        preset=options.preset,
+        scored_on=options.scored_on,
+    )
+
+
 def make_source(
     options: Train, config: TrainConfig, trainer: "Trainer", memory: "TrainingBytes"
 ) -> "tuple[ShardSource | DeviceSource, GroupDataset]":
-    """Where the batches come from, and the packed data that it opened: the CPU; or the training's device, where that is
-    asked for or has the place.
+    """Where the batches come from, and the packed data that it opened.
+
+    Batches are made on the CPU, or on the training's device if that is asked for or has enough free memory.
 
     Args:
         options: data folder, and where batches are made.
