@@ -20,7 +20,8 @@ from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.store import Job
 from unirender_evaluation.suites import Scene, Suite, material_key
-from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.task import PROTOCOLS, Task
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.truth_check import TruthCheck
 from unirender_evaluation.versions import LPIPS, REFERENCE
 

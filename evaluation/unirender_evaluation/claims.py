@@ -7,7 +7,7 @@ from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL
 from unirender_evaluation.metrics import Metric, Scale, Variant, metric_key
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.table_list import ALL_METRICS
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 MASKED = Variant("masked", "srgb", "raw")
 

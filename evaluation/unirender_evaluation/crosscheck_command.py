@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from unirender.options import at_least
+from unirender.option_checks import at_least
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unirender.errors import UsageError
-from unirender.options import at_least
+from unirender.option_checks import at_least
 
 LEAST_SIZE = 8
 

@@ -19,7 +19,8 @@ from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.task import PROTOCOLS, Task
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import Versions
 
 

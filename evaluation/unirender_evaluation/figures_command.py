@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, at_least, notice
+from unirender.notices import notice
+from unirender.option_checks import at_least
+from unirender.options import Device
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture

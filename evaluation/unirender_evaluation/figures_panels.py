@@ -23,7 +23,8 @@ from unirender_evaluation.mitsuba_method import MitsubaScene
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.scoring import over_white, score_image, score_maps
 from unirender_evaluation.suites import Material, Scene, Suite
-from unirender_evaluation.tasks import Task, picture, tasks
+from unirender_evaluation.task import Task
+from unirender_evaluation.tasks import picture, tasks
 from unirender_evaluation.truth_render import good_spp, item_seed
 
 Truth = Callable[[Scene, Material, Float[np.ndarray, "eh ew 3"]], Image]

@@ -4,7 +4,7 @@ from unirender_evaluation.light_balls import GLOSSY, GLOSSY_BALL, MATTE_BALL
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.specs import Column, TableSpec
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 
 def _column(group: str, quantity: str, metric: Metric, **overrides: str) -> Column:

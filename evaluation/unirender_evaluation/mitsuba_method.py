@@ -28,7 +28,8 @@ from unirender_evaluation.rows import evenly
 from unirender_evaluation.store import Job
 from unirender_evaluation.suite_objects import scene_object
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
-from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.task import PROTOCOLS, Task
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.truth_file import diffuse_member, image_member, specular_member
 from unirender_evaluation.truth_render import good_spp, item_seed
 from unirender_evaluation.versions import LPIPS, REFERENCE

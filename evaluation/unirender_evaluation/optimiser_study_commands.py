@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from unirender.errors import UsageError
-from unirender.options import at_least
+from unirender.option_checks import at_least
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from typing import Any
 
 from unirender_evaluation.optimized_method import OPTIMISER, REFINED, OptimizedMethod
 from unirender_evaluation.rows import Row, make_row
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 from unirender_evaluation.versions import MODEL, OPTIMIZER, REFERENCE
 from unirender_reference.optimize.single_config import COLD, fitted
 

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender.options import Device, at_least
+from unirender.option_checks import at_least
+from unirender.options import Device
 
 
 @dataclass(frozen=True)

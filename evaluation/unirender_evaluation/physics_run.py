@@ -25,7 +25,8 @@ from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.physics_ambiguity import POSTERIOR, Points, material_point
 from unirender_evaluation.physics_questions import Posterior, true_maps
 from unirender_evaluation.physics_stage import Stage
-from unirender_evaluation.physics_tests import TESTS, PhysicsTest
+from unirender_evaluation.physics_test import PhysicsTest
+from unirender_evaluation.physics_tests import TESTS
 from unirender_evaluation.physics_tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate

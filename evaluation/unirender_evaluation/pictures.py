@@ -28,7 +28,8 @@ from unirender_evaluation.metrics import METRICS, Variant, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Scene, Suite, material_key
 from unirender_evaluation.table_formats import format_number
-from unirender_evaluation.tasks import LIGHT, PROTOCOLS, Task, tasks
+from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
+from unirender_evaluation.tasks import tasks
 
 PRIMARY = {  # table -> metric and quantities that rank its samples; a sample has one of them
     "rendering": ("psnr", ("edit_metallic", "edit_roughness")),

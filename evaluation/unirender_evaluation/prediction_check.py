@@ -17,7 +17,8 @@ from unirender_evaluation.methods import Mask
 from unirender_evaluation.predictions import LIGHT_FILES, MAP_FILES, SUFFIXES, PredictionFolder
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read

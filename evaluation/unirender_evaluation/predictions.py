@@ -37,7 +37,7 @@ from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.plausible import picture_doubt
 from unirender_evaluation.png import read_png
-from unirender_evaluation.tasks import LIGHT_ANSWER, Task
+from unirender_evaluation.task import LIGHT_ANSWER, Task
 
 PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
 COLOURS = ("albedo", "specular", "diffuse")

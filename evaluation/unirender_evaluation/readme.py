@@ -36,7 +36,7 @@ from unirender_evaluation.table_formats import to_markdown
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.table_text import plain_paragraph
 from unirender_evaluation.tables import Table, build_tables
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 SHIPPED_SUITE = "tiny"
 STANDING_SUITE = "standard"

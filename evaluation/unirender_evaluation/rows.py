@@ -31,7 +31,7 @@ from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
 from unirender_evaluation.suites import Scene, material_key
-from unirender_evaluation.tasks import LIGHT, PROTOCOLS, Task
+from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")
@@ -164,8 +164,8 @@ def trivial_rows() -> list[Row]:
 def our_rows(
     pipeline: Any, weights: str, seed: int = 0, sample_scenes: int | None = None, device: str = "cpu"
 ) -> list[Row]:
-    """Our rows: `mean` plain, anchored, of several looks, with a flat albedo and not closed, composites of its decomposition, `sample` on a
-    subset of scenes.
+    """Our rows: `mean` plain, anchored, of several looks, with a flat albedo and not closed; composites of its
+    decomposition; `sample` on a subset of scenes.
 
     Args:
         pipeline: a `UniRenderPipeline`.

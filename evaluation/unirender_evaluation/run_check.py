@@ -21,7 +21,8 @@ from unirender_evaluation.engine import Prediction, record_of, score
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.truth_check import TruthCheck, check_truth, chosen_scenes
 from unirender_evaluation.versions import LPIPS, REFERENCE
 from unirender_evaluation.workers import Run

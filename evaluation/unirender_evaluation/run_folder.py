@@ -11,7 +11,8 @@ from unirender.whole_files import replace_file
 from unirender_evaluation.records import Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 
 MISSING = "missing.txt"
 TO_DO = {

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from unirender.errors import UsageError
-from unirender.options import MOST_STEPS, Device, at_least
+from unirender.option_checks import at_least
+from unirender.options import MOST_STEPS, Device
 
 
 @dataclass(frozen=True)

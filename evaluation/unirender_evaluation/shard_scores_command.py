@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
-from unirender.options import Device, ModelOptions, at_least
+from unirender.option_checks import at_least
+from unirender.options import Device, ModelOptions
 
 if TYPE_CHECKING:
     from unirender_evaluation.shard_scores import Scored

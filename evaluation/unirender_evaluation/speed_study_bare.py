@@ -17,8 +17,9 @@ from torch import Tensor
 
 from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
+from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS
 from unirender.training.presets import TrainConfig
 
 LAST = NUM_TIMESTEPS - 1

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, DType, ModelOptions, at_least, usage
+from unirender.option_checks import at_least, usage
+from unirender.options import Device, DType, ModelOptions
 from unirender.training.presets import TrainConfig, get_preset
 from unirender_evaluation.speed_study_parts import NEED_DATA, PARTS, PartName
 

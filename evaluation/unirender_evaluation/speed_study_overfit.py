@@ -120,7 +120,7 @@ def picture_errors(packing: Any, found: Intrinsics, truth: Intrinsics) -> dict[s
     """Mean squared error of each of the network's six pictures, scaled to [0, 1]."""
     import torch
 
-    from unirender.models.conditioning import TRIPLETS
+    from unirender.models.packing import TRIPLETS
 
     def packed(maps: Intrinsics) -> np.ndarray:
         tensors = {name: torch.from_numpy(np.moveaxis(value, -1, 0)[None].copy()) for name, value in maps.maps.items()}

@@ -22,7 +22,8 @@ from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation import lpips, metrics
 from unirender_evaluation.engine import Prediction, score
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import Asked, Task, tasks
+from unirender_evaluation.task import Asked, Task
+from unirender_evaluation.tasks import tasks
 
 LEAST = lpips.KEPT_TRUTHS + 1  # pictures of a pass: with fewer, LPIPS would find features kept from the last one
 QUESTIONS = {"picture": ("rendering", "from-image"), "maps": ("inverse", "single-image")}

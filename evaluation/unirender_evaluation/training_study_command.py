@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
-from unirender.options import Device, at_least
+from unirender.option_checks import at_least
+from unirender.options import Device
 
 if TYPE_CHECKING:
     from unirender_evaluation.training_study import Choice

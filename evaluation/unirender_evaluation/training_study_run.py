@@ -109,7 +109,8 @@ class Trained:
     def pipeline(self) -> Any:
         """The averaged weights at the end of the training, which goes on where it was stopped."""
         from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-        from unirender.training.run import Train, train
+        from unirender.training.command import Train
+        from unirender.training.run import train
 
         study = self.study
         options = Train(data=study.data, steps=study.steps, device=study.device, parallel=study.parallel)

@@ -1,5 +1,4 @@
-"""Nobody has to believe a file: a random part of a suite's truth, rendered again on the spot with other seeds, and
-z-tested.
+"""The check of a suite's truth: a random part of it is rendered again on this machine, with other seeds, and z-tested.
 
 The same renders, at the suite's own samples per pixel, are the row *reference (other seed)*. Mask, albedo and normal
 are traced again and compared within stated tolerances. Twins have to fail on one of the scenes, or the test is blind:

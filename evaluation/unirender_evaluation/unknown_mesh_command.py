@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from unirender.errors import UsageError
-from unirender.options import at_least
+from unirender.option_checks import at_least
 from unirender_reference.optimize.config import OptimizeConfig
 
 LEAST_VIEWS = 4

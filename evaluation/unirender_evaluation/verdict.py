@@ -8,7 +8,7 @@ from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import FEW, paired_difference
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import itertools
 import os
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -148,8 +148,32 @@ def _generate(
             journal.add(done[name])
             render_seconds += spent
         manifest_sha256 = journal.complete()
-    seconds = time.perf_counter() - start
-    new = list(done.values())[found:]
+    return _report(
+        list(done.values()),
+        found,
+        unreadable,
+        seconds=time.perf_counter() - start,
+        render_seconds=render_seconds,
+        workers=workers,
+        manifest_sha256=manifest_sha256,
+    )
+
+
+def _report(
+    records: Sequence[ShardRecord],
+    found: int,
+    unreadable: Sequence[Failure],
+    *,
+    seconds: float,
+    render_seconds: float,
+    workers: int,
+    manifest_sha256: str,
+) -> GenerateReport:
+    """The report of a run whose first `found` shards were there before.
+
+    `unreadable` are the folders that could not be listed.
+    """
+    new = records[found:]
     return GenerateReport(
         groups=sum(record.groups for record in new),
         samples=sum(record.samples for record in new),
@@ -160,10 +184,10 @@ def _generate(
         overhead=seconds * workers / render_seconds if render_seconds else float("nan"),
         nan_pixels=sum(record.nan_pixels for record in new),
         manifest_sha256=manifest_sha256,
-        failures=(*unreadable, *all_failures(done.values())),
-        floor=total_floor(record.floor for record in done.values()),
-        negative_pixels=sum(record.negative_pixels for record in done.values()),
-        unreadable_lights=tuple(sorted({line for record in done.values() for line in record.unreadable_lights})),
+        failures=(*unreadable, *all_failures(records)),
+        floor=total_floor(record.floor for record in records),
+        negative_pixels=sum(record.negative_pixels for record in records),
+        unreadable_lights=tuple(sorted({line for record in records for line in record.unreadable_lights})),
     )
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from unirender.color import srgb_decode
-from unirender_reference.shapes.noise import value_noise
+from unirender_reference.shapes.noise import soft_step, value_noise
 
 DARKEST, BRIGHTEST = 0.015, 0.95
 
@@ -55,10 +55,6 @@ def _ramp(value: np.ndarray, palette: np.ndarray) -> np.ndarray:
     """Piecewise-linear colour of a value in [0, 1]."""
     stops = np.linspace(0, 1, len(palette))
     return np.stack([np.interp(value, stops, palette[:, k]) for k in range(3)], -1)
-
-
-def _soft_step(value: np.ndarray, width: float) -> np.ndarray:
-    return np.clip(value / width + 0.5, 0, 1)
 
 
 def random_texture(rng: np.random.Generator) -> tuple[str, SolidTexture]:
@@ -105,15 +101,15 @@ def random_texture(rng: np.random.Generator) -> tuple[str, SolidTexture]:
             return _ramp(np.clip(0.5 + 0.9 * noise.fractal(points * frequency, 4), 0, 1), palette)
         if kind == "speckle":
             grain = noise.fractal(points * (4 + 3 * frequency), 2)
-            return palette[0] + (palette[1] - palette[0]) * _soft_step(grain - share, 0.1)[..., None]
+            return palette[0] + (palette[1] - palette[0]) * soft_step(grain - share, 0.1)[..., None]
         shifted = p + warp * np.stack([noise(points * 2 + k) for k in range(3)], -1)
         distance, nearest = map(np.asarray, sites.query(shifted, k=2))
         if kind == "cells":
-            edge = _soft_step(distance[..., 1] - distance[..., 0] - 0.06, 0.03)[..., None]
+            edge = soft_step(distance[..., 1] - distance[..., 0] - 0.06, 0.03)[..., None]
             joint = palette[0] if share > 0 else site_color[nearest[..., 0]]
             return joint + (site_color[nearest[..., 0]] - joint) * edge
         radius = size * 1.1 / count ** (1 / 3)
-        inside = _soft_step(radius - distance[..., 0], 0.03)[..., None]
+        inside = soft_step(radius - distance[..., 0], 0.03)[..., None]
         return palette[0] + (palette[1 + nearest[..., 0] % (len(palette) - 1)] - palette[0]) * inside
 
     return kind, lambda points: np.clip(texture(points), DARKEST, BRIGHTEST).astype(np.float32)

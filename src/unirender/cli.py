@@ -10,17 +10,14 @@ what it was asked for. An error is one line.
 
 import contextlib
 import functools
-import gc
 import importlib.metadata
 import logging
 import os
-import select
 import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -28,20 +25,22 @@ import tyro
 from unirender.command_line import Ended, causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
-from unirender.models.lean_imports import lean_imports
-from unirender.options import notice
+from unirender.notices import NoticeHandler, notice
+from unirender.process_ends import READER_LEFT, drop_output, end, quick_start, reader_left
 from unirender.training.average import Average
 from unirender.training.calibrate import Calibrate
-from unirender.training.run import Train
+from unirender.training.command import Train
 from unirender.training.visibility import TrainVisibility
-from unirender_evaluation.commands import Bench, BenchRun, BenchTruth
+from unirender_evaluation.commands import Bench
 from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.derived_light_study_command import BenchDerivedLight
 from unirender_evaluation.figures_command import Figures
 from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
 from unirender_evaluation.public_command import BenchPublic
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.sampling_study_command import BenchSampling
 from unirender_evaluation.training_study_command import BenchTraining
+from unirender_evaluation.truth_commands import BenchTruth
 from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
 from unirender_evaluation.warm_start_command import BenchWarmStart
 from unirender_reference.commands import Dataset
@@ -115,8 +114,6 @@ Command = (
 )
 
 MODEL = (Decompose, Edit, Relight, Render)  # in a process of their own these have a `quick_start`
-OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
-READER_LEFT = 141  # as a shell reports SIGPIPE
 RESUMABLE = (
     Dataset,
     MixMeshes,
@@ -199,28 +196,6 @@ def run(command: Any) -> int:
     return command.run()
 
 
-@contextlib.contextmanager
-def quick_start() -> Iterator[None]:
-    """For a process of our own that ends with what is done inside: a lean start, and a quick end.
-
-    Importing torch makes a multitude of objects that live as long as the process. Python, which looks among all of them
-    for cycles that nobody uses any more, does so seldom here, and at the end of the process no more.
-    """
-    gc.set_threshold(OBJECTS)
-    try:
-        with lean_imports():
-            yield
-    finally:
-        gc.freeze()
-
-
-class NoticeHandler(logging.Handler):
-    """Prints what the package logs as notices."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        notice(record.getMessage())
-
-
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
@@ -259,31 +234,6 @@ def main(argv: list[str] | None = None) -> None:
     finally:
         logger.removeHandler(handler)
     sys.exit(status)
-
-
-def end(number: int, frame: FrameType | None) -> None:
-    """Asked to stop by a batch system or a terminal that closes, a command of the model ends as when it is interrupted.
-
-    Others resume by what they have written, and end at once.
-
-    Raises:
-        Ended: always.
-    """
-    for each in (signal.SIGTERM, signal.SIGHUP):  # `timeout` sends it to the process and to its group
-        signal.signal(each, signal.SIG_IGN)
-    raise Ended(number)
-
-
-def reader_left() -> bool:
-    """Whether nobody reads the standard output any more; another pipe that breaks is an error like others."""
-    output = select.poll()
-    output.register(sys.stdout.fileno(), 0)
-    return bool(output.poll(0))
-
-
-def drop_output() -> None:
-    """What is still to be printed goes nowhere: the reader of the standard output has left."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def resumes(command: Any) -> bool:

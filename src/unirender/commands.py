@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import InputOptions, ModelOptions, OutputOptions, notice
+from unirender.notices import notice
+from unirender.options import InputOptions, ModelOptions, OutputOptions
 from unirender.remarks import (
     at_white,
     check_looks_option,

@@ -9,7 +9,8 @@ from unirender.errors import UnirenderError
 from unirender.files import SUMMARY_FILE
 from unirender.folders import FolderResult, decompose_folder, list_pictures, write_summary
 from unirender.frames import temporal_difference
-from unirender.options import notice, read_input
+from unirender.input_picture import read_input
+from unirender.notices import notice
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition

@@ -1,16 +1,17 @@
-"""Options that the model's commands share, and how a command speaks to its user. Light to import."""
+"""Options that the model's commands share. Light to import."""
 
-import contextlib
 import dataclasses
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UsageError
+from unirender.input_picture import read_input
+from unirender.notices import notice
+from unirender.option_checks import at_least, usage
 
 if TYPE_CHECKING:
     import torch
@@ -24,23 +25,6 @@ DType = Literal["auto", "float32", "bfloat16", "float16"]
 Sampler = Literal["ddim", "unipc"]
 
 MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
-DARK = 0.35  # display value that an object reaches at the exposures of the training data, unless it is dark itself
-FULL_COVERAGE = 0.95  # that a mask reaches on an object
-MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
-
-
-def notice(text: str) -> None:
-    """One line to the user that is no result."""
-    print(f"unirender: {text}", file=sys.stderr)
-
-
-@contextlib.contextmanager
-def usage() -> Iterator[None]:
-    """Whatever is refused inside was asked for in a wrong way: a `UnirenderError` becomes a `UsageError`."""
-    try:
-        yield
-    except UnirenderError as error:
-        raise UsageError(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -208,70 +192,3 @@ class InputOptions:
         for remark in remarks.values():
             notice(remark)
         return dataclasses.replace(picture, remarks=remarks), model.camera(picture)
-
-
-def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
-    """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
-
-    Args:
-        path: of the picture.
-        mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
-        option: what remarks on a mask that is not there add: how one is given.
-
-    Raises:
-        UnirenderError: an unreadable file, or a mask that does not fit.
-    """
-    import numpy as np
-
-    from unirender.pictures import OPAQUE, read_mask_file, read_picture
-
-    picture = read_picture(path)
-    remarks = dict(picture.remarks)
-    height, width = picture.image_srgb.shape[:2]
-    if mask is not None:
-        coverage, lost = read_mask_file(mask, (height, width))
-        remarks |= lost
-        picture = dataclasses.replace(picture, mask=coverage)
-        if coverage.min() >= OPAQUE:
-            remarks["mask"] = "the mask covers the whole frame, which is taken as the object"
-    elif picture.mask is None:
-        remarks["mask"] = f"no mask and no alpha channel: the whole frame is taken as the object{option}"
-        picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
-    elif picture.mask.min() >= OPAQUE:
-        remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
-    assert picture.mask is not None, "the whole frame at least"
-    if (most := picture.mask.max()) < FULL_COVERAGE:
-        remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
-    if (bright := float(np.percentile(picture.image_srgb[picture.mask[..., 0] > 0.5].max(axis=-1), 99))) < DARK:
-        remarks["dark"] = (
-            f"the object is dark, 99% of it below {bright:.2f} of display white: the network was taught exposures at "
-            "which white is bright, and a darker one goes into the albedo"
-        )
-    if picture.negative:
-        remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"
-    if picture.clipped > MANY_CLIPPED:
-        remarks["clipped"] = (
-            f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there"
-        )
-    return picture, remarks
-
-
-def check_seed(seed: int) -> None:
-    """Looks at the seed of a training.
-
-    Raises:
-        UsageError: PyTorch or NumPy does not take it.
-    """
-    if not 0 <= seed < 2**63:
-        raise UsageError(f"--seed {seed}: expected an integer from 0 to 2^63 - 1")
-
-
-def at_least(low: int, **options: int | None) -> None:
-    """Looks at options that have a least value; None is one that was not given.
-
-    Raises:
-        UsageError: one is below `low`.
-    """
-    for name, value in options.items():
-        if value is not None and value < low:
-            raise UsageError(f"--{name.replace('_', '-')} {value}: expected at least {low}")

@@ -6,7 +6,9 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
-from unirender.options import MANY_CLIPPED, notice, usage
+from unirender.input_picture import MANY_CLIPPED
+from unirender.notices import notice
+from unirender.option_checks import usage
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,8 +16,8 @@ from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.benchmark import _work, prepare
 from unirender_evaluation.bounds import CEILING_KEY
-from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.records import Record
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.store import Job, Store
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene

@@ -19,10 +19,10 @@ from unirender_evaluation import engine
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
-from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.metrics import ALL_VARIANTS
 from unirender_evaluation.prediction_check import PredictionError
 from unirender_evaluation.rows import make_row, trivial_rows
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.tasks import scene_ids, tasks
 from unirender_evaluation.truth_check import chosen_scenes

@@ -13,7 +13,7 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.benchmark import run
-from unirender_evaluation.commands import BenchRun
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.truth import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 

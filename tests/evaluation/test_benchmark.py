@@ -37,7 +37,8 @@ from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_ro
 from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run, run_in_workers

@@ -10,8 +10,8 @@ from tiny_suites import make_suite
 from unirender.errors import UnirenderError
 from unirender_evaluation.bench_config import BenchConfig
 from unirender_evaluation.benchmark import prepare
-from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.dry_run import PlannedRow, planned, print_plan
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.store import Job, Store
 
 METHOD = """

@@ -26,7 +26,8 @@ from unirender_evaluation.rows import make_row, prediction_rows, trivial_rows
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_table
-from unirender_evaluation.tasks import Task, tasks
+from unirender_evaluation.task import Task
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.verdict import findings
 
 RAW, ALIGNED = f"{MATTE_BALL}.rmse_relative@raw", f"{MATTE_BALL}.rmse_relative@aligned"

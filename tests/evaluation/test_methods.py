@@ -17,7 +17,8 @@ from unirender_evaluation.claims import SHADOWED
 from unirender_evaluation.engine import Prediction, answer, score
 from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.training_statistics import training_statistics
 
 

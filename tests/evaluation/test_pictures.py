@@ -14,7 +14,8 @@ from unirender_evaluation.pictures import Pictures, chosen_places, question, ran
 from unirender_evaluation.records import Record
 from unirender_evaluation.report_samples import make_sheets
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import PROTOCOLS, Task, tasks
+from unirender_evaluation.task import PROTOCOLS, Task
+from unirender_evaluation.tasks import tasks
 
 
 @pytest.fixture(scope="module")

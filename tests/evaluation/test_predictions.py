@@ -23,7 +23,8 @@ from unirender_evaluation.png import read_png
 from unirender_evaluation.prediction_check import PredictionError, check_predictions
 from unirender_evaluation.rows import make_row, prediction_rows
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import Task, tasks
+from unirender_evaluation.task import Task
+from unirender_evaluation.tasks import tasks
 
 
 @pytest.fixture(scope="module")

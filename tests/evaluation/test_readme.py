@@ -16,7 +16,7 @@ from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables import build_tables
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"

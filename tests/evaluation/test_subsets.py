@@ -7,13 +7,14 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender_evaluation.bench_config import BenchConfig, build_rows
-from unirender_evaluation.commands import BenchRun
 from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.physics_rows import physics_scenes
 from unirender_evaluation.rows import Row
+from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 from unirender_evaluation.suites import Suite
-from unirender_evaluation.tasks import PROTOCOLS, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run
 

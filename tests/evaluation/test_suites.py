@@ -17,7 +17,8 @@ from unirender_evaluation.suites import (
     stratified_materials,
     suite_path,
 )
-from unirender_evaluation.tasks import PROTOCOLS, scene_ids, tasks
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import scene_ids, tasks
 
 
 def test_tiny_materials_are_stratified_and_independent() -> None:

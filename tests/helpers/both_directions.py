@@ -6,8 +6,9 @@ from torch import Tensor
 
 from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.diffusion.schedule import make_scheduler
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS
 from unirender.training.data import Batch
 
 

@@ -12,7 +12,7 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.report import write_report
 from unirender_evaluation.report_samples import make_sheets
 from unirender_evaluation.tables import build_tables
-from unirender_evaluation.tasks import LIGHT
+from unirender_evaluation.task import LIGHT
 
 SIZE = 24
 LONG = "Learned_inverse_rendering_with_transformer_priors_and_differentiable_path_tracing_v2.1"  # nowhere to break

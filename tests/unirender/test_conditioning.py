@@ -11,6 +11,7 @@ from unirender.composite import composite
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models import conditioning as c
+from unirender.models import packing
 from unirender.models.priors import PRIORS
 
 
@@ -31,7 +32,7 @@ def test_round_trip_of_all_maps(cond: c.Conditioning) -> None:
 
 def test_round_trip_twin_fails_with_another_curve(cond: c.Conditioning) -> None:
     batch = make_batch()
-    other = c.Packing(cond.packing.curves | {"specular": color.HdrCurve(9.0, 20.0)})
+    other = packing.Packing(cond.packing.curves | {"specular": color.HdrCurve(9.0, 20.0)})
     back = other.unpack(cond.packing.pack(batch))
     assert (back["specular"] - batch["specular"]).abs().max() > 1e-2
 
@@ -65,10 +66,10 @@ def test_twins_agree_with_the_numpy_functions() -> None:
     y = np.linspace(0, 1.2, 1001).astype(np.float32)
     curve = color.HdrCurve(10.0, 20.0)
     pairs = [
-        (c.srgb_encode(torch.from_numpy(x)), color.srgb_encode(x)),
-        (c.srgb_decode(torch.from_numpy(y)), color.srgb_decode(y)),
-        (c.curve_encode(curve, torch.from_numpy(x)), curve.encode(x)),
-        (c.curve_decode(curve, torch.from_numpy(y)), curve.decode(y)),
+        (packing.srgb_encode(torch.from_numpy(x)), color.srgb_encode(x)),
+        (packing.srgb_decode(torch.from_numpy(y)), color.srgb_decode(y)),
+        (packing.curve_encode(curve, torch.from_numpy(x)), curve.encode(x)),
+        (packing.curve_decode(curve, torch.from_numpy(y)), curve.decode(y)),
     ]
     for torch_value, numpy_value in pairs:
         np.testing.assert_allclose(torch_value.numpy(), numpy_value, rtol=1e-5, atol=1e-6)
@@ -101,7 +102,7 @@ def test_extras_hold_flags_mask_rays_and_prior() -> None:
     assert torch.equal(extras.attributes[:, :6, 0, 0], given.float())
     expected = cond.codec.encode(
         2
-        * c.srgb_encode(
+        * packing.srgb_encode(
             (composite(*(batch[k] for k in ("albedo", "metallic", "diffuse", "specular"))) * batch["mask"]).clamp(0, 1)
         )
         - 1

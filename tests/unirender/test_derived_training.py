@@ -19,7 +19,8 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, exr_bytes, intrinsics_channels, read_exr_bytes
 from unirender.intrinsics import Intrinsics
-from unirender.models.conditioning import DERIVED_FLAG, TRIPLETS
+from unirender.models.conditioning import DERIVED_FLAG
+from unirender.models.packing import TRIPLETS
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.inputs import ready_to_render, told_derived
 from unirender.pipelines.results import EditResult

@@ -22,8 +22,8 @@ from unirender.folders import (
     write_summary,
 )
 from unirender.frames import Frame, temporal_difference
+from unirender.input_picture import read_input
 from unirender.intrinsics import Intrinsics
-from unirender.options import read_input
 from unirender.pictures import Picture
 from unirender.pipelines.results import Decomposition
 

@@ -20,9 +20,10 @@ from unirender.diffusion.inference import extras_by_camera, infer_attributes, in
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model
-from unirender.models.conditioning import LIGHT, TRIPLETS, Conditioning
+from unirender.models.conditioning import LIGHT, Conditioning
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.light_encoder import LightEncoder, pad_sphere
+from unirender.models.packing import TRIPLETS
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder

@@ -9,7 +9,7 @@ from tiny_models import SIZE, make_pipeline
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import Packing
+from unirender.models.packing import Packing
 from unirender.pipelines.looks import AS_IT_IS, LOOKS, MATERIAL, check_looks, mean_of_looks
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 

@@ -16,8 +16,8 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model
 from unirender.models.codec import KLCodec
-from unirender.models.conditioning import TRIPLETS
 from unirender.models.dual_stream import DualStreamOutput
+from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, compressed, timestep_weights

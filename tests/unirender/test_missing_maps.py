@@ -13,8 +13,9 @@ from torch import Tensor
 from unirender.diffusion.inference import infer_image
 from unirender.diffusion.schedule import make_scheduler
 from unirender.intrinsics import Intrinsics
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.losses import DROPPABLE

@@ -11,7 +11,7 @@ from torch import Tensor
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import TRIPLETS
+from unirender.models.packing import TRIPLETS
 from unirender.training import consistency, loss_terms, losses, passes
 from unirender.training.losses import LossFunction
 from unirender.training.passes import BatchGradient, Split

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.added import Answers
-from unirender.models.conditioning import TRIPLETS, coverage_of, pack_image
+from unirender.models.conditioning import coverage_of
 from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
+from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import (
     CELLS_WEIGHT,
     LIGHT_WEIGHT,
@@ -23,11 +24,11 @@ from unirender.models.picture_encoder import (
     truth_of,
 )
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.training.command import Train
 from unirender.training.config_check import check_config
 from unirender.training.export import export_pipeline
 from unirender.training.memory import training_bytes
 from unirender.training.presets import PRESETS, TrainConfig
-from unirender.training.run import Train
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trained import encoder_of
 from unirender.training.trainer import RunConfig, Trainer

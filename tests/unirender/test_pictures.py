@@ -15,7 +15,7 @@ from unirender.color import srgb_encode
 from unirender.display_files import MAX_PIXELS, display_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.options import read_input
+from unirender.input_picture import read_input
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 

@@ -20,8 +20,9 @@ from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training import processes
 from unirender.training.checkpoint import load_state
+from unirender.training.command import Train
 from unirender.training.processes import ALONE, Processes, join_processes
-from unirender.training.run import Train, train
+from unirender.training.run import train
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")

@@ -9,9 +9,9 @@ from both_directions import OneBatch, decompose, render
 from tiny_models import TRAIN, make_batch
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.training.command import Train
 from unirender.training.config_check import check_config
 from unirender.training.presets import PRESETS, TrainConfig
-from unirender.training.run import Train
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import RunConfig, Trainer
 

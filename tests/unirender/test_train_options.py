@@ -10,7 +10,7 @@ from synthetic_shards import write_dataset
 from unirender import cli
 from unirender.errors import UsageError
 from unirender.training.checkpoint import STATE_FILE
-from unirender.training.run import Train
+from unirender.training.command import Train
 from unirender_reference.folder_lock import locked, made_folder
 
 

@@ -6,7 +6,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import Device, at_least
+from unirender.option_checks import at_least
+from unirender.options import Device
 
 MOST_PORT = 65535
 

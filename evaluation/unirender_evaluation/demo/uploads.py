@@ -20,8 +20,8 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.errors import UnirenderError
+from unirender.input_picture import read_input
 from unirender.lighting import resample_environment
-from unirender.options import read_input
 from unirender.pictures import Picture
 from unirender_evaluation.figures_pictures import framed
 from unirender_reference.lights import load_light

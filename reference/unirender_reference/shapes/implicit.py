@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from skimage.measure import marching_cubes
 
-from unirender_reference.shapes.noise import value_noise
+from unirender_reference.shapes.noise import random_direction, value_noise
 from unirender_reference.shapes.surface import Part, box_part
 
 GRID = 54
@@ -112,14 +112,9 @@ def _spread(rng: np.random.Generator, count: int, reach: float) -> Float[np.ndar
     """Centres that hang together: each starts near an earlier one."""
     centers = [np.zeros(3)]
     for _ in range(count - 1):
-        step = _direction(rng) * rng.uniform(0.5, 1) * reach
+        step = random_direction(rng) * rng.uniform(0.5, 1) * reach
         centers.append(np.clip(centers[int(rng.integers(len(centers)))] + step, -0.7, 0.7))
     return np.array(centers)
-
-
-def _direction(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)
 
 
 def union_of(solids: Sequence[Distance], k: float) -> Distance:
@@ -149,7 +144,7 @@ def smooth_difference(rng: np.random.Generator) -> Part:
     if rng.random() < 0.5:
         solids.append(primitive(rng, 0.5, rng.uniform(-0.5, 0.5, 3)))
     cutters = [
-        primitive(rng, rng.uniform(0.25, 0.5), _direction(rng) * rng.uniform(0.45, 0.8))
+        primitive(rng, rng.uniform(0.25, 0.5), random_direction(rng) * rng.uniform(0.45, 0.8))
         for _ in range(int(rng.integers(1, 4)))
     ]
     body = union_of(solids, 0.08)
@@ -168,7 +163,7 @@ def displaced_union(rng: np.random.Generator) -> Part:
 def shell(rng: np.random.Generator) -> Part:
     """Hollowed union opened by a plane: bowls, helmets, broken pots."""
     solids = [primitive(rng, rng.uniform(0.7, 0.95), np.zeros(3)), primitive(rng, 0.5, rng.uniform(-0.4, 0.4, 3))]
-    solid, normal, offset = union_of(solids, 0.15), _direction(rng), rng.uniform(-0.1, 0.4)
+    solid, normal, offset = union_of(solids, 0.15), random_direction(rng), rng.uniform(-0.1, 0.4)
 
     def field(points: np.ndarray) -> np.ndarray:
         hollow = np.abs(solid(points) + 0.09) - 0.09

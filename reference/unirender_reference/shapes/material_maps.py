@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from unirender.errors import UnirenderError
-from unirender_reference.shapes.noise import ValueNoise, value_noise
+from unirender_reference.shapes.noise import ValueNoise, random_direction, soft_step, value_noise
 
 ROUGHEST, SMOOTHEST = 0.95, 0.08
 STEEPEST = 0.8  # slope of the height, 39 degrees
@@ -112,17 +112,19 @@ def _share(kind: str, rng: np.random.Generator, noise: ValueNoise, frequency: fl
     level, phase = rng.uniform(-0.25, 0.3), rng.uniform(0, 1)
     sites = KDTree(rng.uniform(-1.2, 1.2, (int(rng.integers(8, 50)), 3)))
     chosen = rng.random(sites.n) < rng.uniform(0.25, 0.6)
-    lines = [(_unit(rng), rng.uniform(-0.8, 0.8), _unit(rng)) for _ in range(int(rng.integers(6, 16)))]
+    lines = [
+        (random_direction(rng), rng.uniform(-0.8, 0.8), random_direction(rng)) for _ in range(int(rng.integers(6, 16)))
+    ]
 
     def worn(points: np.ndarray) -> np.ndarray:
-        return _soft(noise.fractal(points * frequency, 3) - level, 0.08)
+        return soft_step(noise.fractal(points * frequency, 3) - level, 0.08)
 
     def stripes(points: np.ndarray) -> np.ndarray:
-        return _soft(np.sin(np.pi * (points @ axis * frequency + phase)) - level, 0.25)
+        return soft_step(np.sin(np.pi * (points @ axis * frequency + phase)) - level, 0.25)
 
     def patches(points: np.ndarray) -> np.ndarray:
         distance, nearest = map(np.asarray, sites.query(points + 0.1 * noise(points * 3)[..., None], k=2))
-        border = _soft(distance[..., 1] - distance[..., 0], 0.08)  # 0.5 where two cells meet
+        border = soft_step(distance[..., 1] - distance[..., 0], 0.08)  # 0.5 where two cells meet
         here, there = chosen[nearest[..., 0]], chosen[nearest[..., 1]]
         return np.where(here == there, here, np.where(here, border, 1 - border))
 
@@ -130,7 +132,7 @@ def _share(kind: str, rng: np.random.Generator, noise: ValueNoise, frequency: fl
         across = [
             np.abs(points @ normal - offset + 0.05 * np.sin(3 * points @ along)) for normal, offset, along in lines
         ]
-        return 1 - _soft(np.min(across, axis=0) - 0.02, 0.03)
+        return 1 - soft_step(np.min(across, axis=0) - 0.02, 0.03)
 
     fields = {"worn": worn, "stripes": stripes, "patches": patches, "scratches": scratches}
     return fields.get(kind, lambda points: np.zeros(points.shape[:-1], np.float32))
@@ -164,12 +166,3 @@ def normal_from_height(
 
 def _mix(pair: tuple[float, float], share: np.ndarray) -> np.ndarray:
     return pair[0] + (pair[1] - pair[0]) * share
-
-
-def _soft(value: np.ndarray, width: float) -> np.ndarray:
-    return np.clip(value / width + 0.5, 0, 1)
-
-
-def _unit(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    vector = rng.normal(size=3)
-    return vector / np.linalg.norm(vector)

@@ -50,3 +50,14 @@ def value_noise(rng: np.random.Generator) -> ValueNoise:
     """Draws a noise field."""
     lattice = rng.uniform(-1, 1, (LATTICE,) * 3).astype(np.float32)
     return ValueNoise(lattice, rng.uniform(0, LATTICE, 3).astype(np.float32))
+
+
+def random_direction(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    """A unit vector, uniform over the sphere."""
+    vector = rng.normal(size=3)
+    return vector / np.linalg.norm(vector)
+
+
+def soft_step(value: np.ndarray, width: float) -> np.ndarray:
+    """0 to 1 as the value goes from -width / 2 to width / 2, linear between."""
+    return np.clip(value / width + 0.5, 0, 1)

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from unirender.camera import Camera
 from unirender.diffusion.sampling import Generators, Progress, denoise, draw_noise
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
+from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, Encoded
+from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
 
 Cameras = Camera | Sequence[Camera] | None

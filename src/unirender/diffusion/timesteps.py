@@ -2,7 +2,8 @@
 
 Section 3.2 (`conditional`, the default): one stream is always clean, the other at t with probability p_t, else at T.
 
-    (t_attributes, t_image) = (0, t~) when rendering, (t~, 0) when inverse;    t~ = t with probability p_t, T otherwise
+    (t_attributes, t_image) = (0, t~) when rendering, (t~, 0) when inverse             (Eq. 3)
+    t~ = t with probability p_t, T otherwise                                           (Eq. 4)
 
 Algorithm 1 of the supplement (`algorithm1`): one stream, the same for the whole batch, gets uniform timesteps in
 [0, T]; each entry of the other is 0 or T. Here both streams can be noisy at once, which Section 3.2 rules out.
@@ -28,7 +29,7 @@ class Timesteps:
 
 
 def conditional_timesteps(batch: int, last: int, p_render: float, p_t: float, generator: torch.Generator) -> Timesteps:
-    """Section 3.2. The rendering samples come first; their share of a batch is exact up to random rounding.
+    """Eqs. 3 and 4. The rendering samples come first; their share of a batch is exact up to random rounding.
 
     Args:
         batch: samples.

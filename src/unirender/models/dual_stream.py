@@ -37,11 +37,11 @@ class Encoded:
     """What an encoder hands to the decoders.
 
     Attributes:
-        features: its feature pyramid: skips, then mid.
-        time: its time embedding.
-        context: what its cross-attention saw: the prompt and, of a light with an encoder of its own, the tokens.
-        summary: of a clean image's features, which comes to the time embedding of the other stream's decoder.
-        skips: of them to each entry of the pyramid in that decoder; () or None: nothing.
+        features: the feature pyramid of this encoder: skips, then mid.
+        time: time embedding of this stream.
+        context: what the cross-attention saw: the prompt, and the tokens of a light that has an encoder of its own.
+        summary: what a clean image's features add to the time embedding of the other stream's decoder; None: nothing.
+        skips: what they add to each entry of the pyramid in that decoder; () or None: nothing.
     """
 
     features: tuple[Tensor, ...]
@@ -61,16 +61,16 @@ class Encoded:
 
 @dataclass
 class DualStreamOutput(BaseOutput):
-    """What was predicted, of the rows asked for, and from what; None without any.
+    """What was predicted for the rows that were asked for, and from what; None where no row was.
 
     Attributes:
         attributes: clean latents (x0).
         image: clean latents (x0).
-        encoded_attributes: the attribute stream as the image's decoder saw it. It may stand for the same latents at the
-            same timestep in another call.
+        encoded_attributes: the attribute stream as the image's decoder saw it. Another call takes it in place of the
+            same latents at the same timestep.
         encoded_image: the image stream as the attributes' decoder saw it.
-        answers: of the picture encoder, for the rows whose attributes are predicted, zeros where the image is not
-            clean; None without one, and where it was asked in a call before.
+        answers: of the picture encoder, for the rows whose attributes are predicted; zeros where the image is not
+            clean. None without such an encoder, and where the image was already encoded.
     """
 
     attributes: Tensor | None = None
@@ -81,7 +81,7 @@ class DualStreamOutput(BaseOutput):
 
 
 def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d:
-    """Returns a convolution that starts as the zero map, so that it cannot disturb what stands already."""
+    """A convolution that starts as the zero map, so that it does not change what the network does already."""
     conv = nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
     nn.init.zeros_(conv.weight)
     assert conv.bias is not None
@@ -136,7 +136,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         codec: str = "pixel",  # "pixel" (space to depth) or "kl" (an AutoencoderKL beside the network)
         patch: int = 2,  # image pixels per latent pixel, one way
         environment_size: Sequence[int] = (16, 32),  # rows, columns of the light the model predicts
-        hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: conditioning.HDR_CURVES
+        hdr_curves: dict[str, Sequence[float]] | None = None,  # map -> (k, x_max); None: packing.HDR_CURVES
         physics_prior: str = "none",  # the closed-form image that the image stream sees and corrects
         light: str = "latent",  # a given light is the sixth attribute picture, or tokens of an "encoder" of its own
         derived_light: bool = False,  # s and d that were derived from a light, without shadows, have their own flag
@@ -148,6 +148,11 @@ class DualStreamModel(ModelMixin, ConfigMixin):
             raise ValueError(
                 f"attention_levels {tuple(attention_levels)}: expected levels from 0, the finest, to "
                 f"{len(block_out_channels) - 1}, the lowest"
+            )
+        if picture_features not in FEATURES or (picture_features != "none" and codec != "pixel"):
+            raise ValueError(
+                f"picture_features {picture_features!r} with codec {codec!r}: expected one of {', '.join(FEATURES)}, "
+                "and 'none' where the streams see an autoencoder's latents"
             )
         common = unet_config(block_out_channels, layers_per_block, attention_levels, attention_head_dim)
         common |= {"cross_attention_dim": cross_attention_dim, "norm_num_groups": norm_num_groups}
@@ -166,18 +171,13 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         self.image_extra = zero_conv(image_extra_channels, width, 3) if image_extra_channels else None
         rows, columns = environment_size
         self.light_encoder = LightEncoder((rows, columns), cross_attention_dim) if light == "encoder" else None
-        if picture_features not in FEATURES or (picture_features != "none" and codec != "pixel"):
-            raise ValueError(
-                f"picture_features {picture_features!r} with codec {codec!r}: expected one of {', '.join(FEATURES)}, "
-                "and 'none' where the streams see an autoencoder's latents"
-            )
-        self.patch, vgg, encoder = patch, picture_features == "vgg16", picture_features == "encoder"
+        self.patch = patch
         entering = (width, *block_out_channels[:-1])  # channels that come into each level of the encoder
         time_width = self.attribute_unet.time_embedding.linear_2.out_features
-        self.vgg = PictureFeatures(entering, patch, time_width) if vgg else None
+        self.vgg = PictureFeatures(entering, patch, time_width) if picture_features == "vgg16" else None
         strides = pyramid_strides(self.attribute_unet, patch)
         shape = (channels, strides, sample_size * patch, time_width, (rows, columns))
-        self.encoder = PictureEncoder(*shape) if encoder else None
+        self.encoder = PictureEncoder(*shape) if picture_features == "encoder" else None
         self.register_buffer("prompt_embedding", torch.ones(1, prompt_tokens, cross_attention_dim))
         self.prompt_embedding: Tensor
 
@@ -198,8 +198,8 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         batch are decoded in a stream that are asked for there.
 
         Args:
-            attributes: Noised attribute latents at `attributes_timestep`; or what a call before made of these latents,
-                this timestep, these extra inputs and this light, which are then not looked at.
+            attributes: Noised attribute latents at `attributes_timestep`; or what an earlier call made of these
+                latents, this timestep, these extra inputs and this light, all of which are then ignored.
             image: The same for the image.
             attributes_timestep: 0 (clean) .. T (pure noise), per sample.
             image_timestep: The same for the image.
@@ -250,7 +250,7 @@ class DualStreamModel(ModelMixin, ConfigMixin):
     def features_of(
         self, image: Float[Tensor, "b ci h w"], timestep: Int[Tensor, " b"], extra: Tensor | None
     ) -> Added | None:
-        """What the features of clean images add; None without any."""
+        """What the features of clean images add; None for a network without any, and where no image is clean."""
         clean = timestep == 0
         if (self.vgg is None and self.encoder is None) or not clean.any():
             return None

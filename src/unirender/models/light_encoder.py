@@ -40,7 +40,7 @@ class LightEncoder(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, light: Float[Tensor, "b 4 eh ew"]) -> Float[Tensor, "b k width"]:
-        """Tokens of a light that `unirender.models.conditioning` packed; zeros for one that is not given."""
+        """Tokens of a light that `unirender.models.packing` packed; zeros for one that is not given."""
         features = self.features(light) + self.position
         return self.last(F.silu(features).flatten(2).transpose(1, 2))
 

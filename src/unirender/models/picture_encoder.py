@@ -190,7 +190,7 @@ def truth_of(
     """What the heads should say of packed attribute pictures, and the coverage of each cell.
 
     Args:
-        pictures: of `unirender.models.conditioning.Packing.pack`.
+        pictures: of `unirender.models.packing.Packing.pack`.
         mask: coverage.
         light: packed.
         cells: rows, columns of the cells.

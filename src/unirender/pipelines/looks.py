@@ -17,7 +17,7 @@ import torch
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.models.conditioning import Packing
+from unirender.models.packing import Packing
 from unirender.symmetries import Maps, mirror, permute_channels
 
 MATERIAL = ("roughness", "metallic")
@@ -78,8 +78,8 @@ def check_looks(looks: Any, mode: str) -> int:
 def mean_of_looks(found: Sequence[Maps], packing: Packing) -> Maps:
     """The maps of one picture from those of the first of `LOOKS`, one each, [s s c].
 
-    The mean is that of the pictures which the network predicts (`unirender.models.conditioning`): of display values and
-    tone curves, not of radiance.
+    The mean is that of the pictures which the network predicts (`unirender.models.packing`): of display values and tone
+    curves, not of radiance.
     """
     looks = LOOKS[: len(found)]
     own = [look.undo(maps) for look, maps in zip(looks, found, strict=True)]

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.models.conditioning import TRIPLETS, Conditioning
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS
 from unirender.pipelines.looks import LOOKS, mean_of_looks
 from unirender.pipelines.settings import Sampling
 

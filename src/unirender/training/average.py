@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import notice
+from unirender.notices import notice
 
 if TYPE_CHECKING:
     import torch

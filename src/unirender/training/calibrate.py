@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError
-from unirender.options import at_least
+from unirender.option_checks import at_least
 
 if TYPE_CHECKING:
     import numpy as np

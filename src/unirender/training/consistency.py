@@ -1,11 +1,12 @@
 """The losses that compare what the predicted attributes look like with the true image, on inverse rows.
 
-`cycle` (paper Sec. 3.2, "cycle-consistent constraint"): the network renders them again, from pure noise in one step.
+`cycle` (paper Eq. 5, "cycle-consistent constraint"): the network renders them again, from pure noise in one step.
 `composite` (ours): their closed-form image; no network takes part, so nothing can learn to accept wrong maps, but
 shadowed highlights and interreflection are then explained by the maps.
 
-Both ask one answer to look like the picture. The prediction at much noise is a mean of answers, which need not.
-`cycle_steps` > 1 renders a few-step sample of the inverse direction instead: an answer, at that many passes more.
+Both terms ask that an answer looks like the picture. But the prediction at much noise is a mean of answers, which need
+not look like it. `cycle_steps` > 1 therefore renders a few-step sample of the inverse direction, which is one answer,
+at the cost of that many more passes.
 """
 
 import contextlib
@@ -20,8 +21,9 @@ from unirender.camera import Camera
 from unirender.diffusion.sampling import denoise, make_sampler
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, srgb_encode
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS, srgb_encode
 from unirender.models.priors import PRIORS
 from unirender.training.loss_terms import Errors, gradients, noise_like, predict, weighted_mean
 from unirender.training.presets import LossConfig

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from unirender.diffusion.schedule import signal_to_noise
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.conditioning import TRIPLETS, Conditioning, Extras
+from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
+from unirender.models.packing import TRIPLETS
 
 HALF_SCALE = 1024.0  # of a loss whose gradient goes through float16, which has nothing below 6e-8
 COLOURS = ("albedo", "specular", "diffuse")  # the attribute pictures that are scored by PSNR

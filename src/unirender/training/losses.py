@@ -1,9 +1,10 @@
-"""The loss of one batch (paper Sec. 3.2): x0 regression in both directions, and consistency with the image.
+"""The loss of one batch: x0 regression in both directions, and consistency with the image (paper Sec. 3.2, Eq. 5).
 
-Each stream is compared where it is noisy: the image stream's x0 with the true image; the attribute stream's with each
-of the six attribute pictures, every picture with a weight of its own, pixels weighted by coverage (the light: all
-alike). Where the image is clean and the attributes are not (an *inverse* row), what the predicted attributes look like
-is compared with the image too: see `unirender.training.consistency`.
+The regression is UniDiffuser's (paper Eq. 2), of x0 in place of the noise. Each stream is compared where it is noisy:
+the image stream's x0 with the true image, the attribute stream's with each of the six attribute pictures. Every picture
+has a weight of its own. Pixels are weighted by coverage (those of the light: all alike). In an *inverse* row the image
+is clean and the attributes are not. There the predicted attributes are rendered, too, and compared with the image: see
+`unirender.training.consistency`.
 
 Notation: a attributes, i image, t timestep, n = 6 pictures of c latent channels each.
 """
@@ -18,8 +19,9 @@ from torch import Tensor
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.added import Answers
-from unirender.models.conditioning import TRIPLETS, Conditioning, pack_image
+from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
 from unirender.pipelines.inputs import told_derived

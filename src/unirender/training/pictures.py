@@ -10,7 +10,7 @@ from torch import Tensor
 
 from unirender.color import image_srgb
 from unirender.diffusion.inference import infer_attributes, infer_image
-from unirender.models.conditioning import TRIPLETS
+from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
 from unirender.writing import writing

@@ -17,7 +17,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_features import PictureFeatures, read_vgg
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
-from unirender.options import notice
+from unirender.notices import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.beginning import Beginning, beginning

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import check_seed
-from unirender.training.run import Alone
+from unirender.option_checks import check_seed
+from unirender.training.command import Alone
 from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:

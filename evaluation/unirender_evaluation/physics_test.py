@@ -1,0 +1,62 @@
+"""What a physics test is: formula, unit, direction, what a perfect renderer scores, and a twin that must fail.
+
+A *renderer* test asks a function `maps -> image`, a *decomposer* test a function `(stage, material, picture) -> maps`,
+a *posterior* test the same for samples of the material (a method sees the picture alone; Mitsuba and the twins know the
+rest; see `physics_questions`). A test is sound where its twin (`physics_twins`) is worse than Mitsuba on the same
+scenes by more than its margin.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from unirender_evaluation.metrics import Metric, metric_key
+from unirender_evaluation.physics_stage import Stage
+
+
+@dataclass(frozen=True)
+class PhysicsTest:
+    """One test.
+
+    Attributes:
+        name: as in records: the quantity of its metric key.
+        label: as in tables.
+        formula: one line; notation of `physics`.
+        metric: unit, direction and decimals.
+        expected: value of a perfect renderer, decomposer or posterior, noise apart; in words where it is the scene's.
+        asks: what it asks of.
+        run: (renderer, decomposer or posterior, stage) -> value.
+        twin: a broken renderer, decomposer or posterior.
+        twin_is: what is broken, in words.
+        margin: how much worse than Mitsuba on the same scenes counts as failing.
+        in_run: whether `bench run` measures it, or `bench physics` alone.
+    """
+
+    name: str
+    label: str
+    formula: str
+    metric: Metric
+    expected: float | str
+    asks: Literal["render", "decompose", "sample"]
+    run: Callable[[Any, Stage], float]
+    twin: Any
+    twin_is: str
+    margin: float
+    in_run: bool = True
+
+    @property
+    def key(self) -> str:
+        """The metric key of its value."""
+        return metric_key(self.name, self.metric)
+
+    @property
+    def unit(self) -> str:
+        return self.metric.unit
+
+    @property
+    def direction(self) -> str:
+        return "higher is better" if self.metric.higher_is_better else "lower is better"
+
+    def fails(self, value: float, mitsuba: float) -> bool:
+        """Whether a value is worse than Mitsuba's by more than the margin."""
+        return (mitsuba - value if self.metric.higher_is_better else value - mitsuba) > self.margin

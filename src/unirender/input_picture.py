@@ -1,0 +1,58 @@
+"""A picture file with a mask as a command takes them, and the remarks that are due on it. Light to import."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from unirender.pictures import Picture
+
+DARK = 0.35  # display value that an object reaches at the exposures of the training data, unless it is dark itself
+FULL_COVERAGE = 0.95  # that a mask reaches on an object
+MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
+
+
+def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
+    """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
+
+    Args:
+        path: of the picture.
+        mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
+        option: what remarks on a mask that is not there add: how one is given.
+
+    Raises:
+        UnirenderError: an unreadable file, or a mask that does not fit.
+    """
+    import numpy as np
+
+    from unirender.pictures import OPAQUE, read_mask_file, read_picture
+
+    picture = read_picture(path)
+    remarks = dict(picture.remarks)
+    height, width = picture.image_srgb.shape[:2]
+    if mask is not None:
+        coverage, lost = read_mask_file(mask, (height, width))
+        remarks |= lost
+        picture = dataclasses.replace(picture, mask=coverage)
+        if coverage.min() >= OPAQUE:
+            remarks["mask"] = "the mask covers the whole frame, which is taken as the object"
+    elif picture.mask is None:
+        remarks["mask"] = f"no mask and no alpha channel: the whole frame is taken as the object{option}"
+        picture = dataclasses.replace(picture, mask=np.ones((height, width, 1), dtype=np.float32))
+    elif picture.mask.min() >= OPAQUE:
+        remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
+    assert picture.mask is not None, "the whole frame at least"
+    if (most := picture.mask.max()) < FULL_COVERAGE:
+        remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
+    if (bright := float(np.percentile(picture.image_srgb[picture.mask[..., 0] > 0.5].max(axis=-1), 99))) < DARK:
+        remarks["dark"] = (
+            f"the object is dark, 99% of it below {bright:.2f} of display white: the network was taught exposures at "
+            "which white is bright, and a darker one goes into the albedo"
+        )
+    if picture.negative:
+        remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"
+    if picture.clipped > MANY_CLIPPED:
+        remarks["clipped"] = (
+            f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there"
+        )
+    return picture, remarks
