@@ -12,7 +12,7 @@ from unirender.pipelines.flat_albedo import flattened, patterned, with_flat_albe
 from unirender.pipelines.framing import Frame
 
 SIZE = 64
-LEFT, RIGHT = np.float32([0.6, 0.3, 0.2]), np.float32([0.1, 0.2, 0.4])
+LEFT, RIGHT = np.array([[0.6, 0.3, 0.2], [0.1, 0.2, 0.4]], np.float32)
 Y, X = np.mgrid[0:SIZE, 0:SIZE]
 MASK = (np.hypot(X - 31.5, Y - 31.5) < 26)[..., None].astype(np.float32)
 GREY = np.full((SIZE, SIZE, 3), 0.3, np.float32)
@@ -52,7 +52,7 @@ def test_shading_leaves_the_albedo_and_its_edge_stays() -> None:
 
 def test_a_pattern_in_colour_stays_and_one_in_brightness_goes() -> None:
     stripes = ((X // 2) % 2)[..., None]
-    red, green = np.float32([0.5, 0.25, 0.2]), np.float32([0.2, 0.45, 0.2])
+    red, green = np.array([[0.5, 0.25, 0.2], [0.2, 0.45, 0.2]], np.float32)
     coloured, bright = (
         np.where(stripes, red, green).astype(np.float32),
         (GREY * np.where(stripes, 0.8, 1.2)).astype(np.float32),

@@ -120,7 +120,7 @@ def test_an_edit_takes_looks_and_tiles_have_one(pipeline):
     assert np.array_equal(edited.decomposition.intrinsics.albedo, at_hand.intrinsics.albedo)
     wide = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1), np.repeat(np.repeat(mask, 2, axis=0), 2, axis=1)
     assert np.isfinite(pipeline.decompose(*wide, looks=2, tile=True).intrinsics.albedo).all()
-    with pytest.raises(UnirenderError, match="looks: got 3 beside a decomposition.*expected 2"):
+    with pytest.raises(UnirenderError, match=r"looks: got 3 beside a decomposition.*expected 2"):
         pipeline.edit(image, mask, roughness=0.2, looks=3, decomposition=at_hand)
 
 

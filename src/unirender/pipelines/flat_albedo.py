@@ -69,10 +69,10 @@ def flattened(
             no edge.
     """
     covered = mask[..., 0] >= mask.max() / 2
-    nearest = tuple(distance_transform_edt(~covered, return_distances=False, return_indices=True))
-    display = srgb_encode(albedo)[nearest]
+    row, column = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
+    display = srgb_encode(albedo)[row, column]
     even = denoise_tv_chambolle(display, WEIGHT * len(mask), eps=TOLERANCE, max_num_iter=ITERATIONS, channel_axis=-1)
-    kept = patterned(srgb_encode(picture)[nearest], NEIGHBOURHOOD * len(mask))
+    kept = patterned(srgb_encode(picture)[row, column], NEIGHBOURHOOD * len(mask))
     flat = np.clip(even + kept * (display - even), 0, 1).astype(np.float32)
     return np.where(mask > 0, srgb_decode(flat), 0).astype(np.float32)
 
