@@ -120,8 +120,8 @@ def test_an_edit_takes_looks_and_tiles_have_one(pipeline):
     assert np.array_equal(edited.decomposition.intrinsics.albedo, at_hand.intrinsics.albedo)
     wide = np.repeat(np.repeat(image, 2, axis=0), 2, axis=1), np.repeat(np.repeat(mask, 2, axis=0), 2, axis=1)
     assert np.isfinite(pipeline.decompose(*wide, looks=2, tile=True).intrinsics.albedo).all()
-    with pytest.raises(UnirenderError, match="looks: got 2 beside a decomposition"):
-        pipeline.edit(image, mask, roughness=0.2, looks=2, decomposition=at_hand)
+    with pytest.raises(UnirenderError, match="looks: got 3 beside a decomposition"):
+        pipeline.edit(image, mask, roughness=0.2, looks=3, decomposition=at_hand)
 
 
 @pytest.mark.parametrize("looks", [0, 13, -1, 2.0, True, "6", None])
