@@ -125,8 +125,8 @@ def test_a_picture_that_was_written_here_brings_its_camera(
     assert "2 pictures (2 of them from before)" in capsys.readouterr().out
     metas = [json.loads((tmp_path / "maps" / name / "meta.json").read_text()) for name in ("b.exr", "c.exr")]
     assert [meta["fov_deg"] for meta in metas] == [60, 36]
-    for name, meta in zip(("b.exr", "c.exr"), metas, strict=True):  # of a version that knew no looks
-        older = {key: value for key, value in meta.items() if key != "looks"}
+    for name, meta in zip(("b.exr", "c.exr"), metas, strict=True):  # of a version that knew neither
+        older = {key: value for key, value in meta.items() if key not in ("looks", "flat")}
         (tmp_path / "maps" / name / "meta.json").write_text(json.dumps(older))
     assert run("decompose", tmp_path / "film", "--output", tmp_path / "maps") == 0
     assert "2 pictures (2 of them from before)" in capsys.readouterr().out
@@ -327,6 +327,24 @@ def test_sampler_size_and_tiles_are_recorded(ball: Path, tmp_path: Path) -> None
     assert recorded == [[3, "unipc", 96, True], [3, "ddim", 64, False]]
     albedos = [read_result(tmp_path / name).require("albedo")["albedo"] for name in ("out", "plain")]
     assert np.abs(albedos[0] - albedos[1]).max() > 0.01
+
+
+def test_a_flat_albedo_is_recorded_and_that_of_every_command(ball: Path, tmp_path: Path) -> None:
+    light = tmp_path / "light.exr"
+    write_exr(light, image_channels(np.ones((8, 16, 3), np.float32)), half=False)
+    commands = {
+        "plain": ("decompose", ball),
+        "flat": ("decompose", ball, "--flat"),
+        "edited": ("edit", ball, "--flat", "--metallic", "1"),
+        "relit": ("relight", ball, "--flat", "--environment", light),
+    }
+    for name, arguments in commands.items():
+        assert run(*arguments, "--output", tmp_path / name) == 0
+        assert json.loads((tmp_path / name / "meta.json").read_text())["flat"] == (name != "plain")
+    plain, *flat = (read_result(tmp_path / name).require("albedo")["albedo"] for name in commands)
+    assert np.abs(flat[0] - plain).max() > 0.001
+    for albedo in flat[1:]:
+        np.testing.assert_array_equal(albedo, flat[0])
 
 
 def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

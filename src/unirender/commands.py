@@ -239,8 +239,7 @@ class Relight:
         check_stops(self.exposure)
         picture, camera = self.input.read(self.model)
         options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "flat": self.flat}
-        options |= {"tile": self.tile}
-        options |= {"shadows": self.shadows}
+        options |= {"tile": self.tile, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
             pipeline, sampling = self.model.load(), self.model.sampling()

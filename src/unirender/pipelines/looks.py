@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from unirender.camera import Camera
+from unirender.diffusion.sampling import is_whole
 from unirender.errors import UnirenderError
 from unirender.models.packing import Packing
 from unirender.symmetries import Maps, mirror, permute_channels
@@ -65,7 +66,7 @@ def check_looks(looks: Any, mode: str) -> int:
     Raises:
         UnirenderError: it is no such number, or samples are drawn, whose spread a mean would hide.
     """
-    if isinstance(looks, bool) or not isinstance(looks, int | np.integer) or not 1 <= looks <= len(LOOKS):
+    if not is_whole(looks) or not 1 <= looks <= len(LOOKS):
         raise UnirenderError(f"looks: got {looks!r}, expected a whole number from 1 to {len(LOOKS)}")
     if looks > 1 and mode != "mean":
         raise UnirenderError(

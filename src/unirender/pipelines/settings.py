@@ -52,13 +52,7 @@ class Sampling:
         Raises:
             UnirenderError: an unknown mode, numbers that do not go with it, or a generator that is none.
         """
-        given: Any = generator
-        each = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
-        for own in each:
-            if given is not None and not isinstance(own, torch.Generator):
-                raise UnirenderError(
-                    f"generator: got {own!r:.60}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
-                )
+        _check_generators(generator)
         steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
         return cls(mode, steps, count, generator, check_looks(looks, mode))
 
@@ -135,6 +129,16 @@ def check_switches(**switches: Any) -> None:
 def same_noise(seed: int, count: int) -> list[torch.Generator]:
     """Generators that all draw the same."""
     return [torch.Generator().manual_seed(seed) for _ in range(count)]
+
+
+def _check_generators(given: Any) -> None:
+    if given is None:
+        return
+    for own in given if isinstance(given, Sequence) and not isinstance(given, str) else [given]:
+        if not isinstance(own, torch.Generator):
+            raise UnirenderError(
+                f"generator: got {own!r:.60}, expected a torch.Generator, like torch.Generator().manual_seed(0)"
+            )
 
 
 def _sample_count(mode: str, num_samples: int | None) -> int:
