@@ -24,7 +24,6 @@ from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 from unirender.pipelines.editing import (
     LOBE_FLOOR,
     SMALL_CHANGE,
-    TRUST_SHARPER,
     TRUST_WIDER,
     anchor,
     constant_map,
@@ -384,15 +383,27 @@ def test_specular_for_the_same_roughness_is_unchanged_and_constant_light_stays_c
         np.testing.assert_allclose(changed[middle], expected[middle], rtol=0.01)
 
 
-def test_trust_grows_with_the_change_of_roughness_and_with_the_share_of_s() -> None:
-    """None without a change, half of the most at a small one; sharper lobes are believed less."""
+def test_a_wider_lobe_is_trusted_whatever_shows_of_s() -> None:
+    """That it reflects less is known of every light."""
     old = np.full((1, 1, 1), 0.5, dtype=np.float32)
     assert trust(old, old, 1.0).item() == 0
-    assert trust(old, old + 0.5, 0.0).item() == 0
-    for share in (0.2, 0.4):
-        np.testing.assert_allclose(trust(old, old + SMALL_CHANGE, share).item(), 0.5 * TRUST_WIDER * share, rtol=1e-5)
-        np.testing.assert_allclose(trust(old, old - SMALL_CHANGE, share).item(), 0.5 * TRUST_SHARPER * share, rtol=1e-5)
-    assert 0.9 < trust(old, old + 0.5, 1.0).item() <= 1
+    for share in (0.0, 0.3, 1.0):
+        assert 0.8 < trust(old, old + 0.4, share).item() < 1
+        np.testing.assert_allclose(trust(old, old + SMALL_CHANGE, share).item(), 0.5 * TRUST_WIDER, rtol=1e-5)
+
+
+def test_a_sharper_lobe_is_trusted_less_the_sharper_it_is_and_the_less_shows_of_s() -> None:
+    old = np.full((1, 1, 1), 0.95, dtype=np.float32)
+    believed = {
+        (new, share): trust(old, np.full_like(old, new), share).item()
+        for new in (0.1, 0.3, 0.5)
+        for share in (0.0, 0.2, 0.4)
+    }
+    for new in (0.1, 0.3, 0.5):
+        assert believed[new, 0.0] == 0
+        assert believed[new, 0.4] > 1.9 * believed[new, 0.2] > 0
+    assert 1.9 * believed[0.1, 0.4] < believed[0.3, 0.4] < believed[0.5, 0.4] < 1
+    assert trust(old, np.full_like(old, 0.5), 1.0).item() <= 1
 
 
 def test_the_share_of_s_is_that_of_the_composite() -> None:

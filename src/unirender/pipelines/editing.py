@@ -15,7 +15,9 @@ from unirender.pipelines.derived_light import derived_light, derived_specular
 from unirender.pipelines.revealed_light import revealed_light
 
 LOBE_RATIO = 4.0  # bound on the change of s by an edit, either way: beyond it the predicted light is too coarse to say
-TRUST_WIDER, TRUST_SHARPER = 1.7, 0.5  # of that change's logarithm, per share of the picture that s makes
+TRUST_WIDER = 0.9  # of that change's logarithm, where the lobe becomes wider
+TRUST_SHARP, TRUST_PER_ROUGHNESS = 0.2, 3.0  # c: the same where it becomes sharper, per share of s in the picture
+LEAST_TRUST, MOST_TRUST = 0.5, 1.7  # bounds of c
 SMALL_CHANGE = 0.1  # of roughness: made by half, since the old one is a guess
 LOBE_FLOOR = 0.02  # radiance added to both lobes, so that dark light does not decide the ratio
 RELIGHT_TARGET = 0.75  # brightness of white under a light whose exposure is chosen here: the gauge's middle
@@ -53,14 +55,16 @@ def specular_for_roughness(
 def trust(old: Float[np.ndarray, "h w 1"], new: Float[np.ndarray, "h w 1"], share: float) -> Float[np.ndarray, "h w 1"]:
     """t of `specular_for_roughness`: how much of a change of s to believe; 0 where the roughness is the old one.
 
-        t = min(c q, 1) (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2)
+        t = k (r_1 - r_0)^2 / ((r_1 - r_0)^2 + e^2),    k = 0.9 if r_1 > r_0, else min(c(r_1) q, 1)
 
-    q is the share of the picture that s makes: the less of it shows, the less is known of it. c is smaller for sharper
-    lobes, which show detail that the light lacks; a change of e is made by half of that.
+    A wider lobe asks for no detail, and reflects less whatever the light is: its change is believed. A sharper lobe
+    shows detail that the light lacks, the more the sharper it is: c(r) = clip(0.2 + 3 r, 0.5, 1.7). q is the share of
+    the picture that s makes: the less of it shows, the less is known of it. A change of e is made by half.
     """
     square = np.square(new - old)
-    most = np.minimum(np.where(new < old, np.float32(TRUST_SHARPER), np.float32(TRUST_WIDER)) * np.float32(share), 1)
-    return most * square / (square + SMALL_CHANGE**2)
+    per_share = np.clip(TRUST_SHARP + TRUST_PER_ROUGHNESS * new, LEAST_TRUST, MOST_TRUST)
+    most = np.where(new > old, np.float32(TRUST_WIDER), np.minimum(per_share * np.float32(share), 1))
+    return (most * square / (square + SMALL_CHANGE**2)).astype(np.float32)
 
 
 def specular_share(intrinsics: Intrinsics) -> float:
