@@ -45,7 +45,9 @@ Material = np.ndarray | np.floating | float
 
 
 class UniRenderPipeline(DualStreamPipeline):
-    """One dual-stream model in both directions; its arguments are those of `DualStreamPipeline`."""
+    """One dual-stream model in both directions. Get it by `from_pretrained`, with a folder or the name of a shipped
+    checkpoint (`tiny`, `small`); the arguments of the class itself are those of `DualStreamPipeline`.
+    """
 
     @overload
     def __call__(self, image: list | tuple, mask: Any = None, **kwargs: Any) -> list[Decomposition]: ...
@@ -77,7 +79,7 @@ class UniRenderPipeline(DualStreamPipeline):
         closed: bool = True,
         flat: bool = False,
     ) -> Decomposition:
-        """Inverse rendering.
+        """Takes a picture apart into maps and light (inverse rendering).
 
         Args:
             image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (its EXIF orientation is
@@ -100,6 +102,9 @@ class UniRenderPipeline(DualStreamPipeline):
                 network predicts (materials by the checkpoint's calibration, if it has one).
             flat: make the albedo even between its edges, and move the detail that it loses into s and d
                 (`unirender.pipelines.flat_albedo`).
+
+        Returns:
+            The maps at the picture's size, the light, and roughness and metallic of the object as numbers.
 
         Raises:
             UnirenderError: the picture, the mask or a setting is not usable; the message says why.
@@ -140,7 +145,7 @@ class UniRenderPipeline(DualStreamPipeline):
         closed: bool = True,
         flat: bool = False,
     ) -> list[Decomposition]:
-        """Inverse rendering of several pictures of any sizes in one batch of the network (and one more to close them).
+        """Takes several pictures of any sizes apart, in one batch of the network (and one more to close them).
 
         Args:
             images_srgb: as for `decompose`.
@@ -158,6 +163,9 @@ class UniRenderPipeline(DualStreamPipeline):
             material: one number per object or maps.
             closed: change albedo, s, d and the light, as for `decompose`.
             flat: make the albedo even, likewise.
+
+        Returns:
+            One decomposition for each picture, in their order.
 
         Raises:
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
@@ -204,7 +212,7 @@ class UniRenderPipeline(DualStreamPipeline):
         derived: str | Collection[str] = (),
         shadows: bool = True,
     ) -> Float[np.ndarray, "h w 3"]:
-        """Rendering; several samples are averaged in linear light.
+        """Renders maps to a picture; several samples are averaged in linear light.
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
@@ -261,7 +269,7 @@ class UniRenderPipeline(DualStreamPipeline):
         decomposition: Decomposition | None = None,
         **sampling: Any,
     ) -> EditResult:
-        """Decomposes, changes the material, derives s for the new roughness, renders.
+        """Changes the material of a picture's object: decomposes, derives s for the new roughness, renders.
 
         Args:
             image_srgb: as for `decompose`.
@@ -273,6 +281,9 @@ class UniRenderPipeline(DualStreamPipeline):
                 tile, material, closed and flat are its own; others are refused.
             **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material,
                 closed and flat, as for `decompose`.
+
+        Returns:
+            The edited picture (premultiplied and linear), its maps, and the decomposition.
 
         Raises:
             UnirenderError: as `decompose`; or nothing to change; a value outside [0, 1]; or a decomposition that does
@@ -310,7 +321,7 @@ class UniRenderPipeline(DualStreamPipeline):
         decomposition: Decomposition | None = None,
         **sampling: Any,
     ) -> EditResult:
-        """Decomposes, puts the object under another light, renders.
+        """Puts a picture's object under another light: decomposes, derives s and d, renders.
 
         s and d are derived from the predicted normal and roughness at the light's own resolution, unless they are
         given, and what the decomposition's s and d have beyond its own light is carried over
@@ -327,6 +338,9 @@ class UniRenderPipeline(DualStreamPipeline):
             shadows: as for `render`; off, since predicted normals say less of where they fall.
             decomposition: as for `edit`.
             **sampling: as for `edit`.
+
+        Returns:
+            The relit picture (premultiplied and linear), its maps, and the decomposition.
 
         Raises:
             UnirenderError: as `decompose`; or neither a light nor both s and d are given; or a decomposition that does
