@@ -173,6 +173,44 @@ def test_an_edited_neighbour_is_another_configuration(
     assert source_sha256(kind, kind) != before
 
 
+def test_an_edited_package_elsewhere_is_another_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that the method puts on the path, as one installed for editing is, and what it imports; nothing beside it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    package = tmp_path / "src" / "my_edited_package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("from .net import Net")
+    (package / "net.py").write_text("class Net: ...")
+    (package / "other.py").write_text("")
+    file = tmp_path / "adapter" / "mine.py"
+    file.parent.mkdir()
+    file.write_text(
+        f"import sys\nsys.path.append({str(package.parent)!r})\nfrom my_edited_package import Net\n"
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): ..."
+    )
+    before = named_plugin(f"{file}:Mine").source
+    (package / "other.py").write_text("# edited")
+    assert named_plugin(f"{file}:Mine").source == before
+    (package / "net.py").write_text("class Net: ...  # edited")
+    assert named_plugin(f"{file}:Mine").source != before
+
+
+def test_neighbours_of_one_name_are_not_mistaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two copies of a method, each with its own net: Python would give the second the first one's."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for level, copy in enumerate(("one", "two")):
+        (tmp_path / copy).mkdir()
+        (tmp_path / copy / "copy.py").write_text("")  # named as one of Python's, which is meant
+        (tmp_path / copy / "my_shadowed_net.py").write_text(f"LEVEL = {level}")
+        (tmp_path / copy / "mine.py").write_text(
+            "import copy\nfrom my_shadowed_net import LEVEL\n"
+            f"class Mine:\n    name, config = '{copy}', {{}}\n    def render(self, intrinsics): ..."
+        )
+    named_plugin(f"{tmp_path}/one/mine.py:Mine")
+    said = r"in place of .*/two/my_shadowed_net\.py Python imports .*/one/my_shadowed_net\.py; rename"
+    with pytest.raises(UnirenderError, match=said):
+        named_plugin(f"{tmp_path}/two/mine.py:Mine")
+
+
 def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else another patch version of Python would be another method."""
     bodies = {"plain_mine": "class Mine:\n", "abstract_mine": "from abc import ABC\nclass Mine(ABC):\n"}
