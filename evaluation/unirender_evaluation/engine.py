@@ -12,13 +12,13 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
-from unirender_evaluation.metrics import FACING_AWAY
-from unirender_evaluation.plausible import NEARLY_ALL, facing_away, picture_doubt
+from unirender_evaluation.plausible import picture_doubt
 from unirender_evaluation.predictions import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suspicions import suspicions
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import Versions
@@ -273,14 +273,5 @@ def _ask(row: Row, task: Task, key: str, backbones: Sequence[str], pictures: Kee
     pictures.keep(task, row.info.key, key, prediction)
     values = score(task, prediction, backbones)
     if row.info.kind == "external":
-        values |= _facing_away(task, prediction)
+        values |= suspicions(task, prediction.image, prediction.maps)
     return record_of(task, row.info, values, key, prediction.seconds)
-
-
-def _facing_away(task: Task, prediction: Prediction) -> dict[str, float]:
-    """The share of a stranger's normals that face away, where it is nearly all of those that are scored."""
-    found, true = (None if maps is None else maps.normal for maps in (prediction.maps, task.truth_maps))
-    if found is None or true is None:
-        return {}
-    share = facing_away(found, task.mask)
-    return {FACING_AWAY: share} if share > NEARLY_ALL else {}
