@@ -10,6 +10,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender_evaluation.kept_defaults import kept_defaults
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
 from unirender_evaluation.plausible import picture_doubt
@@ -149,7 +150,8 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     asked = inputs.get("intrinsics")
     size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
-        result = function(**{argument: _own(value) for argument, value in inputs.items()})
+        with kept_defaults():
+            result = function(**{argument: _own(value) for argument, value in inputs.items()})
     except (Exception, SystemExit) as error:  # neither ends a run without a word
         raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
     if result is None:

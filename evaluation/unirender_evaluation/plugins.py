@@ -24,6 +24,7 @@ from typing import Any, Union, get_args, get_origin
 from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
+from unirender_evaluation.kept_defaults import kept_defaults
 from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
 from unirender_evaluation.plugin_source import shadowed, source_sha256
 
@@ -189,7 +190,8 @@ def _search_last(folder: Path) -> None:
 def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
     """Runs foreign code; whatever it raises becomes one clear line."""
     try:
-        return run()
+        with kept_defaults():
+            return run()
     except UnirenderError as error:  # written to be read: one of ours
         raise UnirenderError(f"{what}: could not {task}: {error}") from error
     except (Exception, SystemExit) as error:

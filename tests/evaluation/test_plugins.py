@@ -6,9 +6,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import engine
 from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
@@ -209,6 +212,24 @@ def test_neighbours_of_one_name_are_not_mistaken(tmp_path: Path, monkeypatch: py
     said = r"in place of .*/two/my_shadowed_net\.py Python imports .*/one/my_shadowed_net\.py; rename"
     with pytest.raises(UnirenderError, match=said):
         named_plugin(f"{tmp_path}/two/mine.py:Mine")
+
+
+def test_what_a_method_sets_for_the_whole_process_is_put_back(tmp_path: Path) -> None:
+    """Else LPIPS, and our own rows, would run in float64 or elsewhere."""
+    import torch
+
+    file = tmp_path / "setting.py"
+    file.write_text(
+        "import numpy as np\nimport torch\ntorch.set_default_dtype(torch.float64)\nnp.seterr(all='raise')\n"
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics):\n"
+        "        torch.set_default_device('meta')\n        return np.zeros((2, 2, 3))"
+    )
+    before, errors = (torch.get_default_dtype(), torch.get_default_device()), np.geterr()
+    (row,) = plugin_rows([named_plugin(f"{file}:Mine")])
+    assert torch.get_default_dtype() == before[0]
+    engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+    assert (torch.get_default_dtype(), torch.get_default_device()) == before
+    assert np.geterr() == errors
 
 
 def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
