@@ -22,9 +22,9 @@ COLOURS = {
     "albedo": "albedo",
     "specular": "s",
     "diffuse": "d",
-    "edit_metallic": "picture of another metallic",
-    "edit_roughness": "picture of another roughness",
-    "relit": "relit picture",
+    "edit_metallic": "another metallic",
+    "edit_roughness": "another roughness",
+    "relit": "relit",
 }
 MASKED_QUANTITIES = ("albedo", "specular", "diffuse", "roughness", "metallic")  # maps, which a method's mask belongs to
 
@@ -53,19 +53,23 @@ def doubts(method: str, records: Iterable[Record]) -> list[str]:
             f"its normals are nearer to the truth with another sign of x or y on {turned} of {normals} pictures (+y is "
             "up; normal_axes in conventions.toml turns those of a folder)"
         )
-    for quantity, name in COLOURS.items():
-        scored, decoded = (
-            Counter((r.table, r.protocol) for r in of_method if metric_key(quantity, metric) in r.values)
-            for metric in ("psnr", "decoded")
+    decoded = [f"{name} ({count})" for quantity, name in COLOURS.items() if (count := _decoded(quantity, of_method))]
+    if decoded:
+        found.append(
+            f"taken for display values these of its answers are nearer to the truth: {', '.join(decoded)} (encoded? "
+            "expected linear; exr_colour in conventions.toml decodes those of a folder)"
         )
-        asked = [question for question, count in scored.items() if decoded[question] > MOST * count]
-        if asked:
-            found.append(
-                f"its {name} is nearer to the truth if taken for display values on {sum(decoded[q] for q in asked)} of "
-                f"{sum(scored[q] for q in asked)} pictures (encoded? expected linear; exr_colour in conventions.toml "
-                "decodes that of a folder)"
-            )
     return found
+
+
+def _decoded(quantity: str, records: Sequence[Record]) -> str:
+    """On how many pictures colours would be nearer to the truth as display values; empty where it is not on most."""
+    scored, gained = (
+        Counter((r.table, r.protocol) for r in records if metric_key(quantity, metric) in r.values)
+        for metric in ("psnr", "decoded")
+    )
+    asked = [question for question, count in scored.items() if gained[question] > MOST * count]
+    return f"{sum(gained[q] for q in asked)} of {sum(scored[q] for q in asked)} pictures" if asked else ""
 
 
 def protocol_line(
