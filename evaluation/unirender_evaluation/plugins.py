@@ -128,6 +128,16 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
     return arguments
 
 
+def _needed(found: Any, given: Mapping[str, Any]) -> list[str]:
+    """The arguments without a default that a callable is not given."""
+    try:
+        taken = inspect.signature(found).parameters
+    except (TypeError, ValueError):  # one that says nothing of its arguments
+        return []
+    optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [n for n, p in taken.items() if p.default is p.empty and p.kind not in optional and n not in given]
+
+
 def _value(text: str, annotation: Any, what: str) -> Any:
     """A text as the type of an annotation, None apart; as it is where there is no annotation."""
     united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
@@ -204,6 +214,12 @@ def _plugin(
     """The method that `found` of a module is, or that it returns when it is called."""
     is_method = not inspect.isclass(found) and bool(capabilities(found))
     as_it_is = not arguments and (is_method or not callable(found))
+    if not as_it_is and (needed := _needed(found, arguments)):
+        values = "&".join(f"{argument}=VALUE" for argument in needed)
+        raise UnirenderError(
+            f"{what}: it takes {', '.join(needed)}, expected a value of each, as in PLACE:{name}?{values}, or a "
+            "function without arguments that returns the method"
+        )
     method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
     try:
         check_method(method)

@@ -437,8 +437,9 @@ class Encoded(Guess):
         return Intrinsics(albedo=srgb_encode(true["albedo"]), normal=down, camera=camera)
 
     def edit(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **change: float) -> np.ndarray:
-        base = dict(zip(("metallic", "roughness"), self.suite.spec.base, strict=True))
-        true = self.suite.image(self.suite.scenes[0], tuple((base | change).values()))
+        metallic, roughness = self.suite.spec.base
+        material = change.get("metallic", metallic), change.get("roughness", roughness)
+        true = self.suite.image(self.suite.scenes[0], material)
         return srgb_encode(np.clip(unpremultiply(true, mask), 0, 1)) * mask
 
 

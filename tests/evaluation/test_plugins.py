@@ -69,6 +69,11 @@ class Level:
         return self.level * intrinsics.albedo * intrinsics.mask
 
 
+class Loaded(Grey):
+    def __init__(self, weights, steps=4, **more):
+        self.weights = weights
+
+
 instance = Grey()
 bright, dark = Level(0.9), Level(0.1)
 """
@@ -280,6 +285,10 @@ def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
         ("{folder}/absent.py:Grey", "no file .*absent.py, expected module:Class or path/to/file.py:Class"),
         ("{folder}/my_method.py:Gray", "has no 'Gray'; of what it has, Grey, .* has one of decompose"),
         ("{folder}/my_method.py:Empty", "is not a method"),
+        (
+            "{folder}/my_method.py:Loaded",
+            "it takes weights, expected a value of each, as in .*Loaded.weights=VALUE",
+        ),
         ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
         ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),
         ("{folder}/imports.py:Grey", "could not import it: ModuleNotFoundError: No module named 'no_such_package'"),
