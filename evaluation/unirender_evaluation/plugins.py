@@ -228,7 +228,8 @@ def _plugin(
     for beside, other in shadowed(type(method), found, module):
         raise UnirenderError(
             f"{what}: in place of {beside} Python imports {other}; rename one of them, or, where the other is another "
-            "method's, score the two in runs of their own"
+            "method's, score the two in runs of their own, or, where it is a copy that is installed, install it for "
+            "editing (pip install -e)"
         )
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
