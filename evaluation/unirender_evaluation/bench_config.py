@@ -12,7 +12,7 @@ from unirender_evaluation.metrics import Variant
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
-from unirender_evaluation.plugins import installed_plugins, named_plugin
+from unirender_evaluation.plugins import absolute, installed_plugins, named_plugin
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suite_spec import read_spec
@@ -114,10 +114,14 @@ def _load_pipeline(folder: Path, device: str) -> Any:
 
 
 def anywhere(config: BenchConfig) -> BenchConfig:
-    """The same with absolute paths, since a cluster's workers may run in another folder; but for those in `method`."""
+    """The same with absolute paths, since a cluster's workers may run in another folder, and a stranger's method may
+    change the one that it runs in."""
+    named = config.checkpoint
     return replace(
         config,
         suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
-        checkpoint=config.weights().resolve(),
+        out=config.out.absolute(),
+        checkpoint=named.resolve() if named is not None and named.is_dir() else named,
+        method=tuple(map(absolute, config.method)),
         predictions={name: folder.resolve() for name, folder in config.predictions.items()},
     )

@@ -5,7 +5,7 @@
     truth_check.json              what was rendered again on the spot, and how it compares (see `run_check`)
     tables.md tables.tex tables.json     in the variants that are asked for
     verdict.txt                   who beats whom
-    missing.txt                   what a folder of predictions has no answer to, a line each (`missing_answers`)
+    missing.txt                   what a stranger's row has no answer to, a line each (`run_folder`)
     report.html                   one self-contained page
     results.json                  run.json and records.jsonl as one validated file, for others (see `results_file`)
     unused.jsonl pictures/        records that the run did not ask for; the report's pictures
@@ -41,7 +41,14 @@ from unirender_evaluation.results_data import NAME as RESULTS
 from unirender_evaluation.results_file import write_results
 from unirender_evaluation.rows import Row
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
-from unirender_evaluation.run_folder import missing_answers, say_rows_without_values, write_missing, writing_run
+from unirender_evaluation.run_folder import (
+    missing_answers,
+    say_missing,
+    say_rows_without_values,
+    unanswered,
+    write_missing,
+    writing_run,
+)
 from unirender_evaluation.store import KEPT, Job, Store
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
@@ -76,6 +83,7 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
             folder; nothing has run then. Or the folder cannot be written any more, or a method fails: a second run
             continues from there. A failed truth check or claim is no error: the verdict says so.
     """
+    config = anywhere(config)
     here = prepare(config)
     with made_folder(config.out), locked(config.out), writing_run(config.out):
         return _run(config, here, console or Console())
@@ -85,7 +93,9 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     suite, request = here.suite, check_request(config)
     store = Store.open(config.out / "records.jsonl")
     say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
-    write_missing(config.out, missing_answers(suite, here.rows, here.scenes), say)
+    missing = missing_answers(suite, here.rows, here.scenes)
+    write_missing(config.out, missing)
+    say_missing(config.out, missing, say)
     before = set(store.known)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
@@ -93,6 +103,9 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
+    by_plugins = unanswered(suite, here.rows, here.scenes, records)
+    write_missing(config.out, missing | by_plugins)
+    say_missing(config.out, by_plugins, say)
     say_rows_without_values(here.rows, records, say)
     if others := store.of_other_code():
         say(f"{others} records of other code are not used; {store.unused_path} keeps the last {KEPT} of each")
@@ -148,8 +161,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
             progress.update(bar, advance=1, description=job.label)
         return
     if config.cluster is not None:
-        settings = anywhere(config)
-        found = run_on_cluster(here, partial(build_rows, settings), settings.suite, wanted, config.cluster)
+        found = run_on_cluster(here, partial(build_rows, config), config.suite, wanted, config.cluster)
     else:
         done = frozenset(store.used)
         found = run_in_workers(here, partial(build_rows, config), scenes, done, min(config.jobs, len(scenes)))

@@ -1,27 +1,30 @@
 """The engine of a run: asks methods and scores their answers, a job for each record that is wanted."""
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender_evaluation.kept_defaults import kept_defaults
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
-from unirender_evaluation.metrics import FACING_AWAY
-from unirender_evaluation.plausible import NEARLY_ALL, facing_away, picture_doubt
+from unirender_evaluation.plausible import picture_doubt
 from unirender_evaluation.predictions import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suspicions import suspicions
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import Versions
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,10 @@ class Prediction:
     image: Image | None = None
     maps: Intrinsics | None = None
     seconds: float = 0.0
+
+
+class NoAnswer(UnirenderError):
+    """A stranger's method returned None: it has no answer to this question, which is no fault."""
 
 
 @runtime_checkable
@@ -45,7 +52,8 @@ class Keeper(Protocol):
 def answer(row: Row, task: Task) -> Prediction:
     """Asks a method one question; it is handed `task.inputs` and what its row declares, never the truth.
 
-    A stranger's method decomposes a picture once, whatever tables want it; the seconds of each answer hold that.
+    The seconds of an answer hold those of a decomposition that was there before. Where a stranger's method returns
+    None, that part of the answer is None.
     """
     start = time.perf_counter()
     if row.predictions is not None:
@@ -58,17 +66,40 @@ def answer(row: Row, task: Task) -> Prediction:
             continue
         told = {name: getattr(task, name)() for name in row.told}
         asked = partial(ask, row, capability, task.identity, **task.inputs[capability], **told)
-        if capability != "decompose":
-            image = asked()
-        elif row.info.kind == "external":
-            maps, earlier = row.found.of(**task.inputs[capability], decompose=asked)
+        if capability == "decompose":
+            maps, earlier = decomposition(row, task.inputs[capability], asked)
         else:
-            maps = asked()
+            image = answered(asked)
     seconds = time.perf_counter() - start + earlier
     if row.info.kind == "external":
         check_light(row, task, maps)
         check_picture(row, task, image)
     return Prediction(image, maps, seconds)
+
+
+def answered(asked: Callable[[], T]) -> T | None:
+    """What a question to a method gives; None where a stranger's has no answer."""
+    try:
+        return asked()
+    except NoAnswer:
+        return None
+
+
+def decomposition(
+    row: Row, seen: Mapping[str, Any], asked: Callable[[], Intrinsics]
+) -> tuple[Intrinsics | None, float]:
+    """The maps that a row finds in a picture, and the seconds that they took before this call.
+
+    A stranger's method decomposes a picture once, whatever tables want it.
+
+    Args:
+        row: whose.
+        seen: picture, mask and camera.
+        asked: asks the method for them.
+    """
+    if row.info.kind != "external":
+        return asked(), 0.0
+    return row.found.of(**seen, decompose=partial(answered, asked))
 
 
 def check_picture(row: Row, task: Task, image: Image | None) -> None:
@@ -109,8 +140,8 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     returns is copied, so that it may use its arrays again.
 
     Raises:
-        UnirenderError: a stranger's method fails, or returns something else than maps or a finite picture of the
-            question's size.
+        NoAnswer: a stranger's method returns None.
+        UnirenderError: it fails, or returns something else than maps or a finite picture of the question's size.
     """
     function = getattr(row.method, capability)
     if row.info.kind != "external":
@@ -119,16 +150,27 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     asked = inputs.get("intrinsics")
     size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
-        result = function(**{argument: _own(value) for argument, value in inputs.items()})
+        with kept_defaults():
+            result = function(**{argument: _own(value) for argument, value in inputs.items()})
     except (Exception, SystemExit) as error:  # neither ends a run without a word
         raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
+    if result is None:
+        raise NoAnswer(f"{name}: got None, expected {'maps' if capability == 'decompose' else 'a picture'}")
     if capability != "decompose":
         return _picture(result, size, name)
     if not isinstance(result, Intrinsics):
         raise UnirenderError(f"{name}: got {type(result).__name__}, expected unirender.Intrinsics")
-    if any(name in IMAGE_MAPS for name in result.present) and (result.height, result.width) != size:
-        raise UnirenderError(f"{name}: got maps of size {(result.height, result.width)}, expected {size}")
-    return _own(result)
+    for map_name, value in result.maps.items():
+        if value.ndim != 3:
+            raise UnirenderError(
+                f"{name}: got {map_name} of shape {value.shape}, expected those of one picture, not a batch"
+            )
+        if map_name in IMAGE_MAPS and value.shape[:2] != size:
+            raise UnirenderError(f"{name}: got maps of size {value.shape[:2]}, expected {size}")
+    try:
+        return _own(result)
+    except UnirenderError as error:  # the method wrote into its arrays after it had made maps of them
+        raise UnirenderError(f"{name}: {error}") from error
 
 
 def _own(value: Any) -> Any:
@@ -233,14 +275,5 @@ def _ask(row: Row, task: Task, key: str, backbones: Sequence[str], pictures: Kee
     pictures.keep(task, row.info.key, key, prediction)
     values = score(task, prediction, backbones)
     if row.info.kind == "external":
-        values |= _facing_away(task, prediction)
+        values |= suspicions(task, prediction.image, prediction.maps)
     return record_of(task, row.info, values, key, prediction.seconds)
-
-
-def _facing_away(task: Task, prediction: Prediction) -> dict[str, float]:
-    """The share of a stranger's normals that face away, where it is nearly all of those that are scored."""
-    found, true = (None if maps is None else maps.normal for maps in (prediction.maps, task.truth_maps))
-    if found is None or true is None:
-        return {}
-    share = facing_away(found, task.mask)
-    return {FACING_AWAY: share} if share > NEARLY_ALL else {}

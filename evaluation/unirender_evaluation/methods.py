@@ -15,9 +15,10 @@ methods come in: `plugins`.
 """
 
 import hashlib
+import inspect
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -36,7 +37,6 @@ Image = Float[np.ndarray, "h w 3"]
 Mask = Float[np.ndarray, "h w 1"]
 
 
-@runtime_checkable
 class Method(Protocol):
     """A benchmark row; see the module for the four optional capabilities."""
 
@@ -46,21 +46,29 @@ class Method(Protocol):
     def config(self) -> Mapping[str, Any]: ...
 
 
-def capabilities(method: Method) -> tuple[str, ...]:
-    """Which of `decompose`, `edit`, `relight`, `render` the method has.
+def capabilities(method: Any) -> tuple[str, ...]:
+    """Which of `decompose`, `edit`, `relight`, `render` the method has. Its `config` is not read."""
+    return tuple(name for name in CAPABILITIES if callable(getattr(method, name, None)))
+
+
+def check_method(method: Any) -> None:
+    """Looks whether an object is a `Method`, without reading its name and config.
 
     Raises:
-        UnirenderError: it has none, or no name or config.
+        UnirenderError: it has none of the capabilities, or no name or config.
     """
-    found = tuple(name for name in CAPABILITIES if callable(getattr(method, name, None)))
-    absent = [f"no `{name}`" for name in ("name", "config") if not hasattr(method, name)]
-    absent += [] if found else ["none of the functions"]
-    if absent or not isinstance(method, Method):
+    absent = [f"no `{name}`" for name in ("name", "config") if not _has(method, name)]
+    absent += [] if capabilities(method) else ["none of the functions"]
+    if absent:
         raise UnirenderError(
             f"{type(method).__name__} is not a method: it has {' and '.join(absent)}; expected a `name`, a `config` "
             f"and at least one of the functions {', '.join(CAPABILITIES)}"
         )
-    return found
+
+
+def _has(method: Any, attribute: str) -> bool:
+    """Whether it is there, be it a property that fails."""
+    return inspect.getattr_static(method, attribute, None) is not None or hasattr(method, attribute)
 
 
 def quantise(image_linear: Image, mask: Mask) -> Image:

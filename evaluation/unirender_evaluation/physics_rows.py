@@ -1,12 +1,13 @@
 """Runs the physics table: which row answers which test, on how many scenes."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import SHADE_SPP, KeyOf
-from unirender_evaluation.engine import ask
+from unirender_evaluation.engine import NoAnswer, ask, decomposition
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.physics_stage import Light, Stage
@@ -87,11 +88,12 @@ def _record(stage: Stage, row: Row, key: str) -> Record:
     suite, scene = stage.suite, stage.scene
     if callable(getattr(row.method, "render", None)):
         render = partial(ask, row, "render", f"physics/{scene.key}")
-        values |= renderer_values(lambda maps: render(intrinsics=maps), stage)
+        with suppress(NoAnswer):
+            values |= renderer_values(lambda maps: render(intrinsics=maps), stage)
     if callable(getattr(row.method, "decompose", None)):
         seen = picture(suite, scene, suite.spec.base)
-        maps = ask(row, "decompose", f"physics/{scene.key}", **seen)
-        if {"albedo", "normal", "roughness", "metallic"} <= set(maps.present):
+        maps, _ = decomposition(row, seen, partial(ask, row, "decompose", f"physics/{scene.key}", **seen))
+        if maps is not None and {"albedo", "normal", "roughness", "metallic"} <= set(maps.present):
             values |= loop_values(maps, stage)
     return _made(stage, row.info, values, key)
 

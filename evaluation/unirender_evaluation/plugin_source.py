@@ -1,15 +1,18 @@
 """The files that a stranger's method is made of, by which its records are told from those of an edited one.
 
 They are the module that was named, and those that define the method's class and the classes below it; and what these
-import, by the import statements anywhere in them, from their own folder and below. The statements are read, not run:
-what counts depends neither on what else has been imported nor on what a method imports later. Of a file among the
-installed packages its own package counts, no other, and of Python's own library nothing. What is found in other ways
-belongs into a method's `config`.
+import, by the import statements anywhere in them, from their own folder and below, or from a package that is no
+installed copy: one that is installed for editing (`pip install -e`), or that the method has put on the path. The
+statements are read, not run: what counts depends neither on what else has been imported nor on what a method imports
+later. Of a file among the installed packages its own package counts, no other, and of Python's own library nothing.
+What is found in other ways belongs into a method's `config`.
 """
 
 import ast
 import hashlib
+import importlib.util
 import inspect
+import sys
 import sysconfig
 from collections.abc import Iterator
 from contextlib import suppress
@@ -29,6 +32,32 @@ def source_sha256(kind: type, *makers: Any) -> str:
         kind: the method's class.
         *makers: what was called to make it, and the module that has it.
     """
+    files, _ = _files_and_roots(kind, makers)
+    contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
+    return hashlib.sha256(b"".join(contents)).hexdigest() if contents else "unknown"
+
+
+def shadowed(kind: type, *makers: Any) -> Iterator[tuple[Path, Path]]:
+    """Files beside a method's that its import statements name, each with the file that Python imports in its place.
+
+    That is another method's, or lies earlier on the path. A name of Python's own library means Python's.
+
+    Args:
+        kind: the method's class.
+        *makers: what was called to make it, and the module that has it.
+    """
+    files, roots = _files_and_roots(kind, makers)
+    for file in sorted(file for file in files if not _is_installed(file)):
+        root, package = _root(file)
+        for name in sorted({name.partition(".")[0] for name in _names(file, package)} - sys.stdlib_module_names):
+            beside = [found for folder in (root, *roots) for found in _files_of(folder, [name])]
+            place = [] if name in OURS or not beside else _places(name)
+            if place and place[0].is_file() and place[0] not in beside:
+                yield beside[0], place[0]
+
+
+def _files_and_roots(kind: type, makers: tuple[Any, ...]) -> tuple[set[Path], set[Path]]:
+    """A method's files, and the folders in which those lie that are not installed."""
     own = {file for file in map(_file, (kind, *makers)) if file is not None}
     files = own | {file for file in map(_file, kind.__mro__) if file is not None and not _is_pythons(file)}
     roots = {_root(file)[0] for file in own if not _is_installed(file)}
@@ -37,8 +66,7 @@ def source_sha256(kind: type, *makers: Any) -> str:
         new = set(_imported(waiting.pop(), roots)) - files
         files |= new
         waiting += new
-    contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
-    return hashlib.sha256(b"".join(contents)).hexdigest() if contents else "unknown"
+    return files, roots
 
 
 def _file(defined: Any) -> Path | None:
@@ -63,8 +91,27 @@ def _imported(file: Path, roots: set[Path]) -> Iterator[Path]:
         parts = name.split(".")
         if parts[0] in OURS or (_is_installed(file) and parts[:1] != package[:1]):
             continue
-        for folder in {root} if _is_installed(file) else {root, *roots}:
+        for folder in {root} if _is_installed(file) else {root, *roots, *_edited(parts[0])}:
             yield from _files_of(folder, parts)
+
+
+def _edited(name: str) -> tuple[Path, ...]:
+    """The folder where a package or module lies that somebody may edit; none where it is installed, Python's or
+    nowhere."""
+    found = [place.parent if place.name == "__init__.py" else place for place in _places(name)]
+    return tuple(place.parent for place in found if not _is_installed(place) and not _is_pythons(place))
+
+
+def _places(name: str) -> list[Path]:
+    """The file of a module or package, or the folders of a package without one, as Python finds them; none where it
+    finds nothing."""
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return []
+    origins = [] if spec is None else [spec.origin or "", *(spec.submodule_search_locations or ())]
+    places = [Path(origin).resolve() for origin in origins if origin and Path(origin).exists()]
+    return places[:1] if places and places[0].is_file() else places
 
 
 def _names(file: Path, package: list[str]) -> Iterator[str]:

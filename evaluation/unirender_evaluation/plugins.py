@@ -24,8 +24,9 @@ from typing import Any, Union, get_args, get_origin
 from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.methods import CAPABILITIES, capabilities
-from unirender_evaluation.plugin_source import source_sha256
+from unirender_evaluation.kept_defaults import kept_defaults
+from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
+from unirender_evaluation.plugin_source import shadowed, source_sha256
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -74,15 +75,14 @@ def named_plugin(spec: str) -> Plugin:
 
     Raises:
         UnirenderError: the text has another form, there is no such file, module or name, it takes other arguments, its
-            import or construction fails, or it is not a method.
+            import or construction fails, it is not a method, or it imports another's files for its own (`shadowed`).
     """
     what = f"--method {spec}"
     target, has_arguments, query = spec.partition("?")
     place, separator, name = target.rpartition(":")
     if not (separator and place and name.isidentifier()):
         raise UsageError(f"{what}: expected {FORM}, then {ARGUMENTS} if it takes arguments")
-    is_file = place.endswith(".py") or "/" in place or "\\" in place
-    module = _module_of_file(Path(place), what) if is_file else _module_of_name(place, what)
+    module = _module_of_file(Path(place), what) if _is_file(place) else _module_of_name(place, what)
     if not hasattr(module, name):
         defined = [n for n, value in vars(module).items() if any(hasattr(value, c) for c in CAPABILITIES)]
         raise UnirenderError(
@@ -92,6 +92,17 @@ def named_plugin(spec: str) -> Plugin:
     found = getattr(module, name)
     arguments = _arguments(found, query, what) if has_arguments else {}
     return _plugin(found, what, name, module, arguments)
+
+
+def absolute(spec: str) -> str:
+    """The text of a `--method` whose file is found from any folder: a method may change the one that it runs in."""
+    target, mark, query = spec.partition("?")
+    place, separator, name = target.rpartition(":")
+    return f"{Path(place).absolute()}{separator}{name}{mark}{query}" if _is_file(place) else spec
+
+
+def _is_file(place: str) -> bool:
+    return place.endswith(".py") or "/" in place or "\\" in place
 
 
 def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
@@ -115,6 +126,16 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
             raise UsageError(f"{what}: no argument {name!r}, expected some of {', '.join(taken) or 'none'}")
         arguments[name] = _value(unquote(text), taken[name].annotation, f"{what}: {name}")
     return arguments
+
+
+def _needed(found: Any, given: Mapping[str, Any]) -> list[str]:
+    """The arguments without a default that a callable is not given."""
+    try:
+        taken = inspect.signature(found).parameters
+    except (TypeError, ValueError):  # one that says nothing of its arguments
+        return []
+    optional = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    return [n for n, p in taken.items() if p.default is p.empty and p.kind not in optional and n not in given]
 
 
 def _value(text: str, annotation: Any, what: str) -> Any:
@@ -179,7 +200,8 @@ def _search_last(folder: Path) -> None:
 def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
     """Runs foreign code; whatever it raises becomes one clear line."""
     try:
-        return run()
+        with kept_defaults():
+            return run()
     except UnirenderError as error:  # written to be read: one of ours
         raise UnirenderError(f"{what}: could not {task}: {error}") from error
     except (Exception, SystemExit) as error:
@@ -190,13 +212,25 @@ def _plugin(
     found: Any, what: str, name: str, module: ModuleType, arguments: Mapping[str, Any] = MappingProxyType({})
 ) -> Plugin:
     """The method that `found` of a module is, or that it returns when it is called."""
-    is_method = not inspect.isclass(found) and any(callable(getattr(found, can, None)) for can in CAPABILITIES)
+    is_method = not inspect.isclass(found) and bool(capabilities(found))
     as_it_is = not arguments and (is_method or not callable(found))
+    if not as_it_is and (needed := _needed(found, arguments)):
+        values = "&".join(f"{argument}=VALUE" for argument in needed)
+        raise UnirenderError(
+            f"{what}: it takes {', '.join(needed)}, expected a value of each, as in PLACE:{name}?{values}, or a "
+            "function without arguments that returns the method"
+        )
     method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
     try:
-        capabilities(method)
+        check_method(method)
     except UnirenderError as error:
         raise UnirenderError(f"{what}: {error}") from None
+    for beside, other in shadowed(type(method), found, module):
+        raise UnirenderError(
+            f"{what}: in place of {beside} Python imports {other}; rename one of them, or, where the other is another "
+            "method's, score the two in runs of their own, or, where it is a copy that is installed, install it for "
+            "editing (pip install -e)"
+        )
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
     return Plugin(method, source_sha256(type(method), found, module), made_by)

@@ -5,6 +5,7 @@ name (`Sample.answer`), as `predictions` says; `intrinsics.exr` may also have a 
 """
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import read_exr
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.engine import ask
+from unirender_evaluation.engine import answered, ask
 from unirender_evaluation.prediction_check import Question
 from unirender_evaluation.predictions import MAP_FILES, SUFFIXES, PredictionFolder
 from unirender_evaluation.public_sets import MAPS, Answer, PublicSet, Sample
@@ -41,13 +42,13 @@ def answer_files(predictions: PredictionFolder, sample: Sample) -> list[Path]:
 
 
 def asked(row: Row, sample: Sample, inputs: dict[str, Any]) -> tuple[Answer, float]:
-    """What a method says to the sample, and the seconds it took.
+    """What a method says to the sample, nothing where it returns None, and the seconds it took.
 
     Raises:
         UnirenderError: a stranger's method fails, or returns something else than was asked for.
     """
     start = time.perf_counter()
-    result = ask(row, sample.asks, f"{sample.table}/{sample.key}", **inputs)
+    result = answered(partial(ask, row, sample.asks, f"{sample.table}/{sample.key}", **inputs))
     seconds = time.perf_counter() - start
     return (Answer(maps=result) if sample.asks == "decompose" else Answer(image=result)), seconds
 

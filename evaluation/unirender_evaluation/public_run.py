@@ -29,7 +29,7 @@ from unirender_evaluation.public_sets import PublicSet, Sample
 from unirender_evaluation.public_tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
-from unirender_evaluation.run_folder import say_rows_without_values, write_missing, writing_run
+from unirender_evaluation.run_folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
@@ -63,7 +63,7 @@ class PublicRun:
         """With the LPIPS weights that are here, where the set asks for LPIPS."""
         uses = any(column.metric.name.startswith("lpips_") for spec in public.tables for column in spec.columns)
         backbones = tuple(lpips.available()) if uses else ()
-        return cls(public, tuple(rows), out, limit, backbones, versions(backbones))
+        return cls(public, tuple(rows), out.absolute(), limit, backbones, versions(backbones))
 
     def key(self, row: Row, content: str) -> str:
         """The content key of a record; it begins with the core's version, as `Store` wants it.
@@ -116,7 +116,9 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
         if row.predictions is not None
     }
     say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
-    write_missing(what.out, {label: (names, len(samples)) for label, names in missing.items()}, say)
+    counted = {label: (names, len(samples)) for label, names in missing.items()}
+    write_missing(what.out, counted)
+    say_missing(what.out, counted, say)
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     contents, computed = [], 0

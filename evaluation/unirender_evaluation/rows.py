@@ -67,7 +67,7 @@ class Row:
     pictures: int | None = None
     uses: frozenset[str] = frozenset()
     told: frozenset[str] = frozenset()
-    found: Decompositions[Intrinsics] = field(default_factory=Decompositions, compare=False, repr=False)
+    found: Decompositions[Intrinsics | None] = field(default_factory=Decompositions, compare=False, repr=False)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -119,21 +119,32 @@ def make_row(method: Any, kind: MethodKind, label: str | None = None, **options:
     """A row of a method; `options` are fields of :class:`Row` or of :class:`MethodInfo`.
 
     Raises:
-        UnirenderError: the method's name has nothing for a key, or its config is no JSON object.
+        UnirenderError: the method's name has nothing for a key, its config is no JSON object, or one of them is a
+            property that fails.
     """
     fields = {
         name: options.pop(name) for name in ("protocols", "scenes", "pictures", "uses", "told") if name in options
     }
-    if not isinstance(method.name, str) or not slug(method.name):
-        raise UnirenderError(f"{method!r}: got the name {method.name!r}, expected a string with {KEY_LETTERS}")
+    name, config = (_attribute(method, attribute) for attribute in ("name", "config"))
+    if not isinstance(name, str) or not slug(name):
+        raise UnirenderError(f"{method!r}: got the name {name!r}, expected a string with {KEY_LETTERS}")
     try:
-        config = json.loads(json.dumps(dict(method.config), allow_nan=False))
+        config = json.loads(json.dumps(dict(config), allow_nan=False))
     except (TypeError, ValueError) as error:
         raise UnirenderError(
-            f"method {method.name!r}: its config is not JSON ({error}), expected a dict of strings, numbers and lists"
+            f"method {name!r}: its config is not JSON ({error}), expected a dict of strings, numbers and lists"
         ) from None
-    info = MethodInfo(slug(method.name), label or method.name, kind, config=config, **options)
+    info = MethodInfo(slug(name), label or name, kind, config=config, **options)
     return Row(info, method, **fields)
+
+
+def _attribute(method: Any, name: str) -> Any:
+    try:
+        return getattr(method, name)
+    except Exception as error:  # of a stranger's property
+        raise UnirenderError(
+            f"{type(method).__name__}: reading its `{name}` failed: {type(error).__name__}: {error}"
+        ) from error
 
 
 def trivial_rows() -> list[Row]:

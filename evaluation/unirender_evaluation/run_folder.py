@@ -1,5 +1,5 @@
-"""What a run says beside its results: which answers a folder of predictions lacks, which plug-in has none, and why a
-file cannot be written."""
+"""What a run says beside its results: which questions a stranger's row does not answer, and why a file cannot be
+written."""
 
 import contextlib
 import errno
@@ -53,13 +53,27 @@ def missing_answers(suite: Suite, rows: Sequence[Row], scenes: list[Scene]) -> d
     }
 
 
-def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None]) -> None:
-    """Writes the questions without an answer as `missing.txt`, a line each, and says how many have one."""
+def unanswered(
+    suite: Suite, rows: Sequence[Row], scenes: list[Scene], records: Sequence[Record]
+) -> dict[str, tuple[list[str], int]]:
+    """The same of each row that is a plug-in: which questions have no value among the records."""
+    plugins = [row.info for row in rows if row.info.kind == "external" and row.predictions is None]
+    every = [task.identity for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if plugins else []
+    found = {(r.method, f"{r.table}/{r.protocol}/{r.sample}") for r in records}
+    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in plugins}
+
+
+def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]]) -> None:
+    """Writes the questions without an answer as `missing.txt`, a line each; no file where no row of a stranger runs."""
     if not missing:
         (folder / MISSING).unlink(missing_ok=True)
         return
     lines = [f"{label}: {question}\n" for label, (questions, _) in missing.items() for question in questions]
     replace_file(folder / MISSING, "".join(lines))
+
+
+def say_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None]) -> None:
+    """Says how many questions have an answer."""
     for label, (questions, asked) in missing.items():
         listed = f"; the others: {folder / MISSING}" if questions else ""
         say(f"{label}: answers {asked - len(questions)} of {asked} questions{listed}")
@@ -71,6 +85,6 @@ def say_rows_without_values(rows: Sequence[Row], records: Sequence[Record], say:
     for row in rows:
         if row.info.kind == "external" and row.predictions is None and row.info.key not in used:
             say(
-                f"{row.info.label}: is in no table, its answers had no map that is scored; expected an Intrinsics with "
-                "some of them from `decompose` (albedo, normal, roughness, metallic, environment)"
+                f"{row.info.label}: is in no table, all its answers were None or had no map that is scored; expected a "
+                "picture, or from `decompose` an Intrinsics with albedo, normal, roughness, metallic or environment"
             )

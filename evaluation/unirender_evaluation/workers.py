@@ -79,7 +79,7 @@ class Run:
         return key_of
 
 
-_here: tuple[Run, frozenset[str], Path] | None = None  # with the file that says what is under way
+_here: tuple[Run, frozenset[str], Path] | UnirenderError | None = None  # with the file that says what is under way
 
 
 def _start(
@@ -92,6 +92,7 @@ def _start(
     subsets: Subsets,
     known: frozenset[str],
     notes: Path,
+    configs: Mapping[str, Any],
 ) -> None:
     import threadpoolctl
     import torch
@@ -101,23 +102,53 @@ def _start(
     global _here
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
     set_threads(1)  # nor do renders of 64 px
-    loaded = load_suite(suite)
-    run = Run(loaded, build(), [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
+    try:
+        loaded, rows = load_suite(suite), same_rows(build(), configs)
+    except UnirenderError as error:  # is raised by the first task: a pool says nothing of what its beginning raises
+        _here = error
+        return
+    run = Run(loaded, rows, [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     threadpoolctl.threadpool_limits(1)  # nor do numpy's products, and those of what a row has imported
     _here = run, known, notes / str(os.getpid())
 
 
-def _scene(key: str) -> list[Record]:
+def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
+    """The rows as they are, if they are those of the process that asks.
+
+    Args:
+        rows: made here.
+        configs: made there, by the rows' keys.
+
+    Raises:
+        UnirenderError: a row has another configuration here, so that its records would have other keys.
+    """
+    for row in rows:
+        if row.config != configs.get(row.info.key):
+            raise UnirenderError(
+                f"method {row.info.label!r}: its config is {row.config} in a worker process, and "
+                f"{configs.get(row.info.key)} in the one that started it; expected the same whenever the method is "
+                "made: no time, process or random name in it"
+            )
+    return rows
+
+
+def _scene(key: str) -> tuple[list[Record], UnirenderError | None]:
+    """The records of a scene; where a row fails those that were made before, and how it fails."""
     assert _here is not None, "the pool's initializer sets it"
+    if isinstance(_here, UnirenderError):
+        return [], _here
     run, known, note = _here
     records = []
     for job in run.jobs(run.suite.scene(key)):
         if not job.is_done(known.__contains__):
             with suppress(OSError):  # it is a help, and no more
                 note.write_text(f"{job.label} on {key}", encoding="utf-8")
-            records.append(job.make())
+            try:
+                records.append(job.make())
+            except UnirenderError as error:
+                return records, error
     note.unlink(missing_ok=True)
-    return records
+    return records, None
 
 
 def run_in_workers(
@@ -140,12 +171,16 @@ def run_in_workers(
             run.subsets,
             known,
             notes,
+            {row.info.key: row.config for row in run.rows},
         )
         with WorkerPool(jobs, _start, *arguments) as pool:
             futures = [pool.submit(_scene, scene.key) for scene in scenes]
             try:
                 for future in as_completed(futures):
-                    yield future.result()
+                    records, error = future.result()
+                    yield records
+                    if error is not None:
+                        raise error
             except BrokenProcessPool as error:
                 said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
                 raise UnirenderError(

@@ -16,7 +16,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
-from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import ALL_VARIANTS
@@ -61,6 +61,7 @@ def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:
     [
         ("raise RuntimeError('out of memory')", r"method 'wild', render \(x\): RuntimeError: out of memory"),
         ("import sys; sys.exit(3)", r"method 'wild', render \(x\): SystemExit: 3"),
+        ("return None", r"method 'wild', render \(x\): got None, expected a picture"),
         ("return intrinsics", r"got object of shape \(\), expected finite linear radiance"),
         ("return intrinsics.albedo[..., 0]", r"expected finite linear radiance, floats of shape"),
         ("return intrinsics.albedo[:1]", r"of shape \(1, 2, 3\), expected finite linear radiance"),
@@ -97,6 +98,52 @@ def test_the_maps_of_a_stranger_have_the_size_of_the_picture_and_a_light_has_its
         engine.ask(row, "decompose", "x", mask=np.zeros((4, 4, 1), np.float32), **inputs)
 
 
+def test_maps_of_a_stranger_that_cannot_be_scored_are_named() -> None:
+    """A batch of one, as networks return it; and arrays that the method wrote into after it had made maps of them."""
+
+    class Net:
+        name, config = "net", MappingProxyType({})
+        maps: Intrinsics
+
+        def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+            return self.maps
+
+    net = Net()
+    row, inputs = make_row(net, "external"), {"image_srgb": np.ones((4, 4, 3), np.float32), "camera": Camera()}
+    mask, albedo = np.ones((4, 4, 1), np.float32), np.ones((4, 4, 3), np.float32)
+    net.maps = Intrinsics(albedo=albedo[None])
+    with pytest.raises(
+        UnirenderError, match=r"decompose \(x\): got albedo of shape \(1, 4, 4, 3\), expected .* not a batch"
+    ):
+        engine.ask(row, "decompose", "x", mask=mask, **inputs)
+    net.maps = Intrinsics(albedo=albedo)
+    albedo[0] = np.nan
+    with pytest.raises(UnirenderError, match=r"method 'net', decompose \(x\): albedo: 12 of 48 values are NaN"):
+        engine.ask(row, "decompose", "x", mask=mask, **inputs)
+
+
+def test_a_run_is_the_same_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger's method may change it."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine").mkdir()
+    named = BenchConfig(
+        suite="ball.toml",
+        out=Path("run"),
+        checkpoint=Path("mine"),
+        method=("guess.py:Guess?folder=mine", "package:Guess"),
+        predictions={"mine": Path("mine")},
+    )
+    config = anywhere(named)
+    assert (config.suite, config.out, config.checkpoint) == (
+        str(tmp_path / "ball.toml"),
+        tmp_path / "run",
+        tmp_path / "mine",
+    )
+    assert config.method == (f"{tmp_path / 'guess.py'}:Guess?folder=mine", "package:Guess")
+    assert config.predictions == {"mine": tmp_path / "mine"}
+    assert anywhere(BenchConfig(checkpoint=Path("tiny"))).checkpoint == Path("tiny"), "one that ships"
+
+
 def test_nothing_runs_before_all_predictions_are_sound(suite: Suite, tmp_path: Path) -> None:
     task = next(tasks(suite, "rendering", "given", list(suite.scenes)))
     for name in ("good", "bad"):
@@ -116,6 +163,7 @@ def test_nothing_runs_before_all_predictions_are_sound(suite: Suite, tmp_path: P
 
 
 GUESS = """
+import os
 import numpy as np
 from unirender import Intrinsics
 
@@ -123,6 +171,9 @@ from unirender import Intrinsics
 class Guess:
     name = "guess"
     config = {}
+
+    def __init__(self):
+        os.chdir("/")
 
     def decompose(self, image_srgb, mask, camera):
         grey = np.full_like(image_srgb, 0.5) * mask
@@ -134,17 +185,20 @@ class Guess:
 
 
 @pytest.mark.long
-def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two scenes of the shipped suite, no row of ours, a stranger's; Mitsuba's truth check; the second run computes
-    nothing."""
+def test_run_end_to_end_and_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two scenes of the shipped suite, no row of ours, a stranger's, which leaves the folder; Mitsuba's truth check;
+    the second run computes nothing."""
     (tmp_path / "guess.py").write_text(GUESS)
+    monkeypatch.chdir(tmp_path)
     out = tmp_path / "run"
     tiny = load_suite("tiny")
     scenes = scene_ids(tiny, 2)
     config = BenchConfig(
-        out=out,
+        out=Path("run"),
         methods=("trivial",),
-        method=(f"{tmp_path / 'guess.py'}:Guess",),
+        method=("guess.py:Guess",),
         limit=2,
         check_scenes=1,
         check_seed=next(seed for seed in range(1000) if chosen_scenes(tiny, 1, seed)[0] in scenes),
@@ -171,6 +225,7 @@ def test_run_end_to_end_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[
     with (out / "records.csv").open(newline="") as file:
         lines = [(row["method"], row["sample"], row["metric"], float(row["value"])) for row in csv.DictReader(file)]
     assert lines == [(r.method, r.sample, *item) for r in first.records for item in sorted(r.values.items())]
+    monkeypatch.chdir(tmp_path)
     second = run(replace(config, variants=ALL_VARIANTS), Console())
     assert f"check seed {first.truth_check['seed']}" in " ".join(capsys.readouterr().out.split())
     assert second.computed == 0

@@ -19,6 +19,7 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
+from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
@@ -28,7 +29,7 @@ from unirender_evaluation.benchmark import _work
 from unirender_evaluation.dry_run import planned
 from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
-from unirender_evaluation.methods import Composite, UneditedInput
+from unirender_evaluation.methods import Composite, InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.protocol import doubts, mask_source
@@ -420,6 +421,40 @@ def test_what_is_probably_a_mistake_is_noted(suite: Suite, tmp_path: Path) -> No
     mask, normals = doubts("turned", records)
     assert re.search(r"misses the object on \d+ of \d+ pictures", mask)
     assert f"normals face away from the viewer on {n} of {n} pictures (OpenCV axes? normal_axes" in normals
+
+
+class Encoded(Guess):
+    """Answers that are right, but display values, and with y down."""
+
+    name = "encoded"
+
+    def __init__(self, suite: Suite) -> None:
+        self.suite = suite
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+        true = self.suite.intrinsics(self.suite.scenes[0], self.suite.spec.base).require("albedo", "normal")
+        down = true["normal"] * np.array([1, -1, 1], np.float32)
+        return Intrinsics(albedo=srgb_encode(true["albedo"]), normal=down, camera=camera)
+
+    def edit(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **change: float) -> np.ndarray:
+        metallic, roughness = self.suite.spec.base
+        material = change.get("metallic", metallic), change.get("roughness", roughness)
+        true = self.suite.image(self.suite.scenes[0], material)
+        return srgb_encode(np.clip(unpremultiply(true, mask), 0, 1)) * mask
+
+
+def test_other_conventions_that_only_the_score_tells_are_noted(suite: Suite, tmp_path: Path) -> None:
+    """And those of a sound answer, however bad, are not."""
+    sound = [InputAsAlbedo(), MeanAlbedo(), MeanNormal(), SphereNormal(), UneditedInput()]
+    rows = [make_row(method, "external") for method in (Encoded(suite), *sound)]
+    pictures = Pictures(tmp_path, suite, [])
+    records = [job.make() for job in method_jobs(suite, rows, [], suite.scenes[0], TEST_VERSIONS, (), pictures)]
+    turned, encoded = doubts("encoded", records)
+    n = len(suite.scenes[0].materials)
+    assert f"another sign of x or y on {n} of {n} pictures" in turned
+    found = f"albedo ({n} of {n} pictures), another metallic (1 of 1 pictures), another roughness (2 of 2 pictures)"
+    assert f"taken for display values these of its answers are nearer to the truth: {found}" in encoded
+    assert [note for row in rows[1:] for note in doubts(row.info.key, records)] == []
 
 
 def test_maps_are_scored_with_the_mask_that_they_bring_and_pictures_with_the_true_one(

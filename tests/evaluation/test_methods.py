@@ -14,12 +14,16 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import methods
 from unirender_evaluation.claims import SHADOWED
-from unirender_evaluation.engine import Prediction, answer, score
+from unirender_evaluation.engine import Prediction, answer, method_jobs, score
+from unirender_evaluation.physics_rows import _record
+from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.training_statistics import training_statistics
+from unirender_evaluation.versions import LPIPS, Versions
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +155,48 @@ def test_capabilities_are_checked() -> None:
         config: dict[str, Any] = {}  # noqa: RUF012 - a constant of the test
 
     with pytest.raises(UnirenderError, match="is not a method"):
-        methods.capabilities(Empty())
+        methods.check_method(Empty())
+
+
+class Careless:
+    """A stranger's method whose properties fail, or are slow: what they say is read once, and a failure named."""
+
+    def __init__(self, **raised: Exception) -> None:
+        self.raised, self.read = raised, 0
+
+    @property
+    def name(self) -> str:
+        return self._said("name", "careless")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        self.read += 1
+        return self._said("config", {})
+
+    def _said(self, attribute: str, value: Any) -> Any:
+        if attribute in self.raised:
+            raise self.raised[attribute]
+        return value
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> None:
+        return None
+
+
+@pytest.mark.parametrize("attribute", ["name", "config"])
+@pytest.mark.parametrize("error", [RuntimeError("no weights"), AttributeError("no attribute 'weights'")])
+def test_a_property_that_fails_is_named(attribute: str, error: Exception) -> None:
+    method = Careless(**{attribute: error})
+    methods.check_method(method)  # it is there
+    with pytest.raises(UnirenderError, match=f"Careless: reading its `{attribute}` failed: {type(error).__name__}: no"):
+        make_row(method, "external")
+
+
+def test_a_config_is_read_once(suite: Suite) -> None:
+    """It may take the sha256 of weights."""
+    method, scenes = Careless(), list(suite.scenes)
+    row = make_row(method, "external")
+    assert any(row.answers(task, scenes) for what in PROTOCOLS for task in tasks(suite, *what, scenes))
+    assert method.read == 1
 
 
 def test_rows_are_unique_and_named() -> None:
@@ -186,6 +231,42 @@ def test_predictions_folder_is_needed(tmp_path: Path) -> None:
         PredictionFolder(tmp_path)
     with pytest.raises(UnirenderError, match="nowhere: no such folder"):
         PredictionFolder(tmp_path / "nowhere")
+
+
+class Silent(Careless):
+    """Has no answer to any question, and counts them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = 0
+
+    def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> None:
+        self.asked += 1
+
+    def edit(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **_: Any) -> None:
+        return None
+
+    relight = edit
+
+    def render(self, intrinsics: Intrinsics) -> None:
+        return None
+
+
+def test_none_is_no_answer(suite: Suite, tmp_path: Path) -> None:
+    """To any question: a record without values, and no picture in the report."""
+    method, scenes = Silent(), [suite.scenes[0]]
+    row = make_row(method, "external")
+    pictures = Pictures(tmp_path, suite, scenes)
+    jobs = list(method_jobs(suite, [row], scenes, scenes[0], Versions("test", {LPIPS: "1"}), (), pictures))
+    records = [job.make() for job in jobs]
+    assert {(record.table, record.protocol) for record in records} == set(PROTOCOLS)
+    assert not any(record.values for record in records)
+    shown = {task.inputs["decompose"]["image_srgb"].tobytes() for what in PROTOCOLS
+             for task in tasks(suite, *what, scenes) if "decompose" in task.asks}  # fmt: skip
+    assert method.asked == len(shown)
+    physics = _record(Stage(suite, scenes[0]), row, "key")
+    assert not physics.values
+    assert method.asked == len(shown)
 
 
 class Patient:

@@ -6,9 +6,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation import engine
 from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
@@ -64,6 +67,11 @@ class Level:
 
     def render(self, intrinsics):
         return self.level * intrinsics.albedo * intrinsics.mask
+
+
+class Loaded(Grey):
+    def __init__(self, weights, steps=4, **more):
+        self.weights = weights
 
 
 instance = Grey()
@@ -173,6 +181,62 @@ def test_an_edited_neighbour_is_another_configuration(
     assert source_sha256(kind, kind) != before
 
 
+def test_an_edited_package_elsewhere_is_another_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that the method puts on the path, as one installed for editing is, and what it imports; nothing beside it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    package = tmp_path / "src" / "my_edited_package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("from .net import Net")
+    (package / "net.py").write_text("class Net: ...")
+    (package / "other.py").write_text("")
+    file = tmp_path / "adapter" / "mine.py"
+    file.parent.mkdir()
+    file.write_text(
+        f"import sys\nsys.path.append({str(package.parent)!r})\nfrom my_edited_package import Net\n"
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): ..."
+    )
+    before = named_plugin(f"{file}:Mine").source
+    (package / "other.py").write_text("# edited")
+    assert named_plugin(f"{file}:Mine").source == before
+    (package / "net.py").write_text("class Net: ...  # edited")
+    assert named_plugin(f"{file}:Mine").source != before
+
+
+def test_neighbours_of_one_name_are_not_mistaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two copies of a method, each with its own net: Python would give the second the first one's."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for level, copy in enumerate(("one", "two")):
+        (tmp_path / copy).mkdir()
+        (tmp_path / copy / "copy.py").write_text("")  # named as one of Python's, which is meant
+        (tmp_path / copy / "my_shadowed_net.py").write_text(f"LEVEL = {level}")
+        (tmp_path / copy / "mine.py").write_text(
+            "import copy\nfrom my_shadowed_net import LEVEL\n"
+            f"class Mine:\n    name, config = '{copy}', {{}}\n    def render(self, intrinsics): ..."
+        )
+    named_plugin(f"{tmp_path}/one/mine.py:Mine")
+    said = r"in place of .*/two/my_shadowed_net\.py Python imports .*/one/my_shadowed_net\.py; rename"
+    with pytest.raises(UnirenderError, match=said):
+        named_plugin(f"{tmp_path}/two/mine.py:Mine")
+
+
+def test_what_a_method_sets_for_the_whole_process_is_put_back(tmp_path: Path) -> None:
+    """Else LPIPS, and our own rows, would run in float64 or elsewhere."""
+    import torch
+
+    file = tmp_path / "setting.py"
+    file.write_text(
+        "import numpy as np\nimport torch\ntorch.set_default_dtype(torch.float64)\nnp.seterr(all='raise')\n"
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics):\n"
+        "        torch.set_default_device('meta')\n        return np.zeros((2, 2, 3))"
+    )
+    before, errors = (torch.get_default_dtype(), torch.get_default_device()), np.geterr()
+    (row,) = plugin_rows([named_plugin(f"{file}:Mine")])
+    assert torch.get_default_dtype() == before[0]
+    engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+    assert (torch.get_default_dtype(), torch.get_default_device()) == before
+    assert np.geterr() == errors
+
+
 def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else another patch version of Python would be another method."""
     bodies = {"plain_mine": "class Mine:\n", "abstract_mine": "from abc import ABC\nclass Mine(ABC):\n"}
@@ -221,6 +285,10 @@ def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
         ("{folder}/absent.py:Grey", "no file .*absent.py, expected module:Class or path/to/file.py:Class"),
         ("{folder}/my_method.py:Gray", "has no 'Gray'; of what it has, Grey, .* has one of decompose"),
         ("{folder}/my_method.py:Empty", "is not a method"),
+        (
+            "{folder}/my_method.py:Loaded",
+            "it takes weights, expected a value of each, as in .*Loaded.weights=VALUE",
+        ),
         ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
         ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),
         ("{folder}/imports.py:Grey", "could not import it: ModuleNotFoundError: No module named 'no_such_package'"),

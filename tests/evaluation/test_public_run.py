@@ -111,6 +111,28 @@ def test_every_module_that_measures_is_in_the_keys(public: type) -> None:
     assert set(re.findall(r"unirender_evaluation(?:\.| import )(public_\w+)", text)) <= named
 
 
+class Silent:
+    """Has no answer."""
+
+    name = "silent"
+    config: dict[str, float] = {}  # noqa: RUF012 - as a stranger writes it
+
+    def decompose(self, image_srgb, mask, camera):
+        return None
+
+    def relight(self, image_srgb, mask, camera, environment=None, specular=None, diffuse=None):
+        return None
+
+
+def test_none_is_no_answer(tmp_path: Path) -> None:
+    """It is asked all that it is there for, and stands in no table."""
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32, 60.0)
+    result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp)]), tmp_path / "out")
+    assert {record.method for record in result.records} == {"ramp"}
+    asked = [record.method for record in read_records(tmp_path / "out" / "records.jsonl")]
+    assert asked.count("silent") == asked.count("ramp") > 0
+
+
 def test_a_table_that_nothing_can_be_asked_for_is_explained(tmp_path: Path) -> None:
     """The relighting of Stanford-ORB, where no photograph is from nearly the other's camera."""
     folder = make_orb(tmp_path / "orb")

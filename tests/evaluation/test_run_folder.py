@@ -11,7 +11,15 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.methods import UneditedInput
 from unirender_evaluation.records import Record, append_record, write_records
 from unirender_evaluation.rows import make_row, prediction_rows
-from unirender_evaluation.run_folder import missing_answers, say_rows_without_values, write_missing, writing_run
+from unirender_evaluation.run_folder import (
+    missing_answers,
+    say_missing,
+    say_rows_without_values,
+    unanswered,
+    write_missing,
+    writing_run,
+)
+from unirender_evaluation.tasks import tasks
 
 
 def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
@@ -27,13 +35,29 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     assert missing.keys() == {"mine"}
     assert len(questions) == asked - 2
     said: list[str] = []
-    write_missing(tmp_path, missing, said.append)
+    write_missing(tmp_path, missing)
+    say_missing(tmp_path, missing, said.append)
     assert said == [f"mine: answers 2 of {asked} questions; the others: {tmp_path / 'missing.txt'}"]
     lines = (tmp_path / "missing.txt").read_text().splitlines()
     assert lines == [f"mine: {question}" for question in questions]
     assert not any("m100_r050" in line for line in lines if line.startswith("mine: rendering/from-image/"))
-    write_missing(tmp_path, {}, said.append)
+    write_missing(tmp_path, {})
     assert not (tmp_path / "missing.txt").exists(), "that of an earlier run says nothing of this one"
+
+
+def test_what_a_plugin_does_not_answer_is_counted_too(tmp_path: Path) -> None:
+    """It returned None, or nothing that is scored."""
+    suite = make_suite(tmp_path / "suite", objects=1)
+    scenes = [suite.scenes[0]]
+    edit, other = list(tasks(suite, "rendering", "from-image", scenes))[:2]
+    rows = [make_row(UneditedInput(), "trivial"), make_row(UneditedInput(), "external", "mine")]
+    record = Record(edit.table, edit.protocol, rows[1].info.key, edit.sample, "o", {"x": 1.0})
+    missing = unanswered(suite, rows, scenes, [record])
+    questions, asked = missing["mine"]
+    assert len(questions) == asked - 1
+    assert edit.identity not in questions
+    assert other.identity in questions
+    assert unanswered(suite, rows[:1], scenes, [record]) == {}
 
 
 def test_a_plugin_that_stands_in_no_table_is_named() -> None:

@@ -8,17 +8,26 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 from PIL import Image
 from tiny_suites import write_suite
 
+from unirender.camera import Camera
+from unirender.errors import UnirenderError
+from unirender_evaluation import workers
 from unirender_evaluation.figures import Grid, Line, Tile, save
+from unirender_evaluation.methods import UneditedInput
 from unirender_evaluation.pictures import write_sheet
+from unirender_evaluation.rows import make_row
+from unirender_evaluation.suites import load_suite
+from unirender_evaluation.versions import LPIPS, Versions
+from unirender_evaluation.workers import Run
 
 SECONDS = 120  # to start a worker, and to see it end: a busy machine takes its time
 
@@ -71,6 +80,43 @@ if __name__ == "__main__":
         waiting = [pool.submit(hold) for _ in range(3)]
         waiting[0].result()
 """
+
+
+class Failing:
+    """Fails on the second question that it is asked."""
+
+    name = "failing"
+    config: Mapping[str, int] = MappingProxyType({"at": 2})
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def edit(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, **_: float) -> np.ndarray:
+        self.asked += 1
+        if self.asked == 2:
+            raise RuntimeError("out of memory")
+        return image_srgb * mask
+
+
+def test_what_was_made_before_a_method_fails_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    suite = load_suite(write_suite(tmp_path / "suite"))
+    scene = suite.scenes[0]
+    rows = [make_row(UneditedInput(), "trivial"), make_row(Failing(), "external")]
+    run = Run(suite, rows, [scene], Versions("test", {LPIPS: "1"}), (), tmp_path / "pictures")
+    monkeypatch.setattr(workers, "_here", (run, frozenset(), tmp_path / "note"))
+    records, error = workers._scene(scene.key)
+    assert [record.method for record in records] == ["unedited-input", "failing", "unedited-input"]
+    assert "method 'failing', edit (rendering/from-image/" in str(error)
+    assert "RuntimeError: out of memory" in str(error)
+
+
+def test_rows_are_the_same_in_every_process() -> None:
+    """A config with a time or a random name in it has other content keys in each."""
+    row = make_row(Failing(), "external")
+    assert workers.same_rows([row], {"failing": {"at": 2}}) == [row]
+    said = r"method 'failing': its config is {'at': 2} in a worker process, and {'at': 3} in the one that started it"
+    with pytest.raises(UnirenderError, match=said):
+        workers.same_rows([row], {"failing": {"at": 3}})
 
 
 def locked(path: Path) -> bool:
