@@ -122,6 +122,20 @@ def test_area_resampling_keeps_energy_and_directions():
         assert found[:, :2] == pytest.approx(np.array([[1.5, 1.0], [1.0, 1.5]]), abs=0.01)
 
 
+@pytest.mark.parametrize("size", [(8, 16), (64, 128), (50, 100), (128, 256), (300, 600)])
+def test_area_resampling_keeps_the_energy_of_a_sun_in_any_row(size):
+    """One pixel of the first or last row lost up to 2.5 %."""
+    height, width = size
+    theta = np.arange(height + 1) * np.pi / height
+    solid_angles = -np.diff(np.cos(theta)) * 2 * np.pi / width
+    assert np.abs(area_resampled(np.ones((*size, 3), np.float32), (64, 128)) - 1).max() < 1e-6
+    for row, column in ((0, 0), (1, width // 3), (height // 2, width - 1), (height - 1, 5)):
+        sun = np.zeros((*size, 3), np.float32)
+        sun[row, column] = 1e3
+        expected = 1e3 * solid_angles[row] / (4 * np.pi)
+        assert mean_radiance(area_resampled(sun, (64, 128))) == pytest.approx(expected, rel=1e-5)
+
+
 def test_the_smallest_map_can_be_rendered_by(tmp_path):
     """A map of 2 x 4 pixels was brought to two rows, and every renderer refused it."""
     pixels = np.zeros((2, 4, 3), np.float32)
