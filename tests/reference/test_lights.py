@@ -226,7 +226,7 @@ def test_a_radiance_header_says_what_its_colours_are(tmp_path, primaries, radian
     pink = white.replace(bytes([128, 128, 128, 129]), bytes([128, 96, 96, 129]))
     for data, expected in ((white, (1, 1, 1)), (pink, radiance)):
         found = lights.load_light(bad_file(tmp_path, "map.hdr", data), normalise=False).environment
-        np.testing.assert_allclose(found, np.broadcast_to(np.float32(expected), found.shape), atol=1e-3)
+        np.testing.assert_allclose(found, np.broadcast_to(np.array(expected, np.float32), found.shape), atol=1e-3)
 
 
 def test_radiance_files_of_xyz_are_refused(tmp_path):
