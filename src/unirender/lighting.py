@@ -171,7 +171,7 @@ def resample_environment(
     check_map(environment)
     check_shape(shape)
     height, width = environment.shape[:2]
-    return _mixed(environment, *resampling_operators((height, width), tuple(shape)))
+    return _mixed(environment, *resampling_operators((height, width), tuple(shape)), shape)
 
 
 def area_pixels(environment: Float[np.ndarray, "h w 3"], finer: int) -> Float[np.ndarray, "h2 w2 3"]:
@@ -181,20 +181,20 @@ def area_pixels(environment: Float[np.ndarray, "h w 3"], finer: int) -> Float[np
     """
     check_map(environment)
     height, width = environment.shape[:2]
-    count = AREA_POINTS * finer * height
+    shape = finer * height, finer * width
+    count = AREA_POINTS * shape[0]
     theta = (np.arange(count) + 0.5) * np.pi / count
-    pixels = hat_weights(np.arange(count) // AREA_POINTS * 1.0, finer * height)  # each point lies in one
+    pixels = hat_weights(np.arange(count) // AREA_POINTS * 1.0, shape[0])  # each point lies in one
     rows = weighted_means(pixels, np.sin(theta)) @ hat_weights(theta * (height - 1) / np.pi, height)
-    columns = hat_weights((np.arange(finer * width) + 0.5) / finer - 0.5, width, wrap=True)
-    return _mixed(environment, rows, columns)
+    columns = hat_weights((np.arange(shape[1]) + 0.5) / finer - 0.5, width, wrap=True)
+    return _mixed(environment, rows, columns, shape)
 
 
 def _mixed(
-    environment: Float[np.ndarray, "h w 3"], rows: "csr_array", columns: "csr_array"
+    environment: Float[np.ndarray, "h w 3"], rows: "csr_array", columns: "csr_array", shape: tuple[int, int]
 ) -> Float[np.ndarray, "h2 w2 3"]:
-    """`rows @ environment @ columns.T` for each channel."""
+    """`rows @ environment @ columns.T` for each channel, which has that shape."""
     height, width = environment.shape[:2]
-    shape = rows.shape[0], columns.shape[0]
     mixed = (rows @ environment.reshape(height, -1)).reshape(shape[0], width, 3).transpose(1, 0, 2)
     new = (columns @ mixed.reshape(width, -1)).reshape(shape[1], shape[0], 3).transpose(1, 0, 2)
     return np.ascontiguousarray(new, dtype=np.float32)
