@@ -56,7 +56,8 @@ def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"
     theta = np.pi * np.arange(height) / max(height - 1, 1)
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    x, y, z = np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)
+    sine = np.abs(np.sin(theta))  # rounding makes that of the last row negative for some heights
+    x, y, z = sine * np.sin(phi), np.cos(theta), -sine * np.cos(phi)
     return np.stack([x, y, z], axis=-1).astype(np.float32)
 
 
