@@ -146,6 +146,6 @@ def _maps(intrinsics: Intrinsics, *names: str) -> dict[str, np.ndarray]:
     if missing:
         raise UnirenderError(
             f"composite: maps {', '.join(missing)} are missing, expected {', '.join(names[:-1])} and {names[-1]}; "
-            "derive specular and diffuse from an environment with unirender.lighting"
+            "derive specular and diffuse from an environment with unirender.surface_light"
         )
     return maps

@@ -1,4 +1,4 @@
-"""OpenEXR files whose header states other primaries than Rec.709: their colours brought to it."""
+"""Files whose header states other primaries than Rec.709 (OpenEXR, Radiance): their colours brought to it."""
 
 from collections.abc import Mapping, Sequence
 

@@ -122,6 +122,20 @@ def test_area_resampling_keeps_energy_and_directions():
         assert found[:, :2] == pytest.approx(np.array([[1.5, 1.0], [1.0, 1.5]]), abs=0.01)
 
 
+@pytest.mark.parametrize("size", [(8, 16), (64, 128), (50, 100), (128, 256), (300, 600)])
+def test_area_resampling_keeps_the_energy_of_a_sun_in_any_row(size):
+    """One pixel of the first or last row lost up to 2.5 %."""
+    height, width = size
+    theta = np.arange(height + 1) * np.pi / height
+    solid_angles = -np.diff(np.cos(theta)) * 2 * np.pi / width
+    assert np.abs(area_resampled(np.ones((*size, 3), np.float32), (64, 128)) - 1).max() < 1e-6
+    for row, column in ((0, 0), (1, width // 3), (height // 2, width - 1), (height - 1, 5)):
+        sun = np.zeros((*size, 3), np.float32)
+        sun[row, column] = 1e3
+        expected = 1e3 * solid_angles[row] / (4 * np.pi)
+        assert mean_radiance(area_resampled(sun, (64, 128))) == pytest.approx(expected, rel=1e-5)
+
+
 def test_the_smallest_map_can_be_rendered_by(tmp_path):
     """A map of 2 x 4 pixels was brought to two rows, and every renderer refused it."""
     pixels = np.zeros((2, 4, 3), np.float32)
@@ -186,10 +200,39 @@ def test_radiance_files_in_another_order_of_pixels_are_refused_with_the_reason(t
         lights.load_light(path)
 
 
-@pytest.mark.parametrize("line", [b"EXPOSURE=0", b"EXPOSURE=", b"EXPOSURE=nan", b"COLORCORR=1 1", b"COLORCORR=1 -1 1"])
+@pytest.mark.parametrize(
+    "line", [b"EXPOSURE=0", b"EXPOSURE=", b"EXPOSURE=nan", b"COLORCORR=1 1", b"COLORCORR=1 -1 1", b"PRIMARIES=1 2"]
+)
 def test_a_radiance_header_that_makes_no_sense_is_refused(tmp_path, line):
     path = bad_file(tmp_path, "map.hdr", RADIANCE % (line + b"\n"))
-    with pytest.raises(UnirenderError, match=r"map\.hdr: its header has '(EXPOSURE|COLORCORR)=.*above 0"):
+    with pytest.raises(UnirenderError, match=r"map\.hdr: its header has '(EXPOSURE|COLORCORR|PRIMARIES)=.*, expected "):
+        lights.load_light(path)
+
+
+PRIMARIES = b"PRIMARIES=%b\n"
+
+
+@pytest.mark.parametrize(
+    ("primaries", "radiance"),
+    [
+        (b"0.708 0.292 0.17 0.797 0.131 0.046 0.3127 0.329", (1.165, 0.719, 0.745)),  # by the matrix of ITU-R BT.2087
+        (b"0.640 0.330 0.300 0.600 0.150 0.060 0.3127 0.3290", (1, 0.75, 0.75)),
+        (b"0 0 0 0 0 0 0 0", (1, 0.75, 0.75)),  # as Photoshop writes it
+    ],
+)
+def test_a_radiance_header_says_what_its_colours_are(tmp_path, primaries, radiance):
+    """They were taken for those of Rec.709."""
+    white = RADIANCE % (PRIMARIES % primaries)
+    pink = white.replace(bytes([128, 128, 128, 129]), bytes([128, 96, 96, 129]))
+    for data, expected in ((white, (1, 1, 1)), (pink, radiance)):
+        found = lights.load_light(bad_file(tmp_path, "map.hdr", data), normalise=False).environment
+        np.testing.assert_allclose(found, np.broadcast_to(np.array(expected, np.float32), found.shape), atol=1e-3)
+
+
+def test_radiance_files_of_xyz_are_refused(tmp_path):
+    """Mitsuba made a neutral light pink."""
+    path = bad_file(tmp_path, "map.hdr", (RADIANCE % b"").replace(b"rle_rgbe", b"rle_xyze"))
+    with pytest.raises(UnirenderError, match="got 32-bit_rle_xyze, expected RGB"):
         lights.load_light(path)
 
 

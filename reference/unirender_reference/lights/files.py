@@ -14,7 +14,7 @@ A lat-long LDR panorama (`photograph=False`) gets step 1 only.
 **Lat-long maps.** The pixels of a map are areas: its first row ends at the pole, and it is resampled to the contract's
 grid, whose first row lies on it. An EXR that unirender wrote is on that grid already (`unirender.exr.on_pole_grid`) and
 taken as it is. Pixels of a Radiance file are divided by what its header says they were multiplied by (`EXPOSURE`,
-`COLORCORR`).
+`COLORCORR`), and their colours brought to Rec.709 where it states other `PRIMARIES`.
 """
 
 import math
@@ -28,9 +28,10 @@ from PIL import Image
 from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, on_pole_grid, read_exr
+from unirender.exr import channels_rgb, image_channels, on_pole_grid, read_exr
 from unirender.lighting import LEAST_ROWS, check_shape, resample_environment
 from unirender.pictures import check_finite, negative_share
+from unirender.primaries import REC709, in_rec709
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import Light, area_resampled, mean_luminance
 
@@ -40,6 +41,12 @@ WINDOW_DEG, FADE_DEG = 45.0, 30.0
 MOST_HEADER_BYTES = 2**16  # of a Radiance file
 # Pixels in another order than by rows from the top left, which alone Mitsuba reads.
 RGBE_TURNED = re.compile(rb"#\?.*?\n\n(?!-Y \d+ \+X )([-+][XY] \d+ [-+][XY] \d+)\s*\n", re.DOTALL)
+XYZE = "32-bit_rle_xyze"  # Mitsuba takes its white for one of D65, which Radiance's is not
+HEADER_NUMBERS = {  # of a Radiance file: how many, and what
+    "EXPOSURE": (1, "a number above 0"),
+    "COLORCORR": (3, "three numbers above 0"),
+    "PRIMARIES": (8, "x, y of red, green, blue and white"),
+}
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
 
@@ -172,29 +179,35 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]
         raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
-    return (np.array(bitmap) / _multiplied(path)).astype(np.float32), {}
+    return _as_its_header_says(np.array(bitmap), path), {}
 
 
-def _multiplied(path: Path) -> Float[np.ndarray, "3"]:
-    """What the pixels of a Radiance file were multiplied by: all its `EXPOSURE` and `COLORCORR` lines; else 1."""
-    factor = np.ones(3)
+def _as_its_header_says(pixels: Float[np.ndarray, "h w 3"], path: Path) -> Float[np.ndarray, "h w 3"]:
+    """Radiance in Rec.709 from the pixels of a Radiance file; those of any other file as they are."""
+    factor, primaries = np.ones(3), REC709
     with path.open("rb") as file:
         header = file.read(MOST_HEADER_BYTES)
-    if not header.startswith(b"#?"):
-        return factor
-    for line in header.split(b"\n\n", 1)[0].decode(errors="replace").split("\n"):
+    lines = header.split(b"\n\n", 1)[0].decode(errors="replace").split("\n") if header.startswith(b"#?") else []
+    for line in lines:
         name, _, text = line.partition("=")
         name = name.rstrip()  # indented lines belong to the pictures that this one was made of
-        if name not in ("EXPOSURE", "COLORCORR"):
+        if name == "FORMAT" and text.strip() == XYZE:
+            raise UnirenderError(f"light {path}: got {XYZE}, expected RGB; convert the file (Radiance: ra_xyze -r)")
+        if name not in HEADER_NUMBERS:
             continue
+        count, expected = HEADER_NUMBERS[name]
         try:
             values = [float(word) for word in text.split()]
         except ValueError:
             values = []
-        if len(values) != (1 if name == "EXPOSURE" else 3) or not all(0 < value < math.inf for value in values):
-            expected = "a number" if name == "EXPOSURE" else "three numbers"
+        least = -math.inf if name == "PRIMARIES" else 0
+        if len(values) != count or not all(least < value < math.inf for value in values):
             raise UnirenderError(
-                f"light {path}: its header has {line[:60]!r}, expected {expected} above 0; write the file again"
+                f"light {path}: its header has {line[:60]!r}, expected {expected}; write the file again"
             )
-        factor *= values
-    return factor
+        if name != "PRIMARIES":
+            factor *= values
+        elif any(values):  # Photoshop writes zeros
+            primaries = values
+    channels = image_channels((pixels / factor).astype(np.float32))
+    return channels_rgb(in_rec709(channels, primaries, ("",), f"light {path}"))

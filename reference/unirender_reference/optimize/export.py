@@ -14,13 +14,14 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.exr import channels_rgb, image_channels, read_exr, write_environment, write_exr
-from unirender.lighting import drawable, sample_environment
+from unirender.lighting import area_pixels, drawable
 from unirender_reference.optimize.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject, Sphere
 
 MESH_FILE, ENVIRONMENT_FILE, LATLONG_FILE = "mesh.glb", "environment.exr", "latlong.exr"
 SOLUTION_FILE, MITSUBA_FOLDER = "solution.json", "mitsuba"
+FINER = 4  # rows and columns of `LATLONG_FILE` beside those of the light
 
 
 def write_solution(solution: Solution, folder: Path, place: Sphere | None = None) -> None:
@@ -33,18 +34,8 @@ def write_solution(solution: Solution, folder: Path, place: Sphere | None = None
     """
     (folder / MESH_FILE).write_bytes(glb_bytes(solution.obj, place))
     write_environment(folder / ENVIRONMENT_FILE, solution.environment, {"object": solution.obj.name})
-    write_exr(folder / LATLONG_FILE, image_channels(latlong(solution.environment)), half=False)
+    write_exr(folder / LATLONG_FILE, image_channels(area_pixels(solution.environment, FINER)), half=False)
     _write_mitsuba(solution, folder / MITSUBA_FOLDER)
-
-
-def latlong(environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The light as most programs read a map: rows are areas between the poles. Four times as fine, bilinear."""
-    height, width = 4 * environment.shape[0], 4 * environment.shape[1]
-    theta = np.pi * (np.arange(height) + 0.5) / height
-    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    directions = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
-    return sample_environment(environment, directions.astype(np.float32))
 
 
 def read_environment(folder: Path) -> Float[np.ndarray, "eh ew 3"]:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
 from unirender.files import write_png
-from unirender.lighting import drawable, sample_environment
+from unirender.lighting import area_pixels, drawable
 from unirender.scene_export.card import Card
 
 FAR_CLIP = 1e4  # Mitsuba's own
@@ -27,7 +27,8 @@ def write_mitsuba(card: Card, folder: Path) -> None:
         write_png(folder / f"{name}.png", values)
     (folder / "card.ply").write_bytes(ply_bytes(card))
     write_environment(folder / "environment.exr", drawable(card.environment))
-    write_exr(folder / "latlong.exr", image_channels(latlong(card.environment)), half=False)
+    finer = max(1, min(4, LATLONG_ROWS // card.environment.shape[0]))
+    write_exr(folder / "latlong.exr", image_channels(area_pixels(card.environment, finer)), half=False)
     (folder / "scene.xml").write_text(scene_xml(card), encoding="utf-8")
 
 
@@ -61,17 +62,6 @@ def _vertices(size: int) -> tuple[np.ndarray, Float[np.ndarray, " n"]]:
     pixels = np.round(np.linspace(0, size - 1, min(size, MOST_VERTICES))).astype(np.int64)
     place = np.concatenate([[0], (pixels + 0.5) / size, [1]])
     return np.pad(pixels, 1, mode="edge"), place.astype(np.float32)
-
-
-def latlong(environment: Float[np.ndarray, "eh ew 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The light as most programs read a map: rows are areas between the poles. Bilinear, finer where it is coarse."""
-    finer = max(1, min(4, LATLONG_ROWS // environment.shape[0]))
-    height, width = finer * environment.shape[0], finer * environment.shape[1]
-    theta = np.pi * (np.arange(height) + 0.5) / height
-    phi = 2 * np.pi * (np.arange(width) + 0.5) / width
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    directions = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], axis=-1)
-    return sample_environment(environment, directions.astype(np.float32))
 
 
 def scene_xml(card: Card) -> str:

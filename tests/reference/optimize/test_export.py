@@ -13,11 +13,11 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import environment_directions, middle_rows, sample_environment
+from unirender.lighting import area_pixels, environment_directions, middle_rows, sample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed
-from unirender_reference.optimize.export import latlong, read_environment, write_solution
+from unirender_reference.optimize.export import FINER, read_environment, write_solution
 from unirender_reference.optimize.glb import glb_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.scene import envmap_data, sensor_dict
@@ -114,7 +114,7 @@ def test_the_map_for_other_programs_is_the_same_light(tmp_path: Path):
     """Read as areas by our own reader; taken for the poles' grid, or turned by a column, it would be off."""
     axes = np.array([[0.6, 0.0, 0.8], [0.0, 1.0, 0.0], [-0.8, 0.36, 0.48]], np.float32)
     smooth = np.exp(3 * (environment_directions(32, 64) @ axes.T) - 2)
-    channels = image_channels(latlong(smooth))
+    channels = image_channels(area_pixels(smooth, FINER))
     write_exr(tmp_path / "latlong.exr", channels, half=False)
     found = load_light(tmp_path / "latlong.exr", normalise=False).environment
     rng = np.random.default_rng(0)
