@@ -344,10 +344,8 @@ def test_beyond_a_photograph_its_edge_fades_over_30_degrees_to_its_mean():
     for elevation, faded in ((50, 1 / 6), (60, 0.5), (70, 5 / 6), (80, 1)):
         for side, edge in ((1, 1), (-1, 0)):  # left is +x
             for up, light in ((1, 1), (-1, 1 - (1 - files.FLOOR) * faded)):
-                angle = np.radians(elevation)
-                direction = np.array([side * np.cos(angle), up * np.sin(angle) * np.sqrt(2), np.cos(angle)]) / np.sqrt(
-                    2
-                )
+                horizontal, y = np.cos(np.radians(elevation)), up * np.sin(np.radians(elevation))
+                direction = np.array([side * horizontal / np.sqrt(2), y, horizontal / np.sqrt(2)])
                 expected = (edge * (1 - faded) + 0.5 * faded) * light
                 seen = sample_environment(environment, direction[None].astype(np.float32))[0]
                 assert seen == pytest.approx(expected, abs=0.02), (elevation, side, up)

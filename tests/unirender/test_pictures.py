@@ -229,6 +229,19 @@ def test_what_a_picture_cannot_show_is_told(tmp_path: Path) -> None:
         read_input(tmp_path / "a.png", tmp_path / "mask.png")
 
 
+def test_lost_highlights_and_an_underexposed_object_are_told(tmp_path: Path) -> None:
+    """By shares of the object, whatever lies behind it; a highlight of three percent shows the exposure."""
+    clipped = {"clipped": "8% of the object's pixels are clipped"}
+    for bright, told in ((1, {"dark": "the object is dark, 99% of it below 0.2"}), (6, {}), (16, clipped)):  # of 200
+        rgba = np.full((20, 20, 4), (255, 255, 255, 0), np.uint8)
+        rgba[:10] = (60, 40, 20, 255)
+        rgba[0, :bright, :3] = 255
+        Image.fromarray(rgba).save(tmp_path / "a.png")
+        remarks = read_input(tmp_path / "a.png", None)[1]
+        assert remarks.keys() == told.keys()
+        assert all(remarks[kind].startswith(text) for kind, text in told.items())
+
+
 def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:
     """NumPy writes it here: `write_exr` refuses."""
     pixels = np.full((4, 5, 4), 0.5, np.float32)
