@@ -56,7 +56,7 @@ def error(one: Intrinsics, other: Intrinsics) -> float:
     return float(np.sqrt(np.mean(np.square(next(logs) - next(logs)))))
 
 
-def test_under_its_own_light_an_insidegets_its_own_light_back() -> None:
+def test_under_its_own_light_an_object_gets_its_own_light_back() -> None:
     before = found()
     without, carried = relit(before, agreeing_light(before))
     assert error(without, before) > 0.1

@@ -94,7 +94,7 @@ def test_hdr_values_above_the_range_are_not_clipped(cond: c.Conditioning) -> Non
 
 
 def test_stray_predictions_become_maps_of_their_ranges(cond: c.Conditioning) -> None:
-    """However far from [-1, 1]: a light has the radiance of at most twice its curve's range, and none is negative."""
+    """However far from [-1, 1]: no radiance is negative, or above that of twice the curve's value at x_max."""
     maps = cond.packing.unpack(20 * torch.randn(1, 18, 32, 32, generator=torch.Generator().manual_seed(0)))
     for name in ("albedo", "roughness", "metallic", "mask"):
         assert (float(maps[name].min()), float(maps[name].max())) == (0, pytest.approx(1)), name

@@ -59,7 +59,7 @@ def test_a_cut_out_object_is_reduced_and_not_enlarged() -> None:
 
 
 def test_what_enters_the_square_has_unit_normals_and_the_same_light() -> None:
-    """Averages of normals are shorter, and a light of fewer texels is as bright."""
+    """Averages of normals are shorter and are mended; a light of fewer texels is as bright."""
     rng, mask = np.random.default_rng(0), disc(100, 60, 50, 30, 25)
     bumpy = (rng.normal(size=(100, 60, 3)) + np.array([0, 0, 2])) * (mask > 0)
     normal = (bumpy / np.maximum(np.linalg.norm(bumpy, axis=-1, keepdims=True), 1e-6)).astype(np.float32)

@@ -159,8 +159,8 @@ def test_the_light_of_a_gutter_is_less_where_it_is_hidden() -> None:
     assert np.abs(least - shares["specular"]).max() > 0.02
 
 
-def test_s_loses_what_its_lobe_would_have_taken() -> None:
-    """A GGX lobe: seen from above D is 4 pi / alpha^2 over all directions of light, and it leads to the mirror's."""
+def test_shadows_of_s_are_weighed_by_a_ggx_lobe() -> None:
+    """Seen along the normal, D sums to 4 pi / alpha^2 over all directions of light; it is largest in the mirror's."""
     directions, up = texel_directions((128, 256)), np.array([[0, 0, 1]], np.float32)
     for alpha in (0.09, 0.36, 1.0):
         lobe = _distribution(up, up, np.array([[alpha]], np.float32), directions)[0]
