@@ -298,6 +298,7 @@ def test_photograph_on_the_sphere(tmp_path):
     Image.fromarray(picture).save(tmp_path / "photo.png")
     light = lights.load_light(tmp_path / "photo.png")
     assert light.environment.shape == (128, 256, 3)
+    assert lights.load_light(tmp_path / "photo.png", shape=(16, 32)).environment.shape == (16, 32, 3)
     assert "photograph" in light.provenance["rule"]
     e = light.environment
     np.testing.assert_allclose(e, e[:, ::-1][:, (np.arange(256) + 128) % 256], atol=0.05 * e.max())  # mirror at +-x

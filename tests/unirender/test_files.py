@@ -30,9 +30,9 @@ def test_result_round_trip(tmp_path: Path) -> None:
         environment=RNG.random((4, 8, 3), dtype=np.float32) * 1e5,
         camera=Camera(fov_deg=50.0, principal=(0.4, 0.6)),
     )
-    with new_folder(tmp_path / "deep" / "out") as folder:
+    with new_folder(tmp_path / "deep" / "down" / "out") as folder:
         write_result(folder, intrinsics, {"seed": 3}, image_linear=intrinsics.albedo)
-    back = read_result(tmp_path / "deep" / "out")
+    back = read_result(tmp_path / "deep" / "down" / "out")
     assert back.camera == intrinsics.camera
     assert back.present == intrinsics.present
     maps, expected = back.require("environment", "albedo"), intrinsics.require("environment", "albedo")

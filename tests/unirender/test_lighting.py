@@ -57,6 +57,13 @@ def test_shrinking_twin_plain_pooling_does_not_keep_it() -> None:
     assert not np.allclose(mean_radiance(pooled), mean_radiance(environment), rtol=0.1)
 
 
+def test_a_side_that_stays_is_not_blurred() -> None:
+    lamp = np.zeros((17, 32, 3), dtype=np.float32)
+    lamp[8, 5] = 1
+    assert not np.delete(resample_environment(lamp, (9, 32)), 5, axis=1).any()
+    assert not np.delete(resample_environment(lamp, (17, 16)), 8, axis=0).any()
+
+
 def test_growing_reads_the_same_radiance() -> None:
     environment = smooth_environment(9, 16)
     grown = resample_environment(environment, (33, 64))
