@@ -39,6 +39,7 @@ def write_tiff16(
     compressed: bool = False,
     orientation: int = 1,
     planar: bool = False,
+    bits: int = 16,
 ) -> None:
     """A TIFF of `[h w c]` whole numbers, in one strip.
 
@@ -50,12 +51,13 @@ def write_tiff16(
         compressed: by Deflate.
         orientation: as EXIF counts them.
         planar: channels one after the other, each in a strip.
+        bits: of a channel: 16, or 8.
     """
     height, width, channels = values.shape
     parts = [values[..., k] for k in range(channels)] if planar else [values]
-    strips = [part.astype(f"{order}u2").tobytes() for part in parts]
+    strips = [part.astype(f"{order}u{bits // 8}").tobytes() for part in parts]
     strips = [zlib.compress(strip) if compressed else strip for strip in strips]
-    tags = [(256, 3, [width]), (257, 3, [height]), (258, 3, [16] * channels), (259, 3, [8 if compressed else 1])]
+    tags = [(256, 3, [width]), (257, 3, [height]), (258, 3, [bits] * channels), (259, 3, [8 if compressed else 1])]
     tags += [(262, 3, [2]), (273, 4, [0] * len(strips)), (274, 3, [orientation]), (277, 3, [channels])]
     tags += [(278, 3, [height]), (279, 4, [len(strip) for strip in strips]), (284, 3, [2 if planar else 1])]
     tags += [] if extra is None else [(338, 3, [extra])]

@@ -341,6 +341,7 @@ def test_photograph_on_the_sphere(tmp_path):
     Image.fromarray(picture).save(tmp_path / "photo.png")
     light = lights.load_light(tmp_path / "photo.png")
     assert light.environment.shape == (128, 256, 3)
+    assert lights.load_light(tmp_path / "photo.png", shape=(16, 32)).environment.shape == (16, 32, 3)
     assert "photograph" in light.provenance["rule"]
     e = light.environment
     np.testing.assert_allclose(e, e[:, ::-1][:, (np.arange(256) + 128) % 256], atol=0.05 * e.max())  # mirror at +-x
@@ -357,6 +358,41 @@ def test_photograph_on_the_sphere(tmp_path):
     panorama = lights.load_light(tmp_path / "photo.png", photograph=False)
     assert panorama.environment.shape == (90, 180, 3)
     assert panorama.provenance["rule"] == "lat-long"
+
+
+@pytest.mark.parametrize(("row", "column"), [(0.3, 0.15), (0.5, 0.5), (0.75, 0.8)])
+def test_a_photograph_spans_180_degrees_of_the_horizon_and_45_up_and_down(row, column):
+    """A spot at a share of the picture's height and width; its mirror image lies in the other half."""
+    picture = np.zeros((100, 200, 3), np.float32)
+    top, left = round(100 * row), round(200 * column)
+    picture[top - 3 : top + 3, left - 3 : left + 3] = 1
+    environment = files.photograph_environment(picture, (64, 128))
+    directions = environment_directions(64, 128)
+    energy = environment.sum(-1) * texel_solid_angles(64, 128) * (directions[..., 2] > 0)
+    x, y, z = (energy[..., None] * directions).sum((0, 1))
+    assert np.degrees(np.arctan2(x, z)) == pytest.approx(180 * (0.5 - column), abs=1)
+    assert np.degrees(np.arctan2(y, np.hypot(x, z))) == pytest.approx(90 * (0.5 - row), abs=1)
+
+
+def test_of_a_tall_photograph_the_middle_is_taken():
+    picture = np.full((200, 100, 3), 5, np.float32)
+    picture[75:125] = 1  # 90 degrees high where the width is 180
+    assert files.photograph_environment(picture, (64, 128)).max() == pytest.approx(1)
+
+
+def test_beyond_a_photograph_its_edge_fades_over_30_degrees_to_its_mean():
+    """Left half white, right half black; the floor is darkened as it fades."""
+    picture = np.zeros((100, 200, 3), np.float32)
+    picture[:, :100] = 1
+    environment = files.photograph_environment(picture, (64, 128))
+    for elevation, faded in ((50, 1 / 6), (60, 0.5), (70, 5 / 6), (80, 1)):
+        for side, edge in ((1, 1), (-1, 0)):  # left is +x
+            for up, light in ((1, 1), (-1, 1 - (1 - files.FLOOR) * faded)):
+                horizontal, y = np.cos(np.radians(elevation)), up * np.sin(np.radians(elevation))
+                direction = np.array([side * horizontal / np.sqrt(2), y, horizontal / np.sqrt(2)])
+                expected = (edge * (1 - faded) + 0.5 * faded) * light
+                seen = sample_environment(environment, direction[None].astype(np.float32))[0]
+                assert seen == pytest.approx(expected, abs=0.02), (elevation, side, up)
 
 
 def test_a_grey_photograph_has_an_even_sky_and_a_darker_floor(tmp_path):

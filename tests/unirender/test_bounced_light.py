@@ -5,7 +5,7 @@ import pytest
 from seen_shapes import SIZE, as_maps, ball, gutter
 
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.bounced_light import REFLECTED, bounced_light
+from unirender.pipelines.bounced_light import AROUND, REFLECTED, _mean_radiance, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.inputs import ready_to_render
@@ -54,6 +54,20 @@ def test_b_is_the_mean_around_a_pixel() -> None:
     half = even.replace(specular=right)
     beside = bounced_light(half, ["specular"])["specular"] / found
     assert beside[SIZE // 2, SIZE // 2 - 12, 0] < beside[SIZE // 2, SIZE // 2, 0] < beside[SIZE // 2, SIZE // 2 + 12, 0]
+
+
+@pytest.mark.parametrize("side", [96, 48])
+def test_how_far_around_a_pixel_goes_with_the_size_of_the_object(side: int) -> None:
+    """One bright pixel of a square: the standard deviation of what its neighbours see of it, whatever the frame is."""
+    mask, specular = np.zeros((96, 96, 1), np.float32), np.zeros((96, 96, 3), np.float32)
+    mask[:side, :side] = 1
+    specular[side // 2, side // 2] = 1
+    facing = (mask * np.array([0, 0, 1])).astype(np.float32)
+    seen = _mean_radiance(painted(facing, mask, 1.0, 1.0).replace(specular=specular, diffuse=0 * specular))[..., 0]
+    away = np.arange(96) - side // 2
+    for axis in (0, 1):
+        spread = np.sqrt((seen.sum(axis=axis) * away**2).sum() / seen.sum())
+        assert spread == pytest.approx(AROUND * side, rel=0.05)
 
 
 def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:

@@ -9,7 +9,7 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
 from unirender.pipelines import carried_light
-from unirender.pipelines.carried_light import MOST_RATIO, agreement, with_carried_light
+from unirender.pipelines.carried_light import MOST_RATIO, _smoothed, agreement, with_carried_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.revealed_light import agreeing_light
@@ -159,3 +159,17 @@ def test_the_finer_detail_is_carried_only_between_lights_that_agree() -> None:
         inside = np.s_[SIDE // 3 : 2 * SIDE // 3, SIDE // 3 : 2 * SIDE // 3]
         share = np.mean(log_ratio[inside] * np.log(detail[inside])) / np.log(1.3) ** 2
         assert least <= share <= most
+
+
+def test_smoothing_has_its_standard_deviation_and_looks_at_nothing_but_the_object() -> None:
+    middle, away = 60, np.arange(121) - 60
+    spot = np.zeros((121, 121, 3), np.float32)
+    spot[middle, middle] = 1
+    for sigma in (2.0, 5.0, 12.0):
+        smooth = _smoothed(spot, np.ones((121, 121, 1), np.float32), sigma)[..., 0]
+        assert smooth.sum() == pytest.approx(1, rel=1e-4)
+        for axis in (0, 1):
+            assert np.sqrt((smooth.sum(axis=axis) * away**2).sum()) == pytest.approx(sigma, rel=0.1)
+    inside = (np.hypot(away[:, None], away) < 40)[..., None].astype(np.float32)
+    beside = np.where(inside > 0, 0.5, 9).repeat(3, axis=-1).astype(np.float32)
+    np.testing.assert_allclose(_smoothed(beside, inside, 5.0), np.where(inside > 0, 0.5, 0).repeat(3, -1), rtol=1e-4)

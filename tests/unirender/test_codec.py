@@ -47,7 +47,9 @@ def test_kl_codec_scales_the_posterior_mode() -> None:
     torch.testing.assert_close(latents, vae.encode(picture, return_dict=False)[0].mode() * 0.18215)
     scaled: Any = latents / 0.18215
     torch.testing.assert_close(codec.decode(latents), vae.decode(scaled, return_dict=False)[0])
-    assert codec.weights(torch.ones(2, 1, 16, 16)).shape == latents.shape
+    mask = torch.rand(2, 1, 16, 16)
+    of_patches = mask.reshape(2, 1, 8, 2, 8, 2).mean(dim=(3, 5))  # each latent counts as its pixels do on average
+    torch.testing.assert_close(codec.weights(mask), of_patches.expand_as(latents))
 
 
 def test_unknown_codec_and_missing_autoencoder() -> None:

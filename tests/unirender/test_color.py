@@ -50,7 +50,7 @@ def test_image_srgb_clips_to_the_display() -> None:
 
 def test_display_slope_is_the_derivative_of_what_is_shown() -> None:
     """Against central differences in float64; 0 where the display clips; twin: the slope of a plain gamma."""
-    x, h = np.array([-0.5, 0.001, 0.002, 0.01, 0.2, 0.7, 0.99, 1.5]), 1e-6
+    x, h = np.array([-0.5, 0.001, 0.002, 0.0035, 0.01, 0.2, 0.7, 0.99, 1.5]), 1e-6
 
     def shown(linear: np.ndarray) -> np.ndarray:
         clipped = np.clip(linear, 0, 1)
@@ -58,7 +58,7 @@ def test_display_slope_is_the_derivative_of_what_is_shown() -> None:
 
     differences = (shown(x + h) - shown(x - h)) / (2 * h)
     np.testing.assert_allclose(display_slope(x), differences, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(display_slope(x, "linear"), [0, 1, 1, 1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(display_slope(x, "linear"), [0, 1, 1, 1, 1, 1, 1, 1, 0])
     gamma = 1 / 2.2 * x[1:-1] ** (1 / 2.2 - 1)
     assert np.abs(gamma / differences[1:-1] - 1).max() > 0.1
 
@@ -71,3 +71,4 @@ def test_unpremultiply_undoes_coverage_and_leaves_the_background_black() -> None
     np.testing.assert_allclose(straight[2:], colour_linear[2:], rtol=1e-6)
     assert not straight[:2].any()
     assert np.abs(colour_linear * mask - colour_linear)[2:].max() > 0.1  # twin: left premultiplied
+    assert not unpremultiply(colour_linear, mask)[:2].any()  # a glow around the object has no coverage

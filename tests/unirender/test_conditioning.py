@@ -93,6 +93,16 @@ def test_hdr_values_above_the_range_are_not_clipped(cond: c.Conditioning) -> Non
     torch.testing.assert_close(back, batch["specular"], rtol=1e-3, atol=1e-4)
 
 
+def test_stray_predictions_become_maps_of_their_ranges(cond: c.Conditioning) -> None:
+    """However far from [-1, 1]: no radiance is negative, or above that of twice the curve's value at x_max."""
+    maps = cond.packing.unpack(20 * torch.randn(1, 18, 32, 32, generator=torch.Generator().manual_seed(0)))
+    for name in ("albedo", "roughness", "metallic", "mask"):
+        assert (float(maps[name].min()), float(maps[name].max())) == (0, pytest.approx(1)), name
+    for name, curve in cond.packing.curves.items():
+        most = ((1 + curve.k * curve.x_max) ** 2 - 1) / curve.k
+        assert (float(maps[name].min()), float(maps[name].max())) == (0, pytest.approx(most, rel=1e-3)), name
+
+
 def test_extras_hold_flags_mask_rays_and_prior() -> None:
     _, cond = make_model(physics_prior="composite")
     batch = make_batch(2)

@@ -35,3 +35,5 @@ def test_an_anchored_edit_is_the_ratio_where_light_is_and_the_difference_in_the_
     unseen = anchor(seen, dark, np.full(shape, 0.1, np.float32))
     np.testing.assert_allclose(unseen, seen + ANCHOR_GAIN * 0.1, rtol=1e-6)  # the bound; without it the gain is 31
     assert (seen[0, 0, 0] + ANCHOR_FLOOR) / ANCHOR_FLOOR > 30
+    too_bright = anchor(dark, seen, seen + np.float32(0.1))  # a change shows on what is far darker than its rendering
+    np.testing.assert_allclose(too_bright, 0.1 / ANCHOR_GAIN, rtol=1e-5)

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from unirender.camera import Camera
+from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import image_channels, intrinsics_channels, read_exr, write_environment, write_exr
 from unirender.files import new_folder, read_result, write_result
@@ -28,14 +30,34 @@ def test_result_round_trip(tmp_path: Path) -> None:
         environment=RNG.random((4, 8, 3), dtype=np.float32) * 1e5,
         camera=Camera(fov_deg=50.0, principal=(0.4, 0.6)),
     )
-    with new_folder(tmp_path / "deep" / "out") as folder:
+    with new_folder(tmp_path / "deep" / "down" / "out") as folder:
         write_result(folder, intrinsics, {"seed": 3}, image_linear=intrinsics.albedo)
-    back = read_result(tmp_path / "deep" / "out")
+    back = read_result(tmp_path / "deep" / "down" / "out")
     assert back.camera == intrinsics.camera
     assert back.present == intrinsics.present
     maps, expected = back.require("environment", "albedo"), intrinsics.require("environment", "albedo")
     np.testing.assert_array_equal(maps["environment"], expected["environment"])
     np.testing.assert_allclose(maps["albedo"], expected["albedo"], rtol=0, atol=1e-3)
+
+
+def test_pictures_of_a_result_are_for_the_eye(tmp_path: Path) -> None:
+    """Colours and light as a display shows them, materials as they are, (n + 1) / 2, and an image that is no darker
+    where the object covers half of a pixel."""
+    mask = np.array([[[1.0], [0.5], [0.0]]], np.float32)
+    grey, up = np.full((1, 3, 3), 0.25, np.float32) * (mask > 0), np.array([0, 1, 0], np.float32) * (mask > 0)
+    maps = Intrinsics(albedo=grey, roughness=grey[..., :1], normal=up.astype(np.float32), mask=mask, diffuse=8 * grey)
+    write_result(tmp_path, maps, {}, image_linear=grey * mask)
+    shown = srgb_encode(np.array(0.25)).item()
+    for name, expected in {
+        "albedo": [[shown] * 3] * 2 + [[0] * 3],
+        "diffuse": [[1] * 3] * 2 + [[0] * 3],
+        "roughness": [0.25, 0.25, 0],
+        "mask": [1, 0.5, 0],
+        "normal": [[0.5, 1, 0.5]] * 2 + [[0] * 3],
+        "image": [[shown] * 3 + [1], [shown] * 3 + [0.5], [0] * 4],
+    }.items():
+        pixels = np.asarray(Image.open(tmp_path / f"{name}.png"))[0] / 255
+        np.testing.assert_allclose(pixels, expected, rtol=0, atol=0.501 / 255, err_msg=name)
 
 
 def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from PIL import Image
 from tiny_models import make_pipeline
 
 from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import mean_radiance
 from unirender.pipelines.framing import FAINT, Frame, visible_parts
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
@@ -54,6 +56,22 @@ def test_a_cut_out_object_is_reduced_and_not_enlarged() -> None:
     assert frame.size == frame.side < 60
     assert Frame.reduced(mask, 32).size == 32
     np.testing.assert_allclose(frame.leave(frame.enter(mask)), mask, atol=1e-6)
+
+
+def test_what_enters_the_square_has_unit_normals_and_the_same_light() -> None:
+    """Averages of normals are shorter and are mended; a light of fewer texels is as bright."""
+    rng, mask = np.random.default_rng(0), disc(100, 60, 50, 30, 25)
+    bumpy = (rng.normal(size=(100, 60, 3)) + np.array([0, 0, 2])) * (mask > 0)
+    normal = (bumpy / np.maximum(np.linalg.norm(bumpy, axis=-1, keepdims=True), 1e-6)).astype(np.float32)
+    light = rng.random((40, 80, 3), np.float32) ** 8
+    given = Intrinsics(normal=normal, roughness=0.7 * mask, mask=mask, environment=light)
+    square = Frame.around(mask, SIZE).enter_intrinsics(given, (16, 32)).require("normal", "mask", "environment")
+    covered = square["mask"][..., 0] > 1e-3
+    length = np.linalg.norm(square["normal"], axis=-1)
+    np.testing.assert_allclose(length[covered], 1, rtol=1e-5)
+    assert not length[~covered].any()
+    assert square["environment"].shape == (16, 32, 3)
+    np.testing.assert_allclose(mean_radiance(square["environment"]), mean_radiance(light), rtol=2e-3)
 
 
 def test_haze_and_stray_pixels_are_left_out_only_where_they_hardly_count() -> None:

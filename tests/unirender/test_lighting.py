@@ -71,6 +71,13 @@ def test_pixels_that_are_areas_have_the_energy_of_a_lamp(height: int, finer: int
         np.testing.assert_allclose(seen, mean_radiance(lamp), rtol=0.003)
 
 
+def test_a_side_that_stays_is_not_blurred() -> None:
+    lamp = np.zeros((17, 32, 3), dtype=np.float32)
+    lamp[8, 5] = 1
+    assert not np.delete(resample_environment(lamp, (9, 32)), 5, axis=1).any()
+    assert not np.delete(resample_environment(lamp, (17, 16)), 8, axis=0).any()
+
+
 def test_growing_reads_the_same_radiance() -> None:
     environment = smooth_environment(9, 16)
     grown = resample_environment(environment, (33, 64))

@@ -119,6 +119,10 @@ def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_r
     write_tiff16(tmp_path / "b.tif", values, planar=True)
     with pytest.raises(UnirenderError, match="channels are stored one after the other, uncompressed"):
         read_input(tmp_path / "b.tif", None)
+    write_tiff16(tmp_path / "c.tif", values >> 8, planar=True, bits=8)
+    picture, remarks = read_input(tmp_path / "c.tif", None)
+    assert "depth" not in remarks
+    np.testing.assert_allclose(picture.image_srgb, (values >> 8) / 255, atol=1e-6)
 
 
 def test_a_bitmap_of_16_bits_a_pixel_has_lost_nothing(tmp_path: Path) -> None:
@@ -164,11 +168,11 @@ def test_a_file_of_several_pictures_gives_its_first_which_is_told(
 def test_a_mask_outside_of_0_to_1_is_told_or_refused(tmp_path: Path) -> None:
     Image.new("RGB", (9, 8), "white").save(tmp_path / "a.png")
     mask = np.zeros((8, 9), np.float32)
-    for most, least in ((1.05, -0.02), (1.0, 0.0)):
+    for most, least in ((1.05, -0.02), (1.05, 0), (1, -0.02), (1, 0)):
         mask[2:6], mask[0] = most, least
         write_exr(tmp_path / "m.exr", {"Y": mask})
         picture, remarks = read_input(tmp_path / "a.png", tmp_path / "m.exr")
-        told = "the mask has values in [-0.02, 1.05], clipped to [0, 1]" if most > 1 else None
+        told = f"the mask has values in [{least}, {most}], clipped to [0, 1]" if (most, least) != (1, 0) else None
         assert remarks.get("mask_range") == told
         assert picture.mask is not None
         assert (picture.mask.min(), picture.mask.max()) == (0, 1)
@@ -208,9 +212,10 @@ def test_an_exr_mask_beside_the_colours_is_their_alpha(tmp_path: Path) -> None:
     np.testing.assert_array_equal(picture.mask, alpha[..., None])
     np.testing.assert_allclose(picture.image_srgb[alpha > 0], srgb_encode(np.full(3, 0.2, np.float32))[0], atol=1e-3)
     assert "alpha" not in remarks
-    write_exr(tmp_path / "b.exr", channels | {"A": 2 * alpha - 0.5, "mask.Y": alpha})
-    _, remarks = read_input(tmp_path / "b.exr", None)
-    assert remarks["alpha"] == "A has values in [-0.5, 1.5], clipped to [0, 1]"
+    for factor, most in ((2, 1.5), (1.5, 1)):
+        write_exr(tmp_path / "b.exr", channels | {"A": factor * alpha - 0.5, "mask.Y": alpha})
+        _, remarks = read_input(tmp_path / "b.exr", None)
+        assert remarks["alpha"] == f"A has values in [-0.5, {most}], clipped to [0, 1]"
 
 
 def test_what_a_picture_cannot_show_is_told(tmp_path: Path) -> None:
@@ -229,6 +234,19 @@ def test_what_a_picture_cannot_show_is_told(tmp_path: Path) -> None:
         read_input(tmp_path / "a.png", tmp_path / "mask.png")
 
 
+def test_lost_highlights_and_an_underexposed_object_are_told(tmp_path: Path) -> None:
+    """By shares of the object, whatever lies behind it; a highlight of three percent shows the exposure."""
+    clipped = {"clipped": "8% of the object's pixels are clipped"}
+    for bright, told in ((1, {"dark": "the object is dark, 99% of it below 0.2"}), (6, {}), (16, clipped)):  # of 200
+        rgba = np.full((20, 20, 4), (255, 255, 255, 0), np.uint8)
+        rgba[:10] = (60, 40, 20, 255)
+        rgba[0, :bright, :3] = 255
+        Image.fromarray(rgba).save(tmp_path / "a.png")
+        remarks = read_input(tmp_path / "a.png", None)[1]
+        assert remarks.keys() == told.keys()
+        assert all(remarks[kind].startswith(text) for kind, text in told.items())
+
+
 def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:
     """NumPy writes it here: `write_exr` refuses."""
     pixels = np.full((4, 5, 4), 0.5, np.float32)
@@ -239,6 +257,8 @@ def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:
         OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(tmp_path / "a.exr"))
         with pytest.raises(UnirenderError, match=r"2 of 20 pixels are NaN or infinite \(the first in row 2, column 3,"):
             read_picture(tmp_path / "a.exr")
+    with pytest.raises(UnirenderError, match="2 of 20 pixels are NaN"):
+        read_mask(tmp_path / "a.exr", (4, 5))
 
 
 def test_a_little_negative_radiance_passes_and_is_told(tmp_path: Path) -> None:

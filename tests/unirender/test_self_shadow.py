@@ -9,12 +9,20 @@ from seen_shapes import CAMERA, SIZE, as_maps, ball, gutter, rays
 from unirender.camera import Camera
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.lighting import environment_directions, texel_solid_angles
+from unirender.lobes import texel_directions
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, SeenShadows, forget_shadows, visible_shares
+from unirender.pipelines.shadowed_light import (
+    LEAST_ROUGHNESS,
+    SHADOW_SIDE,
+    SeenShadows,
+    _distribution,
+    forget_shadows,
+    visible_shares,
+)
 from unirender.symmetries import mirror, quarter_turn
 
 
@@ -143,6 +151,23 @@ def test_the_light_of_a_gutter_is_less_where_it_is_hidden() -> None:
         np.testing.assert_allclose(lit[name], without[name] * share, rtol=1e-6)
     assert set(derived_light(maps, light, ["specular"])) == {"specular"}
     assert derived_light(maps, light, []) == {}
+    sharp, least = (
+        visible_shares(as_maps(normal, mask, roughness), light, ["specular"])["specular"]
+        for roughness in (0.05, LEAST_ROUGHNESS)
+    )
+    assert np.array_equal(sharp, least)
+    assert np.abs(least - shares["specular"]).max() > 0.02
+
+
+def test_shadows_of_s_are_weighed_by_a_ggx_lobe() -> None:
+    """Seen along the normal, D sums to 4 pi / alpha^2 over all directions of light; it is largest in the mirror's."""
+    directions, up = texel_directions((128, 256)), np.array([[0, 0, 1]], np.float32)
+    for alpha in (0.09, 0.36, 1.0):
+        lobe = _distribution(up, up, np.array([[alpha]], np.float32), directions)[0]
+        assert lobe @ texel_solid_angles(128, 256).ravel() == pytest.approx(4 * math.pi / alpha**2, rel=0.01)
+    tilted = np.array([[0.48, 0.36, 0.8]], np.float32)
+    lobe = _distribution(tilted, up, np.array([[0.09]], np.float32), directions)[0]
+    assert directions[:, lobe.argmax()] @ (2 * 0.8 * tilted[0] - up[0]) > math.cos(math.radians(1.5))
 
 
 def test_shadows_of_d_are_linear_in_the_light() -> None:
