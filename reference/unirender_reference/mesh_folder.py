@@ -15,6 +15,7 @@ from unirender.errors import UnirenderError
 
 KEY_STEM = 40  # characters of a file's name in its key: tar member names end at 100
 MAGIC = re.compile(r"[*?\[]")
+MIXES = "mix.json"  # marks a folder of `unirender mix-meshes`
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def mesh_folder(
         limit: take no more files than this.
 
     Raises:
-        UnirenderError: there are no such files.
+        UnirenderError: there are no such files, or files are held out of mixes, whose meshes are on both sides.
     """
     from unirender_reference.meshes import find_meshes
 
@@ -122,7 +123,23 @@ def mesh_folder(
     if not names:
         held = f" for --split {split} with --holdout {holdout}" if holdout else ""
         raise UnirenderError(f"{pattern}: no mesh files{held}, expected .glb, .gltf, .obj or .ply files")
+    if holdout:
+        _check_no_mixes(base, names)
     return MeshFolder(base, names, unreadable)
+
+
+def _check_no_mixes(base: Path, names: Iterable[str]) -> None:
+    """Looks whether files are mixes (`unirender mix-meshes`), each in a folder of its own.
+
+    Raises:
+        UnirenderError: some are: one mesh is a part of many.
+    """
+    for above in {(base / name).parent.parent for name in names}:
+        if (above / MIXES).is_file():
+            raise UnirenderError(
+                f"{above}: --holdout would divide mixes, of which two on either side share meshes; hold meshes out "
+                "when they are mixed (`unirender mix-meshes --holdout`), and take their mixes without --holdout"
+            )
 
 
 def pattern_base(pattern: str | Path) -> Path:

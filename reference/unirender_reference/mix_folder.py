@@ -13,14 +13,13 @@ import numpy as np
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
 from unirender_reference.folder_lock import LOCK, locked, made_folder
-from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
+from unirender_reference.mesh_folder import MIXES, MeshFile, files_hash, mesh_folder
 from unirender_reference.meshes.load import read_model
 from unirender_reference.meshes.mix import draw_count, mixed, pictures_of
 from unirender_reference.meshes.surface import Model, Texture
 from unirender_reference.meshes.write_obj import write_obj
 from unirender_reference.mix_command import MixMeshes
 
-MANIFEST = "mix.json"
 DONORS_TRIED = 8  # meshes that are read for one that has pictures
 
 
@@ -69,7 +68,7 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         _claim(options, drawn.files)
         for leftover in out.glob(".mix-*"):  # of a run that was killed
             shutil.rmtree(leftover, ignore_errors=True)
-        for leftover in out.glob(f".{MANIFEST}.*"):
+        for leftover in out.glob(f".{MIXES}.*"):
             leftover.unlink(missing_ok=True)
         there = sum(folder.is_dir() for folder in out.glob("mix-*"))
         for number in range(options.count):
@@ -105,7 +104,7 @@ def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
     Raises:
         UnirenderError: it holds something else.
     """
-    out, path = options.out, options.out / MANIFEST
+    out, path = options.out, options.out / MIXES
     made: dict[str, Any] = {name: getattr(options, name) for name in ("seed", "holdout", "max_faces")}
     made |= {"meshes": len(files), "meshes_sha256": files_hash(files)}
     if any(out.glob("mix-*")):
@@ -128,7 +127,7 @@ def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
                 "another --out"
             )
     else:
-        own = (MANIFEST, LOCK)
+        own = (MIXES, LOCK)
         others = [p.name for p in out.iterdir() if p.name not in own and not p.name.startswith((".mix-", ".mix.json."))]
         if others:
             raise UnirenderError(f"{out}: is not empty and holds no mixes ({min(others)}); pass another --out")

@@ -272,6 +272,22 @@ def test_holdout_divides_the_files(holdout: int, tmp_path: Path) -> None:
         mesh_folder(tmp_path, "test", 40)
 
 
+def test_mixes_of_the_same_meshes_are_not_divided(tmp_path: Path) -> None:
+    """Every mesh is a part of several mixes, so that holding mixes out holds out no mesh."""
+    for number in range(4):
+        path = tmp_path / "all" / "mixed" / f"mix-0-{number:05d}" / "mix.obj"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    own = tmp_path / "all" / "own.obj"
+    own.touch()
+    assert len(mesh_folder(tmp_path / "all", "test", 2)) == 2
+    (tmp_path / "all" / "mixed" / "mix.json").touch()
+    for pattern in (tmp_path / "all", tmp_path / "all" / "mixed", f"{tmp_path}/all/mixed/*/*.obj"):
+        with pytest.raises(UnirenderError, match="mixed: --holdout would divide mixes"):
+            mesh_folder(pattern, "train", 2)
+        assert len(mesh_folder(pattern)) >= 4
+
+
 def test_keys_are_unique_and_fit_into_a_tar() -> None:
     names = ["a/model.obj", "b/model.obj", "c.d/x.y.glb", "Ω/ø.ply", "-.obj", f"{'long' * 40}.obj", "a/model.ply"]
     keys = [MeshFile(Path(name), name).key for name in names]
