@@ -90,6 +90,11 @@ def in_split(index: int, split: Literal["train", "test"], holdout: int) -> bool:
     return not holdout or (index % holdout == holdout - 1) == (split == "test")
 
 
+def _is_divided(index: int, holdout: int) -> bool:
+    """Whether file number `index` and the one before it belong to different sides."""
+    return in_split(index, "test", holdout) != in_split(index - 1, "test", holdout)
+
+
 def mesh_folder(
     pattern: str | Path, split: Literal["train", "test"] = "train", holdout: int = 0, limit: int | None = None
 ) -> MeshFolder:
@@ -102,7 +107,8 @@ def mesh_folder(
         limit: take no more files than this.
 
     Raises:
-        UnirenderError: there are no such files, or files are held out of mixes, whose meshes are on both sides.
+        UnirenderError: there are no such files, or one object would be on both sides: as a part of mixes, or in another
+            format.
     """
     from unirender_reference.meshes import find_meshes
 
@@ -115,7 +121,14 @@ def mesh_folder(
     names: list[str] = []
     unreadable: list[tuple[str, str]] = []
     found = find_meshes(pattern, lambda folder, reason: unreadable.append((below(folder), reason)))
+    before = base
     for index, path in enumerate(found):
+        if path.with_suffix("") == before.with_suffix("") and _is_divided(index, holdout):
+            raise UnirenderError(
+                f"{path.parent}: {before.name} and {path.name} look like one model in two formats, and --holdout "
+                f"{holdout} has one on each side; name one format ('{base}/**/*{path.suffix}')"
+            )
+        before = path
         if in_split(index, split, holdout):
             names.append(below(path))
             if len(names) == limit:

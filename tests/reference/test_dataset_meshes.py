@@ -272,6 +272,19 @@ def test_holdout_divides_the_files(holdout: int, tmp_path: Path) -> None:
         mesh_folder(tmp_path, "test", 40)
 
 
+def test_one_model_in_two_formats_is_not_divided(tmp_path: Path) -> None:
+    """Files stand in order of name, so its formats are neighbours, which may belong to different sides."""
+    for name in ("bed/bed.glb", "bed/bed.obj", "chair/chair.glb", "chair/chair.obj", "chair/chair2.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    for split in ("train", "test"):
+        with pytest.raises(UnirenderError, match=r"bed: bed\.glb and bed\.obj look like one model in two formats"):
+            mesh_folder(tmp_path, split, 2)
+    assert list(mesh_folder(f"{tmp_path}/**/*.obj", "test", 2).names) == ["chair/chair.obj"]
+    assert len(mesh_folder(tmp_path, "train", 5)) == 4  # both formats of each are on one side
+    assert len(mesh_folder(tmp_path)) == 5
+
+
 def test_mixes_of_the_same_meshes_are_not_divided(tmp_path: Path) -> None:
     """Every mesh is a part of several mixes, so that holding mixes out holds out no mesh."""
     for number in range(4):
