@@ -103,7 +103,8 @@ class GroupDataset:
             where = [shard.name for shard, group in self._groups if group.key == twice[0]]
             raise UnirenderError(
                 f"{folder}: {len(twice)} groups occur twice ({twice[0]} in {', '.join(where)}), expected each key "
-                "once; take one of the shards away, or render one set with another --seed"
+                "once; take one of the shards away, or render one set with another --seed (of meshes with "
+                "--turn-objects, too: their keys else name the file alone)"
             )
         basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
         self._basis = {i: basis_rows(*self._groups[i]) for i in basis}
