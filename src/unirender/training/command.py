@@ -179,10 +179,7 @@ class Train:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"
             )
-        from unirender.training.checkpoint import check_leftover
-
         check_out(self.folder)
-        check_leftover(self.folder, "pipeline")
         validate = make_validation(self.validate_suite, self.validate) if self.validate else None
         from unirender.training.run import train
 

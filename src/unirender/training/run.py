@@ -31,12 +31,14 @@ def train(
 ) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
     from unirender.models.precision import resolve_device
+    from unirender.training.checkpoint import check_leftover
     from unirender.training.groups import list_shards
     from unirender.training.processes import join_processes
 
     processes, device = join_processes(resolve_device(options.device))
     if options.batches == "device" and device.type != "cuda":
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
+    check_leftover(out, "pipeline")
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     with alone(out) if processes.is_main else contextlib.nullcontext():
         return _train(options, config, out, validate, processes, device)
