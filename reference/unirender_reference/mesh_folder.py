@@ -15,7 +15,6 @@ from unirender.errors import UnirenderError
 
 KEY_STEM = 40  # characters of a file's name in its key: tar member names end at 100
 MAGIC = re.compile(r"[*?\[]")
-MIXES = "mix.json"  # marks a folder of `unirender mix-meshes`
 
 
 @dataclass(frozen=True)
@@ -90,11 +89,6 @@ def in_split(index: int, split: Literal["train", "test"], holdout: int) -> bool:
     return not holdout or (index % holdout == holdout - 1) == (split == "test")
 
 
-def _is_divided(index: int, holdout: int) -> bool:
-    """Whether file number `index` and the one before it belong to different sides."""
-    return in_split(index, "test", holdout) != in_split(index - 1, "test", holdout)
-
-
 def mesh_folder(
     pattern: str | Path, split: Literal["train", "test"] = "train", holdout: int = 0, limit: int | None = None
 ) -> MeshFolder:
@@ -107,8 +101,7 @@ def mesh_folder(
         limit: take no more files than this.
 
     Raises:
-        UnirenderError: there are no such files, or one object would be on both sides: as a part of mixes, or in another
-            format.
+        UnirenderError: there are no such files.
     """
     from unirender_reference.meshes import find_meshes
 
@@ -121,14 +114,7 @@ def mesh_folder(
     names: list[str] = []
     unreadable: list[tuple[str, str]] = []
     found = find_meshes(pattern, lambda folder, reason: unreadable.append((below(folder), reason)))
-    before = base
     for index, path in enumerate(found):
-        if path.with_suffix("") == before.with_suffix("") and _is_divided(index, holdout):
-            raise UnirenderError(
-                f"{path.parent}: {before.name} and {path.name} look like one model in two formats, and --holdout "
-                f"{holdout} has one on each side; name one format ('{base}/**/*{path.suffix}')"
-            )
-        before = path
         if in_split(index, split, holdout):
             names.append(below(path))
             if len(names) == limit:
@@ -136,23 +122,7 @@ def mesh_folder(
     if not names:
         held = f" for --split {split} with --holdout {holdout}" if holdout else ""
         raise UnirenderError(f"{pattern}: no mesh files{held}, expected .glb, .gltf, .obj or .ply files")
-    if holdout:
-        _check_no_mixes(base, names)
     return MeshFolder(base, names, unreadable)
-
-
-def _check_no_mixes(base: Path, names: Iterable[str]) -> None:
-    """Looks whether files are mixes (`unirender mix-meshes`), each in a folder of its own.
-
-    Raises:
-        UnirenderError: some are: one mesh is a part of many.
-    """
-    for above in {(base / name).parent.parent for name in names}:
-        if (above / MIXES).is_file():
-            raise UnirenderError(
-                f"{above}: --holdout would divide mixes, of which two on either side share meshes; hold meshes out "
-                "when they are mixed (`unirender mix-meshes --holdout`), and take their mixes without --holdout"
-            )
 
 
 def pattern_base(pattern: str | Path) -> Path:

@@ -12,8 +12,9 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
+from unirender_reference.dataset_sides import MIXES, check_sides
 from unirender_reference.folder_lock import LOCK, locked, made_folder
-from unirender_reference.mesh_folder import MIXES, MeshFile, files_hash, mesh_folder
+from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
 from unirender_reference.meshes.load import read_model
 from unirender_reference.meshes.mix import draw_count, mixed, pictures_of
 from unirender_reference.meshes.surface import Model, Texture
@@ -50,9 +51,9 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         progress: is told after each mix how many there are.
 
     Raises:
-        UnirenderError: no meshes, none that can be used, or two patterns name one file; `out` cannot be made, holds
-            meshes or something else, or another process writes to it; or a mix cannot be written, and nothing of it
-            stays.
+        UnirenderError: no meshes, none that can be used, or one that `holdout` would divide; two patterns name one
+            file; `out` cannot be made, holds meshes or something else, or another process writes to it; or a mix cannot
+            be written, and nothing of it stays.
     """
     folders = [mesh_folder(pattern, "train", options.holdout) for pattern in options.patterns]
     unreadable = [
@@ -60,6 +61,8 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         for folder in folders
         for name, reason in folder.unreadable
     ]
+    for pattern in options.patterns:
+        check_sides(pattern, options.holdout)
     out, made = options.out, 0
     files = [folder[i] for folder in folders for i in range(len(folder))]
     _check_places(files, out)

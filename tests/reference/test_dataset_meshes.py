@@ -21,6 +21,7 @@ from unirender.training.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig
+from unirender_reference.dataset_sides import check_sides
 from unirender_reference.group import turn_matrix
 from unirender_reference.mesh_folder import MeshFile, mesh_folder, pattern_base
 from unirender_reference.plan import plan_groups
@@ -277,12 +278,13 @@ def test_one_model_in_two_formats_is_not_divided(tmp_path: Path) -> None:
     for name in ("bed/bed.glb", "bed/bed.obj", "chair/chair.glb", "chair/chair.obj", "chair/chair2.obj"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    for split in ("train", "test"):
-        with pytest.raises(UnirenderError, match=r"bed: bed\.glb and bed\.obj look like one model in two formats"):
-            mesh_folder(tmp_path, split, 2)
-    assert list(mesh_folder(f"{tmp_path}/**/*.obj", "test", 2).names) == ["chair/chair.obj"]
-    assert len(mesh_folder(tmp_path, "train", 5)) == 4  # both formats of each are on one side
-    assert len(mesh_folder(tmp_path)) == 5
+    with pytest.raises(UnirenderError, match=r"bed: bed\.glb and bed\.obj look like one model in two formats"):
+        check_sides(tmp_path, 2)
+    with pytest.raises(UnirenderError, match="look like one model in two formats"):
+        plan_groups(DatasetConfig(None, 3, 16, "basis", tmp_path / "out", meshes=tmp_path, holdout=2))
+    check_sides(f"{tmp_path}/**/*.obj", 2)
+    check_sides(tmp_path, 5)  # both formats of each are on one side
+    check_sides(tmp_path, 0)
 
 
 def test_mixes_of_the_same_meshes_are_not_divided(tmp_path: Path) -> None:
@@ -291,14 +293,13 @@ def test_mixes_of_the_same_meshes_are_not_divided(tmp_path: Path) -> None:
         path = tmp_path / "all" / "mixed" / f"mix-0-{number:05d}" / "mix.obj"
         path.parent.mkdir(parents=True)
         path.touch()
-    own = tmp_path / "all" / "own.obj"
-    own.touch()
-    assert len(mesh_folder(tmp_path / "all", "test", 2)) == 2
+    (tmp_path / "all" / "own.obj").touch()
+    check_sides(tmp_path / "all", 2)
     (tmp_path / "all" / "mixed" / "mix.json").touch()
     for pattern in (tmp_path / "all", tmp_path / "all" / "mixed", f"{tmp_path}/all/mixed/*/*.obj"):
         with pytest.raises(UnirenderError, match="mixed: --holdout would divide mixes"):
-            mesh_folder(pattern, "train", 2)
-        assert len(mesh_folder(pattern)) >= 4
+            check_sides(pattern, 2)
+        check_sides(pattern, 0)
 
 
 def test_keys_are_unique_and_fit_into_a_tar() -> None:
