@@ -127,7 +127,8 @@ class ShardSource:
         if self.size is not None and (height, width) != (self.size, self.size):
             raise UnirenderError(
                 f"{self.folder}: got pictures of {height} x {width}, expected {self.size} x {self.size}, the size that "
-                f"the network is made for; render data with --resolution {self.size}, or choose another preset"
+                f"the network is made for; render data with --resolution {self.size}, or train with another "
+                "--resolution or --preset"
             )
         return dataset
 
