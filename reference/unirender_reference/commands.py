@@ -170,6 +170,8 @@ class Dataset:
         from unirender_reference.dataset_config import MOST_SPP
 
         config = self.check()
+        if (config.split, config.seed, config.meshes) == ("test", 0, None):
+            _log.warning("--split test --seed 0: has the objects of the bundled suites; another --seed has others")
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         console = Console(stderr=True)
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

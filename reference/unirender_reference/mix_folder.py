@@ -12,6 +12,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
+from unirender_reference.dataset_sides import MIXES, check_sides
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
 from unirender_reference.meshes.load import read_model
@@ -20,7 +21,6 @@ from unirender_reference.meshes.surface import Model, Texture
 from unirender_reference.meshes.write_obj import write_obj
 from unirender_reference.mix_command import MixMeshes
 
-MANIFEST = "mix.json"
 DONORS_TRIED = 8  # meshes that are read for one that has pictures
 
 
@@ -51,9 +51,9 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         progress: is told after each mix how many there are.
 
     Raises:
-        UnirenderError: no meshes, none that can be used, or two patterns name one file; `out` cannot be made, holds
-            meshes or something else, or another process writes to it; or a mix cannot be written, and nothing of it
-            stays.
+        UnirenderError: no meshes, none that can be used, or one that `holdout` would divide; two patterns name one
+            file; `out` cannot be made, holds meshes or something else, or another process writes to it; or a mix cannot
+            be written, and nothing of it stays.
     """
     folders = [mesh_folder(pattern, "train", options.holdout) for pattern in options.patterns]
     unreadable = [
@@ -61,6 +61,8 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         for folder in folders
         for name, reason in folder.unreadable
     ]
+    for pattern in options.patterns:
+        check_sides(pattern, options.holdout)
     out, made = options.out, 0
     files = [folder[i] for folder in folders for i in range(len(folder))]
     _check_places(files, out)
@@ -69,7 +71,7 @@ def mix_meshes(options: MixMeshes, progress: Callable[[int], None] = lambda done
         _claim(options, drawn.files)
         for leftover in out.glob(".mix-*"):  # of a run that was killed
             shutil.rmtree(leftover, ignore_errors=True)
-        for leftover in out.glob(f".{MANIFEST}.*"):
+        for leftover in out.glob(f".{MIXES}.*"):
             leftover.unlink(missing_ok=True)
         there = sum(folder.is_dir() for folder in out.glob("mix-*"))
         for number in range(options.count):
@@ -105,7 +107,7 @@ def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
     Raises:
         UnirenderError: it holds something else.
     """
-    out, path = options.out, options.out / MANIFEST
+    out, path = options.out, options.out / MIXES
     made: dict[str, Any] = {name: getattr(options, name) for name in ("seed", "holdout", "max_faces")}
     made |= {"meshes": len(files), "meshes_sha256": files_hash(files)}
     if any(out.glob("mix-*")):
@@ -128,7 +130,7 @@ def _claim(options: MixMeshes, files: Sequence[MeshFile]) -> None:
                 "another --out"
             )
     else:
-        own = (MANIFEST, LOCK)
+        own = (MIXES, LOCK)
         others = [p.name for p in out.iterdir() if p.name not in own and not p.name.startswith((".mix-", ".mix.json."))]
         if others:
             raise UnirenderError(f"{out}: is not empty and holds no mixes ({min(others)}); pass another --out")

@@ -31,6 +31,7 @@ from unirender_reference.dataset_config import (
     DatasetConfig,
     basis_shape,
 )
+from unirender_reference.dataset_sides import check_sides
 from unirender_reference.mesh_folder import MeshFile, MeshFolder, mesh_folder
 from unirender_reference.passes import derive_seed
 
@@ -125,11 +126,13 @@ def plan_groups(config: DatasetConfig) -> Plan:
     """The plan of a data set; with meshes their folder is listed, and nothing in it is opened.
 
     Raises:
-        UnirenderError: there are no such meshes.
+        UnirenderError: there are no such meshes, or one object of them would be on both sides.
     """
     if config.meshes is None:
         return Plan(config, None)
-    return Plan(config, mesh_folder(config.meshes, config.split, config.holdout, config.objects))
+    meshes = mesh_folder(config.meshes, config.split, config.holdout, config.objects)
+    check_sides(config.meshes, config.holdout)
+    return Plan(config, meshes)
 
 
 def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lights]]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import tarfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,12 @@ def finished_shards(
         stale.unlink(missing_ok=True)
     path = folder / MANIFEST
     if not path.exists():
-        if any(folder.glob("*.tar")) and not (folder / shard_name(0)).exists():
-            raise UnirenderError(f"{folder}: has .tar files of something else, expected an empty folder; use another")
+        there = sorted(tar.name for tar in folder.glob("*.tar"))
+        if there and not (there == [shard_name(0)] and _is_rendered(folder / there[0])):
+            raise UnirenderError(
+                f"{folder}: has {there[0]} and no {MANIFEST}, so that it may be anybody's and is not overwritten; "
+                "choose another --out, or move the .tar files away"
+            )
         return {}, False
     try:
         content = json.loads(path.read_text())
@@ -76,6 +81,16 @@ def finished_shards(
         and _is_whole(folder / record.name, record, hashed=record.name in hashed)
     }
     return finished, any(finished.get(name) != record for name, record in listed.items())
+
+
+def _is_rendered(path: Path) -> bool:
+    """Whether a shard's first group is of `unirender dataset`, which may have been killed before its first manifest."""
+    with contextlib.suppress(tarfile.TarError, OSError, ValueError), tarfile.open(path) as tar:
+        for member in tar:
+            if member.name.endswith(".json") and (stream := tar.extractfile(member)) is not None:
+                about = json.loads(stream.read())
+                return isinstance(about, dict) and "object_provenance" in about
+    return False
 
 
 def _journal(path: Path) -> dict[str, ShardRecord]:

@@ -17,12 +17,26 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from multiprocessing import active_children, get_context, parent_process
-from multiprocessing.process import BaseProcess
+from multiprocessing import parent_process
+from multiprocessing.context import SpawnContext, SpawnProcess
 from types import TracebackType
 from typing import Any
 
 GRACE_SECONDS = 2  # for a worker to end by itself once it is told to
+
+
+class _Starting(SpawnContext):
+    """The spawn context, which knows the processes that it made."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.made: list[SpawnProcess] = []
+
+    def Process(  # pyright: ignore[reportIncompatibleVariableOverride] - it is called as the class would be
+        self, *args: Any, **kwargs: Any
+    ) -> SpawnProcess:
+        self.made.append(SpawnProcess(*args, **kwargs))
+        return self.made[-1]
 
 
 class WorkerPool(ProcessPoolExecutor):
@@ -35,8 +49,8 @@ class WorkerPool(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int, start: Callable[..., None] | None = None, *arguments: Any) -> None:
-        super().__init__(workers, get_context("spawn"), _begin, (start, *arguments))
-        self._children: set[BaseProcess] = set()
+        self._starting = _Starting()
+        super().__init__(workers, self._starting, _begin, (start, *arguments))
 
     def __enter__(self) -> "WorkerPool":
         if hasattr(signal, "siginterrupt"):
@@ -46,19 +60,16 @@ class WorkerPool(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """As the executor's; a process that it starts is never interrupted."""
-        strangers = set(active_children())
-        try:
-            with interrupts_blocked():
-                return super().submit(fn, *args, **kwargs)
-        finally:
-            self._children |= set(active_children()) - strangers
+        with interrupts_blocked():
+            return super().submit(fn, *args, **kwargs)
 
     def end(self) -> None:
         """Ends the workers, in the middle of whatever they do; tasks that are not done fail."""
-        for process in self._children:
+        started = [process for process in self._starting.made if process.pid is not None]
+        for process in started:
             process.terminate()
         deadline = time.monotonic() + GRACE_SECONDS
-        for process in self._children:
+        for process in started:
             process.join(max(deadline - time.monotonic(), 0))
             process.kill()  # one that has a handler of its own, or is deep in C
         self.shutdown(cancel_futures=True)

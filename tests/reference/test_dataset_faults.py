@@ -2,11 +2,13 @@
 
 import dataclasses
 import errno
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
+import tarfile
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -309,6 +311,29 @@ def test_other_versions_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     with pytest.raises(UnirenderError, match="begun by an earlier version of unirender"):
         generate(own, executor=Stored())
     assert len(list_shards(tmp_path)) == 1  # it can be read
+
+
+@pytest.mark.parametrize("names", [("shard-000000.tar",), ("mine.tar",), ("shard-000000.tar", "shard-000001.tar")])
+def test_shards_that_may_be_of_others_are_not_overwritten(names: tuple[str, ...], tmp_path: Path) -> None:
+    """A folder of one's own renders has the names of ours, and no manifest."""
+    own = config(tmp_path, None, objects=2)
+    for name in names:
+        with tarfile.open(tmp_path / name, "w") as tar:
+            entry = tarfile.TarInfo("chair.json")
+            entry.size = len(text := b'{"vary": "independent"}')
+            tar.addfile(entry, io.BytesIO(text))
+    before = [(tmp_path / name).read_bytes() for name in names]
+    with pytest.raises(UnirenderError, match=rf"has {names[0]} and no manifest\.json, .* is not overwritten"):
+        generate(own, executor=Stored())
+    assert [(tmp_path / name).read_bytes() for name in names] == before
+
+
+def test_a_run_that_was_killed_before_its_first_manifest_goes_on(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / shard_name(0), "w") as tar:
+        entry = tarfile.TarInfo("object0_g0.json")
+        entry.size = len(text := b'{"object_provenance": {}}')
+        tar.addfile(entry, io.BytesIO(text))
+    assert generate(config(tmp_path, None, objects=2), executor=Stored()).groups == 2
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from unirender.training.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig
+from unirender_reference.dataset_sides import check_sides
 from unirender_reference.group import turn_matrix
 from unirender_reference.mesh_folder import MeshFile, mesh_folder, pattern_base
 from unirender_reference.plan import plan_groups
@@ -270,6 +271,35 @@ def test_holdout_divides_the_files(holdout: int, tmp_path: Path) -> None:
     assert list(mesh_folder(tmp_path, "train", holdout, limit=2).names) == train[:2]
     with pytest.raises(UnirenderError, match="no mesh files for --split test with --holdout 40"):
         mesh_folder(tmp_path, "test", 40)
+
+
+def test_one_model_in_two_formats_is_not_divided(tmp_path: Path) -> None:
+    """Files stand in order of name, so its formats are neighbours, which may belong to different sides."""
+    for name in ("bed/bed.glb", "bed/bed.obj", "chair/chair.glb", "chair/chair.obj", "chair/chair2.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(UnirenderError, match=r"bed: bed\.glb and bed\.obj look like one model in two formats"):
+        check_sides(tmp_path, 2)
+    with pytest.raises(UnirenderError, match="look like one model in two formats"):
+        plan_groups(DatasetConfig(None, 3, 16, "basis", tmp_path / "out", meshes=tmp_path, holdout=2))
+    check_sides(f"{tmp_path}/**/*.obj", 2)
+    check_sides(tmp_path, 5)  # both formats of each are on one side
+    check_sides(tmp_path, 0)
+
+
+def test_mixes_of_the_same_meshes_are_not_divided(tmp_path: Path) -> None:
+    """Every mesh is a part of several mixes, so that holding mixes out holds out no mesh."""
+    for number in range(4):
+        path = tmp_path / "all" / "mixed" / f"mix-0-{number:05d}" / "mix.obj"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    (tmp_path / "all" / "own.obj").touch()
+    check_sides(tmp_path / "all", 2)
+    (tmp_path / "all" / "mixed" / "mix.json").touch()
+    for pattern in (tmp_path / "all", tmp_path / "all" / "mixed", f"{tmp_path}/all/mixed/*/*.obj"):
+        with pytest.raises(UnirenderError, match="mixed: --holdout would divide mixes"):
+            check_sides(pattern, 2)
+        check_sides(pattern, 0)
 
 
 def test_keys_are_unique_and_fit_into_a_tar() -> None:

@@ -61,6 +61,18 @@ def test_contradictions_are_refused(changes: dict, message: str, tmp_path: Path)
         config(tmp_path, **changes)
 
 
+def test_the_objects_of_the_suites_are_named_as_such(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """What is fitted to them would be tested on them."""
+    (tmp_path / "file").touch()
+    nowhere = tmp_path / "file" / "data"
+    others = Dataset(out=nowhere, split="test", seed=1), Dataset(out=nowhere)
+    for dataset, said in ((Dataset(out=nowhere, split="test"), True), *((other, False) for other in others)):
+        caplog.clear()
+        with pytest.raises(UnirenderError):  # nothing is rendered
+            dataset.run()
+        assert ("has the objects of the bundled suites" in caplog.text) == said
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -18,9 +18,10 @@ from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.editing import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.calibrate import Calibrate, Line, fit, object_of, readings, write_calibrated
+from unirender.training.calibrate import Calibrate, Line, fit, readings, write_calibrated
 from unirender.training.data import GroupDataset
 from unirender.training.facts import dataset_facts
+from unirender.training.same_objects import object_of, objects_of
 from unirender.training.start import read_start
 from unirender.training.trainer import RunConfig, Trainer
 
@@ -178,10 +179,10 @@ def test_the_command_writes_a_copy(data: Path, checkpoint: Path, tmp_path: Path,
     weights = "dual_stream/diffusion_pytorch_model.safetensors"
     assert (out / weights).read_bytes() == (checkpoint / weights).read_bytes()
     pipeline = UniRenderPipeline.from_pretrained(checkpoint)
-    objects, found, truth = readings(pipeline, GroupDataset(data), 2, 0)
-    assert [int(np.sum(objects == i)) for i in range(10)] == [2] * 10
+    groups, found, truth = readings(pipeline, GroupDataset(data), 2, 0)
+    assert [int(np.sum(groups == i)) for i in range(10)] == [2] * 10
     assert set(np.round(truth[:, 0], 2)) == {0.8, 0.95}
-    line = fit(objects, found[:, 0], truth[:, 0])
+    line = fit(groups, found[:, 0], truth[:, 0])
     assert f"roughness: {line}" in said
     np.testing.assert_allclose(lines["roughness"], [line.slope, line.offset], atol=1e-4)
 
@@ -193,10 +194,26 @@ def test_as_many_pictures_of_groups_of_any_kind(tmp_path: Path, checkpoint: Path
     write_shard(tmp_path / "shard-000000.tar", groups)
     data = GroupDataset(tmp_path)
     assert len(data) > len(keys)
-    objects, found, truth = readings(UniRenderPipeline.from_pretrained(checkpoint), data, 2, 0)
-    assert objects.tolist() == [0, 0, 0, 0, 1, 1]
+    groups, found, truth = readings(UniRenderPipeline.from_pretrained(checkpoint), data, 2, 0)
+    assert groups.tolist() == [0, 0, 1, 1, 2, 2]
+    assert objects_of(data)[0].tolist() == [0, 0, 1]
     assert found.shape == truth.shape == (6, 2)
     np.testing.assert_allclose(truth[:, 1], 0.2, atol=1e-3)
+
+
+def test_one_object_under_several_names_counts_once(
+    tmp_path: Path, checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A line would else be scored on objects that it was fitted to."""
+    seeds = {"a_g0": 0, "b-turned7_g0": 1, "b-turned1000007_g0": 2, "c_g0": 3, "elsewhere_g0": 0, "a_g1": 0}
+    groups = {key: group_members("basis", SIZE, 1, (40,), (0, 50, 100), seed) for key, seed in seeds.items()}
+    write_shard(tmp_path / "shard-000000.tar", groups)
+    numbers, alike = objects_of(GroupDataset(tmp_path))
+    assert numbers.tolist() == [0, 1, 1, 2, 0, 0]
+    assert set(alike) == {("a_g0", "elsewhere_g0"), ("elsewhere_g0", "a_g1")}
+    with pytest.raises(UnirenderError, match="got 3 objects, expected 10 or more"):
+        Calibrate(tmp_path, tmp_path / "out", checkpoint).run()
+    assert "2 pairs of groups look alike, such as a_g0 and elsewhere_g0" in capsys.readouterr().out
 
 
 def test_nothing_is_written_where_no_line_is_worth_having(

@@ -28,9 +28,10 @@ from unirender.training.augment import (
 )
 from unirender.training.data import BATCH_MAPS, GroupDataset
 from unirender.training.environments import turned_environments
-from unirender.training.groups import Pair, list_shards, read_groups
+from unirender.training.groups import Pair, list_shards, read_groups, split_of
 from unirender.training.presets import Augmentation
 from unirender.training.reader import BatchReader
+from unirender.training.source import ShardSource
 
 
 @pytest.fixture(scope="module")
@@ -306,6 +307,21 @@ def test_a_training_set_in_parts(folder: Path, dataset: GroupDataset, tmp_path: 
     (whole / "chairs" / dataset.shard_names[0]).unlink()
     with pytest.raises(UnirenderError, match=r"chairs: shards .* of the manifest are missing"):
         GroupDataset(whole)
+
+
+def test_a_folder_above_both_sides_is_no_training_set(folder: Path, tmp_path: Path) -> None:
+    """`unirender dataset` makes one folder for each side: the one above them has both."""
+    whole = tmp_path / "whole"
+    for part, split in {"mine": "train", "mine-test": "test"}.items():
+        own = shutil.copytree(folder, whole / part) / "manifest.json"
+        own.write_text(json.dumps(json.loads(own.read_text()) | {"config": {"split": split}}))
+    with pytest.raises(UnirenderError, match="holds mine-test of --split test and mine of --split train, expected one"):
+        ShardSource(whole, 2, seed=0).open()
+    assert [split_of(whole / part) for part in ("mine", "mine-test")] == ["train", "test"]
+    assert split_of(folder) is None  # shards of one's own
+    shutil.copytree(folder, whole / "other")
+    (whole / "mine-test" / "manifest.json").unlink()
+    assert split_of(whole) == "train"
 
 
 def test_packing_happens_once(folder: Path, dataset: GroupDataset) -> None:

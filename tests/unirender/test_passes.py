@@ -12,7 +12,8 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.models.packing import TRIPLETS
-from unirender.training import consistency, loss_terms, losses, passes
+from unirender.training import consistency, losses, passes
+from unirender.training.loss_scale import FIRST
 from unirender.training.losses import LossFunction
 from unirender.training.passes import BatchGradient, Split
 from unirender.training.presets import LossConfig, TrainConfig
@@ -170,19 +171,20 @@ def test_a_part_of_which_nothing_is_noisy_has_no_share(
     torch.testing.assert_close(pieces, gradient, rtol=0, atol=1e-5 * float(gradient.abs().max()))
 
 
-def test_float16_keeps_small_gradients(batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_float16_keeps_small_gradients(batch: dict[str, Tensor]) -> None:
     """It has nothing below 6e-8: what a pixel of a large batch, or of a network that is nearly right, comes to."""
     weights = {name: 0.003 * getattr(CONFIG.loss, name) for name in (*TRIPLETS, "image", "cycle", "composite")}
     config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, cycle_into_renderer=False, **weights))
     _, exact = run(gradient_of(config), batch)
 
-    def error() -> float:
-        _, found = run(gradient_of(config, dtype=torch.float16), batch)
+    def error(scale: float) -> float:
+        half = gradient_of(config, dtype=torch.float16)
+        half.loss.scale = scale
+        _, found = run(half, batch)
         return float((found - exact).norm() / exact.norm())
 
-    assert error() < 0.01
-    monkeypatch.setattr(loss_terms, "HALF_SCALE", 1.0)
-    assert error() > 0.02  # the twin
+    assert error(FIRST) < 0.01
+    assert error(1.0) > 0.02  # the twin
 
 
 def test_a_batch_too_small_for_the_processes_is_refused(batch: dict[str, Tensor]) -> None:

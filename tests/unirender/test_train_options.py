@@ -39,6 +39,21 @@ def test_a_run_of_a_part_goes_on_without_what_it_began_with(tmp_path: Path) -> N
     assert run.check().trains == "inverse"
 
 
+@pytest.mark.parametrize(("command", "result"), [("train", "pipeline"), ("train-visibility", "visibility.safetensors")])
+def test_a_result_without_its_state_is_not_replaced(
+    command: str, result: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The state is the largest file of a run that is over, and the first to be deleted."""
+    run = tmp_path / "run"
+    (run / result).mkdir(parents=True)
+    (run / "log.jsonl").write_text('{"step": 20000}\n')
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([command, "--data", str(tmp_path), "--out", str(run), "--steps", "1"])
+    assert stopped.value.code == 1
+    assert "of a run and no state to go on from" in capsys.readouterr().err
+    assert (run / "log.jsonl").read_text() == '{"step": 20000}\n'
+
+
 @pytest.mark.parametrize("command", ["train", "train-visibility"])
 def test_a_second_run_in_one_folder_is_refused(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

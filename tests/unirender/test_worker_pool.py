@@ -1,15 +1,18 @@
 """Workers end with their parent, even if that is killed; without the guard they do not."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from unirender.worker_pool import exit_with_parent
+from unirender import worker_pool
+from unirender.worker_pool import WorkerPool, exit_with_parent
 
 PARENT = """
 import multiprocessing, os, sys, time
@@ -74,6 +77,25 @@ def test_an_unguarded_worker_lives_on(tmp_path: Path) -> None:
         assert not ends(worker, 2)
     finally:
         os.kill(worker, signal.SIGKILL)
+
+
+def test_a_pool_ends_its_own_workers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another one may begin while it does, in another thread."""
+    one, other, blocked = WorkerPool(1), WorkerPool(1), worker_pool.interrupts_blocked
+
+    @contextlib.contextmanager
+    def meanwhile() -> Iterator[None]:
+        monkeypatch.setattr(worker_pool, "interrupts_blocked", blocked)
+        other.submit(os.getpid).result()
+        with blocked():
+            yield
+
+    monkeypatch.setattr(worker_pool, "interrupts_blocked", meanwhile)
+    first = one.submit(os.getpid).result()
+    one.end()
+    assert ends(first, 10)
+    assert running(other.submit(os.getpid).result())
+    other.shutdown()
 
 
 def test_the_main_process_has_no_such_parent() -> None:

@@ -117,6 +117,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.training.data import GroupDataset
     from unirender.training.export import read_history
     from unirender.training.facts import dataset_facts
+    from unirender.training.same_objects import objects_of
     from unirender.writing import writing
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
@@ -132,11 +133,14 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
         )
     if seen := _trained_on(data, history):
         raise UnirenderError(f"{options.data}: {checkpoint} was trained on {seen}, expected a folder of other objects")
-    if (count := len(set(map(object_of, data.keys)))) < LEAST_OBJECTS:
+    numbers, alike = objects_of(data)
+    if alike:
+        print(f"{len(alike)} pairs of groups look alike, such as {' and '.join(alike[0])}: each is of one object")
+    if (count := len(set(numbers))) < LEAST_OBJECTS:
         raise UnirenderError(f"{options.data}: got {count} objects, expected {LEAST_OBJECTS} or more")
     with contextlib.suppress(_NothingKept), new_folder(options.out) as folder:
-        objects, found, truth = readings(pipeline, data, options.pictures, options.seed, _tell)
-        lines = {name: fit(objects, found[:, column], truth[:, column]) for column, name in enumerate(NAMES)}
+        groups, found, truth = readings(pipeline, data, options.pictures, options.seed, _tell)
+        lines = {name: fit(numbers[groups], found[:, column], truth[:, column]) for column, name in enumerate(NAMES)}
         for name, line in lines.items():
             print(f"{name}: {line}")
         kept = {name: line for name, line in lines.items() if line.better}
@@ -168,11 +172,6 @@ def _trained_on(data: "GroupDataset", history: Sequence[Mapping[str, Any]]) -> s
     return f"{len(seen)} of its {len(data.shards)} shards, such as {seen[0]}" if seen else None
 
 
-def object_of(key: str) -> str:
-    """The object of a group, by its key: one object may have several."""
-    return key.rpartition("_g")[0] or key
-
-
 def readings(
     pipeline: "UniRenderPipeline",
     data: "GroupDataset",
@@ -180,7 +179,7 @@ def readings(
     seed: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> 'tuple[Int[np.ndarray, " n"], Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]':
-    """Number of the object, what is predicted, and the truth: means over the object, in the order of `NAMES`.
+    """Number of the group, what is predicted, and the truth: means over the object, in the order of `NAMES`.
 
     Args:
         pipeline: without a calibration.
@@ -201,12 +200,11 @@ def readings(
     from unirender.training.presets import Augmentation
 
     drawn = Augmentation(permute=0.0, turn=0.0)
-    number = {key: i for i, key in enumerate(dict.fromkeys(map(object_of, data.keys)))}
     of_group: dict[int, list[int]] = {}
     for index in range(pictures * len(data)):
         own = of_group.setdefault(data.drawn(index, seed, drawn)[0], [])
         own += [index] * (len(own) < pictures)
-    objects, found, truth = [], [], []
+    groups, found, truth = [], [], []
     for done, (group, indices) in enumerate(sorted(of_group.items()), start=1):
         try:
             scenes = [from_maps(data.sample(index, seed, drawn)) for index in indices]
@@ -217,11 +215,11 @@ def readings(
             raise UnirenderError(f"{data.folder}: group {data.keys[group]}: {error}") from error
         for (_, maps), mask, answer in zip(scenes, masks, answers, strict=True):
             true = maps.require(*NAMES)
-            objects.append(number[object_of(data.keys[group])])
+            groups.append(group)
             found.append([getattr(answer, name) for name in NAMES])
             truth.append([masked_mean(true[name], mask) for name in NAMES])
         progress(done, len(of_group))
-    return np.array(objects), np.array(found), np.array(truth)
+    return np.array(groups), np.array(found), np.array(truth)
 
 
 def fit(objects: 'Int[np.ndarray, " n"]', found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]') -> Line:

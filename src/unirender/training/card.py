@@ -11,7 +11,7 @@ from typing import Any
 CARD_FILE = "README.md"
 TAGS = ("unirender", "diffusers", "inverse-rendering", "neural-rendering", "intrinsic-images", "relighting")
 OF_A_RUN = ("pipeline", "best")  # folders that every run has: the card is titled after the preset
-NO_LOSSES = ("step", "minutes", "samples_per_s", "grad_norm", "lr")  # entries of a line of losses that are none
+NO_LOSSES = ("step", "minutes", "samples_per_s", "grad_norm", "lr", "loss_scale")  # entries of a line that are none
 
 Facts = Mapping[str, Any]
 

@@ -69,6 +69,23 @@ def load_state(folder: Path, entries: Sequence[str] = ()) -> dict[str, Any] | No
     return state
 
 
+def check_leftover(folder: Path, result: str) -> None:
+    """Looks whether a run folder has a result that a new run would replace.
+
+    Args:
+        folder: of the run.
+        result: what a run leaves there.
+
+    Raises:
+        UnirenderError: it has, and no state to go on from.
+    """
+    if (folder / result).exists() and not (folder / STATE_FILE).exists():
+        raise UnirenderError(
+            f"{folder}: holds the {result} of a run and no state to go on from; a new run would replace it, and its "
+            "log; pass another --out, or move it away"
+        )
+
+
 def plain(config: TrainConfig) -> dict[str, Any]:
     """The config as a state holds it: what JSON knows."""
     return json.loads(json.dumps(dataclasses.asdict(config)))

@@ -33,13 +33,18 @@ ALL = slice(None)
 
 @dataclass(frozen=True)
 class Consistency:
-    """Both losses of a model under a config; predicted latents come in float32."""
+    """Both losses of a model under a config; predicted latents come in float32.
+
+    Attributes:
+        scale: of the cycle's loss while its gradient is taken; see `unirender.training.loss_terms.gradients`.
+    """
 
     model: DualStreamModel
     conditioning: Conditioning
     scheduler: DDIMScheduler
     config: LossConfig
     errors: Errors
+    scale: float = 1.0
 
     def cycle(
         self,
@@ -64,9 +69,7 @@ class Consistency:
             return self._rendered(rows, clean_i, mask, generator)
         leaf = rows.detach().requires_grad_()
         error = self._rendered(leaf, clean_i, mask, generator)
-        kind = leaf.device.type
-        dtype = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        (gradient,) = gradients(error, [leaf], dtype)
+        (gradient,) = gradients(error, [leaf], self.scale)
         assert gradient is not None, "what is rendered comes of it"
         return _with_gradient(error.detach(), rows, gradient)
 

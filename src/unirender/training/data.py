@@ -103,7 +103,8 @@ class GroupDataset:
             where = [shard.name for shard, group in self._groups if group.key == twice[0]]
             raise UnirenderError(
                 f"{folder}: {len(twice)} groups occur twice ({twice[0]} in {', '.join(where)}), expected each key "
-                "once; take one of the shards away, or render one set with another --seed"
+                "once; take one of the shards away, or render one set with another --seed (of meshes with "
+                "--turn-objects, too: their keys else name the file alone)"
             )
         basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
         self._basis = {i: basis_rows(*self._groups[i]) for i in basis}
@@ -202,10 +203,14 @@ class GroupDataset:
         s, d, light = basis.specular[on, r], basis.diffuse[on], basis.environment[on]
         return SampleRows(number, shared, basis.image[on, r], s, d, light, drawn.metallic, basis.roughness[r])
 
+    def surface(self, group: int) -> Maps:
+        """What the pictures of group number `group` share: albedo, normal, mask, and materials that are its own."""
+        return shared_maps(*self._groups[group])
+
     @functools.cache  # noqa: B019 - a dataset lives as long as the training that reads it
     def mean_colour(self, group: int) -> Float[np.ndarray, " 3"]:
         """Of a group's object, as `unirender.training.repaint` has it."""
-        maps = shared_maps(*self._groups[group])
+        maps = self.surface(group)
         return mean_colour(maps["albedo"], maps["mask"])
 
     @property

@@ -58,13 +58,37 @@ def list_shards(folder: str | Path) -> dict[Path, str | None]:
     Raises:
         UnirenderError: there is none, or one that the manifest lists is missing or of another size.
     """
-    folder = Path(folder)
-    parts = [folder] if _is_data(folder) else sorted(part for part in folder.glob("*/") if _is_data(part))
+    parts = _parts(Path(folder))
     found = {path: sha256 for part in parts for path, sha256 in _own_shards(part).items()}
     if not found:
         kind = "only shards without groups" if any(any(part.glob("*.tar")) for part in parts) else "no .tar shard found"
         raise UnirenderError(f"{folder}: {kind}, expected a folder written by `unirender dataset`")
     return found
+
+
+def split_of(folder: str | Path) -> str | None:
+    """The side, `train` or `test`, that a data folder was rendered for, as its manifests say; None where none says.
+
+    Raises:
+        UnirenderError: parts of both sides: what is learned from them cannot be tested on either.
+    """
+    sides: dict[str, list[str]] = {}
+    for part in _parts(Path(folder)):
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # shards of one's own need no manifest
+            side = json.loads((part / "manifest.json").read_text())["config"]["split"]
+            sides.setdefault(str(side), []).append(part.name)
+    if len(sides) > 1:
+        both = " and ".join(f"{', '.join(names)} of --split {side}" for side, names in sorted(sides.items()))
+        raise UnirenderError(
+            f"{folder}: holds {both}, expected one side: nothing would be left to test on; pass the folder of the "
+            "train side, or move the others away"
+        )
+    return next(iter(sides), None)
+
+
+def _parts(folder: Path) -> list[Path]:
+    """The folder itself, or those in it, that have shards."""
+    return [folder] if _is_data(folder) else sorted(part for part in folder.glob("*/") if _is_data(part))
 
 
 def _is_data(folder: Path) -> bool:
@@ -249,5 +273,6 @@ __all__ = [
     "open_packed",
     "read_environments",
     "read_groups",
+    "split_of",
     "store",
 ]

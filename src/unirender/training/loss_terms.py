@@ -18,7 +18,6 @@ from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.packing import TRIPLETS
 
-HALF_SCALE = 1024.0  # of a loss whose gradient goes through float16, which has nothing below 6e-8
 COLOURS = ("albedo", "specular", "diffuse")  # the attribute pictures that are scored by PSNR
 LossTerms = dict[str, Float[Tensor, ""]]
 
@@ -152,21 +151,19 @@ def _decibels(
     return (own if rows is None else own * rows).mean()
 
 
-def gradients(
-    loss: Float[Tensor, ""], inputs: Sequence[Tensor], dtype: torch.dtype = torch.float32
-) -> list[Tensor | None]:
+def gradients(loss: Float[Tensor, ""], inputs: Sequence[Tensor], scale: float = 1.0) -> list[Tensor | None]:
     """The gradient of a loss with respect to each input; None: it takes no part.
 
     Args:
         loss: a scalar.
         inputs: float32.
-        dtype: of the autocast in which the loss was computed. In float16 a third of the gradients of a trained network
-            would be 0; of a larger loss they are not, and they are divided again.
+        scale: the gradient is that of a loss so many times larger, divided again: in float16 a third of the gradients
+            of a trained network would be 0 without.
     """
-    if dtype != torch.float16:
+    if scale == 1:
         return list(torch.autograd.grad(loss, inputs, allow_unused=True))
-    scaled = torch.autograd.grad(HALF_SCALE * loss, inputs, allow_unused=True)
-    return [None if gradient is None else gradient / HALF_SCALE for gradient in scaled]
+    scaled = torch.autograd.grad(scale * loss, inputs, allow_unused=True)
+    return [None if gradient is None else gradient / scale for gradient in scaled]
 
 
 def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:

@@ -40,6 +40,7 @@ class LossFunction:
     Attributes:
         encoder_alone: whether only what the picture encoder's heads say is compared; nothing goes through the streams.
         cycle_scale: multiplies the cycle's weight; the trainer raises it from 0 after the warm-up.
+        scale: of the loss while its gradient is taken (`unirender.training.loss_scale`); the terms are without it.
     """
 
     model: DualStreamModel
@@ -49,6 +50,7 @@ class LossFunction:
     map_dropout: float = 0.0
     cycle_scale: float = 1.0
     encoder_alone: bool = False
+    scale: float = 1.0
 
     def terms(self, batch: Maps, timesteps: Timesteps, generator: torch.Generator) -> LossTerms:
         """The loss terms of a batch; {} where nothing is noisy.
@@ -156,7 +158,7 @@ class LossFunction:
         self, predicted: Tensor, clean_i: Tensor, batch: Maps, errors: Errors, generator: torch.Generator
     ) -> LossTerms:
         """The terms of inverse rows; the cycle's of a share of them only."""
-        consistency = Consistency(self.model, self.conditioning, self.scheduler, self.config, errors)
+        consistency = Consistency(self.model, self.conditioning, self.scheduler, self.config, errors, self.scale)
         terms: LossTerms = {}
         if self.config.composite and len(predicted):
             terms["composite"] = consistency.composite(predicted, batch["image"], batch["mask"])

@@ -140,7 +140,7 @@ class BatchGradient:
             terms = {name: shares[name] * mean for name, mean in means.items()}
             if not terms:  # Algorithm 1 may leave both streams of a row clean
                 return [None] * len(parameters), {}
-            found = gradients(self.loss.total(terms), parameters, self.dtype)
+            found = gradients(self.loss.total(terms), parameters, self.loss.scale)
             return found, {name: float(term.detach()) for name, term in terms.items()}
 
         summed: Gradients = [None] * len(parameters)

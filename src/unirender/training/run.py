@@ -31,12 +31,14 @@ def train(
 ) -> Path | None:
     """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
     from unirender.models.precision import resolve_device
+    from unirender.training.checkpoint import check_leftover
     from unirender.training.groups import list_shards
     from unirender.training.processes import join_processes
 
     processes, device = join_processes(resolve_device(options.device))
     if options.batches == "device" and device.type != "cuda":
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
+    check_leftover(out, "pipeline")
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
     with alone(out) if processes.is_main else contextlib.nullcontext():
         return _train(options, config, out, validate, processes, device)
@@ -58,6 +60,7 @@ def _train(
     from unirender.models.precision import resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
     from unirender.training.export import export_pipeline
+    from unirender.training.groups import split_of
     from unirender.training.live import live_report
     from unirender.training.memory import training_bytes
     from unirender.training.start import read_start
@@ -87,6 +90,8 @@ def _train(
         say(f"memory: {memory}")
         if not resumed:  # which goes on with the shards that it has
             say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+            if split_of(options.data) == "test":
+                tell(f"{options.data}: was rendered with --split test; what is trained on it cannot be tested on it")
     del data  # a folder that grew is opened anew: not both at once
     with contextlib.closing(source):
         with (

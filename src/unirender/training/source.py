@@ -7,6 +7,7 @@ from unirender.errors import UnirenderError
 from unirender.training.augment import DEFAULT_AUGMENTATION
 from unirender.training.contrasts import ContrastDataset
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset
+from unirender.training.groups import split_of
 from unirender.training.presets import Augmentation
 from unirender.training.reader import BatchReader
 
@@ -108,12 +109,15 @@ class ShardSource:
         """Opens the folder, unless it is open.
 
         Raises:
-            UnirenderError: no usable shards, or pictures of another size than `size`, where that is given.
+            UnirenderError: no usable shards, some for training and some for tests, or pictures of another size than
+                `size`, where that is given.
         """
         self.dataset = self.dataset or self._open()
         return self.dataset
 
     def _open(self, shards: tuple[str, ...] | None = None) -> GroupDataset:
+        if shards is None:
+            split_of(self.folder)
         derived = self.augmentation.derived > 0
         if self.group_size == 1:
             dataset = GroupDataset(self.folder, shards, derived=derived)
@@ -123,7 +127,8 @@ class ShardSource:
         if self.size is not None and (height, width) != (self.size, self.size):
             raise UnirenderError(
                 f"{self.folder}: got pictures of {height} x {width}, expected {self.size} x {self.size}, the size that "
-                f"the network is made for; render data with --resolution {self.size}, or choose another preset"
+                f"the network is made for; render data with --resolution {self.size}, or train with another "
+                "--resolution or --preset"
             )
         return dataset
 

@@ -30,6 +30,7 @@ def state_of(trainer: "Trainer", source: BatchSource) -> dict[str, Any]:
         "model": trainer.model.state_dict(),
         "ema": trainer.ema.state_dict(),
         "optimizer": trainer.optimizer.state_dict(),
+        "loss_scale": trainer.loss_scale.state_dict(),
         "generator": trainer.generator.get_state(),
         "parts": trainer.split.all_parts,
         "unlogged": dict(trainer.log.waiting),
@@ -70,6 +71,7 @@ def resume(trainer: "Trainer", source: BatchSource, report: Report = lambda line
     for p, moments in trainer.optimizer.state.items():
         same_shape = {name: value for name, value in moments.items() if value.shape == p.shape}
         moments.update({name: laid_out_like(p, value) for name, value in same_shape.items()})
+    trainer.loss_scale.load_state_dict(state.get("loss_scale", {}))
     trainer.generator.set_state(state["generator"])
     trainer.log.waiting.update(state.get("unlogged", {}))
     source.load_state_dict(state["source"])

@@ -31,8 +31,10 @@ from unirender.training.checkpoint import STATE_FILE, save_state
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
+from unirender.training.loss_scale import LossScale
 from unirender.training.losses import LossFunction
 from unirender.training.muon import make_optimizer
+from unirender.training.not_finite import too_large, wrong_data
 from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.presets import OptimizerConfig, TrainConfig
@@ -43,8 +45,6 @@ from unirender.training.state import resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
-
-MOST_NAMED = 5  # maps and groups of a batch in a message
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,6 +106,7 @@ class Trainer:
             self.model, conditioning, make_scheduler(), config.loss, config.map_dropout, encoder_alone=alone
         )
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
+        self.loss_scale = LossScale(dtype)
         self.optimizer = make_optimizer(self.model, config.optimizer, self.gradient.pool)
         self.ema = Ema(self.model, config.optimizer.ema_decay)
         self.log = RunLog(run.out, processes)
@@ -130,6 +131,8 @@ class Trainer:
     def train_step(self, batch: Maps, when_idle: Callable[[], None] = lambda: None) -> dict[str, float]:
         """One optimiser step, on this process's rows of a batch; returns the loss terms of the whole batch.
 
+        A step whose gradient overflowed float16 changes no weight, and has no loss terms.
+
         `when_idle` is called after the passes, when a CPU has one busy core left; it returns at once.
         """
         batch = {name: value.to(self.device) for name, value in batch.items()}
@@ -137,29 +140,25 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.loss.cycle_scale = float(self.progress >= self.config.loss.cycle_warmup)
+        self.loss.scale = self.loss_scale.value
+        told = {"lr": rate} | ({"loss_scale": self.loss.scale} if self.loss_scale.is_dynamic else {})
         terms = self.gradient(batch)
         when_idle()
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.optimizer.clip_norm)
-        if not torch.isfinite(norm):
-            raise UnirenderError(f"training: the gradient at step {self.step} is {float(norm)}; {self._why(batch)}")
-        self.optimizer.step()
-        self.ema.update(self.model)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+            self.ema.update(self.model)
+            self.loss_scale.after_finite()
+            told = terms | {"grad_norm": float(norm)} | told
+        else:
+            keys = self.source.last_keys() if isinstance(self.source, NamesGroups) else None
+            why = wrong_data(batch, keys, self.processes)
+            if why is None and not self.loss_scale.after_overflow():
+                why = too_large((self.run.out / STATE_FILE).exists())
+            if why is not None:
+                raise UnirenderError(f"training: the gradient at step {self.step} is {float(norm)}; {why}")
         self.step += 1
-        return terms | {"grad_norm": float(norm), "lr": rate}
-
-    def _why(self, batch: Maps) -> str:
-        """Why a gradient is not finite, as far as it can be told: the batch is not, or the steps are too large."""
-        rows = {name: (~value.isfinite().flatten(1).all(dim=1)).nonzero().flatten() for name, value in batch.items()}
-        keys = self.source.last_keys() if isinstance(self.source, NamesGroups) else None
-        own = [
-            f"{name} of {keys[row] if keys else f'sample {row}'}" for name, of in rows.items() for row in of.tolist()
-        ]
-        if wrong := [each for one in self.processes.gather(own) for each in one]:
-            named = ", ".join(wrong[:MOST_NAMED])
-            return f"the data have values that are not finite ({named}); mend these groups, or leave them out"
-        if (self.run.out / STATE_FILE).exists():
-            return "begin anew with a lower --learning-rate and another --out: that of a saved run is fixed"
-        return "lower the learning rate (--learning-rate)"
+        return told
 
     def fit(
         self,

@@ -91,7 +91,10 @@ class TrainVisibility:
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
+        from unirender.training.checkpoint import check_leftover
+
         check_out(self.out)
+        check_leftover(self.out, WEIGHTS_FILE)
         with alone(self.out):
             print(f"{train_visibility(self)}: trained")
         return 0

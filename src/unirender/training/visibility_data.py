@@ -26,7 +26,7 @@ from unirender.models.visibility import AZIMUTHS, BANDS, bin_weights
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.training.derived import one_thread
-from unirender.training.groups import list_shards, read_groups
+from unirender.training.groups import list_shards, read_groups, split_of
 from unirender.whole_files import file_sha256
 from unirender.worker_pool import WorkerPool
 
@@ -101,9 +101,10 @@ def read_items(
         progress: called with (shards looked at, shards in all).
 
     Raises:
-        UnirenderError: no such folder, or shards of another kind.
+        UnirenderError: no such folder, shards of another kind, or some for training and some for tests.
     """
     folder = Path(folder)
+    split_of(folder)
     shards = {path: sha256 or file_sha256(path) for path, sha256 in list_shards(folder).items()}
     missing = [(path, sha256) for path, sha256 in shards.items() if not _place(sha256).exists()]
     if missing:
