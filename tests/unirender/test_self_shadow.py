@@ -13,8 +13,9 @@ from unirender.lighting import environment_directions
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
+from unirender.pipelines.remembered import forget_pictures
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, SeenShadows, forget_shadows, visible_shares
+from unirender.pipelines.shadowed_light import SHADOW_SIDE, SeenShadows, visible_shares
 from unirender.symmetries import mirror, quarter_turn
 
 
@@ -239,7 +240,7 @@ def test_a_picture_is_looked_at_once_for_all_its_materials(monkeypatch: pytest.M
     changed[len(changed) // 2, len(changed) // 2] = (0, 0, 1)
     visible_shares(smooth.replace(normal=changed), sky())
     assert len(looks) == 2
-    forget_shadows()
+    forget_pictures()
     visible_shares(smooth.replace(normal=changed), sky())
     assert len(looks) == 3
 
