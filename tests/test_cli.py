@@ -366,6 +366,25 @@ def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, caps
         assert not (tmp_path / "none").exists()
 
 
+def test_the_mask_file_is_recorded_and_where_it_lies_is_no_setting(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    Image.open(ball).convert("RGB").save(tmp_path / "in" / "ball.png")
+    for name in ("masks", "moved"):
+        (tmp_path / name).mkdir()
+        Image.open(ball).getchannel("A").save(tmp_path / name / "ball.png")
+    picture, mask = tmp_path / "in" / "ball.png", tmp_path / "masks" / "ball.png"
+    assert run("edit", picture, "--mask", mask, "--metallic", "1", "--output", tmp_path / "edited") == 0
+    assert run("edit", ball, "--metallic", "1", "--output", tmp_path / "alpha") == 0
+    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("edited", "alpha")]
+    assert [meta["mask"] for meta in metas] == [str(mask), None]
+    for masks, kept in (("masks", 0), ("moved", 1)):
+        assert run("decompose", tmp_path / "in", "--mask", tmp_path / masks, "--output", tmp_path / "out") == 0
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["mask"] == str(tmp_path / masks)
+        stored = json.loads((tmp_path / "out" / "ball.png" / "meta.json").read_text())
+        assert stored["mask"] == str(mask), f"kept: {kept}"
+
+
 def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "film").mkdir()
     picture = Image.open(ball)

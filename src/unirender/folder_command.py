@@ -71,7 +71,7 @@ def run_folder(command: "Decompose") -> int:
     pictures = list_pictures(source)
     pipeline = command.model.load()
     read = Reader(command, command.model.side(pipeline))
-    settings = {"command": "decompose", **command.options, **command.model.provenance(pipeline)}
+    settings = {"command": "decompose", **command.decomposition.settings, **command.model.provenance(pipeline)}
     settings["fov"] = command.model.fov
     found = decompose_folder(
         pictures,
@@ -82,7 +82,7 @@ def run_folder(command: "Decompose") -> int:
         masks=masks,
         overwrite=command.out.overwrite,
     )
-    facts = {**settings, "input": source}
+    facts: dict[str, Any] = {**settings, **command.input.files}
     if command.frames:
         results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
         facts["temporal_difference"] = temporal_difference(results)
@@ -100,7 +100,7 @@ def decompose_batch(command: "Decompose", pipeline: "UniRenderPipeline", batch: 
         [picture.image_srgb for picture in batch],
         [picture.mask for picture in batch],
         cameras=[command.model.camera(picture) for picture in batch],
-        **command.options,
+        **command.decomposition.settings,
         **how,
     )
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UsageError
 from unirender.input_picture import MANY_CLIPPED
 from unirender.notices import notice
-from unirender.option_checks import usage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,19 +29,6 @@ def check_stops(stops: float | None) -> None:
     """
     if stops is not None and not abs(stops) <= MAX_STOPS:
         raise UsageError(f"--exposure {stops}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
-
-
-def check_looks_option(looks: int, mode: str) -> None:
-    """Looks at `--looks`.
-
-    Raises:
-        UsageError: it is no such number, or several samples are asked for.
-    """
-    if looks != 1:
-        from unirender.pipelines.looks import check_looks
-
-        with usage():
-            check_looks(looks, mode)
 
 
 def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
