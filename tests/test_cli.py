@@ -14,7 +14,7 @@ from PIL import Image
 from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
-from unirender.cli import main, read_light
+from unirender.cli import main, read_light, refuse
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
@@ -537,6 +537,29 @@ def test_negative_radiance_of_a_light_is_told(tmp_path: Path, capsys: pytest.Cap
     write_exr(tmp_path / "light.exr", image_channels(pixels))
     assert read_light(tmp_path / "light.exr").min() == 0
     assert "of its radiance is negative and was set to 0" in capsys.readouterr().err
+
+
+def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Image.new("RGB", (64, 32), (200, 180, 160)).save(tmp_path / "panorama.jpg")
+    assert read_light(tmp_path / "panorama.jpg").shape == (128, 256, 3)
+    assert "panorama.jpg: taken as a photograph" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 120. GiB for an array"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried"),
+        RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+    ],
+)
+def test_too_little_memory_is_no_internal_error(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    assert refuse(error) == 1
+    said = capsys.readouterr().err
+    assert "not enough memory" in said
+    assert "internal error" not in said
+    assert refuse(RuntimeError("shape mismatch")) == 1
+    assert "internal error: RuntimeError: shape mismatch" in capsys.readouterr().err
 
 
 USAGE = {
