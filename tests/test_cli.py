@@ -305,6 +305,20 @@ def test_parts_of_the_mask_that_are_left_out_are_told(tmp_path: Path, capsys: py
     assert "stray" not in capsys.readouterr().err
 
 
+def test_tiles_that_add_nothing_are_told(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "small").mkdir()
+    Image.open(ball).resize((60, 40)).save(tmp_path / "small" / "a.png")
+    said = "--tile adds nothing: the part of the picture that the network looks at has 60 pixels along a side"
+    for picture in (tmp_path / "small" / "a.png", tmp_path / "small"):
+        assert run("decompose", picture, "--tile", "--output", tmp_path / f"of {picture.name}") == 0
+        assert said in capsys.readouterr().err
+    meta = json.loads((tmp_path / "of a.png" / "meta.json").read_text())
+    assert said in meta["remarks"]["tile"]
+    assert run("decompose", ball, "--tile", "--output", tmp_path / "twin") == 0
+    assert run("decompose", tmp_path / "small" / "a.png", "--output", tmp_path / "plain") == 0
+    assert "--tile" not in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)

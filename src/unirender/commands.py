@@ -21,7 +21,7 @@ from unirender.remarks import (
     normals_away,
     overflow,
     parts_left_out,
-    with_parts_remark,
+    with_frame_remarks,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class Decompose:
                 beside = folder_beside(self.export, self.out.output, folder, overwrite=self.out.overwrite)
                 scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
             settings = self.decomposition.settings
             result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **settings, **sampling)
             meta = {"command": "decompose", **self.input.files, **of_picture(picture), **settings}
@@ -183,7 +183,7 @@ class Edit:
         options = {"anchored": self.anchored, **self.decomposition.settings}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
             meta = {"command": "edit", **self.input.files, **of_picture(picture), **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
@@ -227,7 +227,7 @@ class Relight:
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light, rule = exposed_light(read_light, self.environment, self.exposure)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
             result = pipeline.relight(
                 picture.image_srgb, light, picture.mask, exposure=rule, camera=camera, **options, **sampling
             )

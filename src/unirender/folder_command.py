@@ -14,7 +14,7 @@ from unirender.notices import notice
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition
-from unirender.remarks import parts_left_out
+from unirender.remarks import frame_remarks
 
 if TYPE_CHECKING:
     from unirender.commands import Decompose
@@ -46,7 +46,9 @@ class Reader:
             as_picture(picture.image_srgb, picture.mask)
         except UnirenderError as error:
             raise UnirenderError(f"{path}: {error}") from error
-        said |= self.command.model.camera_remarks(picture) | parts_left_out(picture.mask, self.side)
+        assert picture.mask is not None, "`read_input` gives one"
+        said |= self.command.model.camera_remarks(picture)
+        said |= frame_remarks(picture.mask, self.side, self.command.decomposition.tile)
         for kind, remark in said.items():
             self.remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
         return dataclasses.replace(picture, remarks=said)
