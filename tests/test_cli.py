@@ -14,7 +14,7 @@ from PIL import Image
 from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
-from unirender.cli import main, read_light
+from unirender.cli import main, read_light, refuse
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
@@ -305,6 +305,20 @@ def test_parts_of_the_mask_that_are_left_out_are_told(tmp_path: Path, capsys: py
     assert "stray" not in capsys.readouterr().err
 
 
+def test_tiles_that_add_nothing_are_told(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "small").mkdir()
+    Image.open(ball).resize((60, 40)).save(tmp_path / "small" / "a.png")
+    said = "--tile adds nothing: the part of the picture that the network looks at has 60 pixels along a side"
+    for picture in (tmp_path / "small" / "a.png", tmp_path / "small"):
+        assert run("decompose", picture, "--tile", "--output", tmp_path / f"of {picture.name}") == 0
+        assert said in capsys.readouterr().err
+    meta = json.loads((tmp_path / "of a.png" / "meta.json").read_text())
+    assert said in meta["remarks"]["tile"]
+    assert run("decompose", ball, "--tile", "--output", tmp_path / "twin") == 0
+    assert run("decompose", tmp_path / "small" / "a.png", "--output", tmp_path / "plain") == 0
+    assert "--tile" not in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
@@ -364,6 +378,25 @@ def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, caps
         assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
         assert message in capsys.readouterr().err
         assert not (tmp_path / "none").exists()
+
+
+def test_the_mask_file_is_recorded_and_where_it_lies_is_no_setting(ball: Path, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    Image.open(ball).convert("RGB").save(tmp_path / "in" / "ball.png")
+    for name in ("masks", "moved"):
+        (tmp_path / name).mkdir()
+        Image.open(ball).getchannel("A").save(tmp_path / name / "ball.png")
+    picture, mask = tmp_path / "in" / "ball.png", tmp_path / "masks" / "ball.png"
+    assert run("edit", picture, "--mask", mask, "--metallic", "1", "--output", tmp_path / "edited") == 0
+    assert run("edit", ball, "--metallic", "1", "--output", tmp_path / "alpha") == 0
+    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("edited", "alpha")]
+    assert [meta["mask"] for meta in metas] == [str(mask), None]
+    for masks, kept in (("masks", 0), ("moved", 1)):
+        assert run("decompose", tmp_path / "in", "--mask", tmp_path / masks, "--output", tmp_path / "out") == 0
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["mask"] == str(tmp_path / masks)
+        stored = json.loads((tmp_path / "out" / "ball.png" / "meta.json").read_text())
+        assert stored["mask"] == str(mask), f"kept: {kept}"
 
 
 def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -518,6 +551,29 @@ def test_negative_radiance_of_a_light_is_told(tmp_path: Path, capsys: pytest.Cap
     write_exr(tmp_path / "light.exr", image_channels(pixels))
     assert read_light(tmp_path / "light.exr").min() == 0
     assert "of its radiance is negative and was set to 0" in capsys.readouterr().err
+
+
+def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Image.new("RGB", (64, 32), (200, 180, 160)).save(tmp_path / "panorama.jpg")
+    assert read_light(tmp_path / "panorama.jpg").shape == (128, 256, 3)
+    assert "panorama.jpg: taken as a photograph" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 120. GiB for an array"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried"),
+        RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+    ],
+)
+def test_too_little_memory_is_no_internal_error(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    assert refuse(error) == 1
+    said = capsys.readouterr().err
+    assert "not enough memory" in said
+    assert "internal error" not in said
+    assert refuse(RuntimeError("shape mismatch")) == 1
+    assert "internal error: RuntimeError: shape mismatch" in capsys.readouterr().err
 
 
 USAGE = {

@@ -82,7 +82,7 @@ def doubled(psnr_at: Callable[[int], float], target: float, most: int) -> tuple[
 
 def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most: int = MOST_SPP) -> list[EqualQuality]:
     """The model against Mitsuba on one scene, a result for each entry of `GIVEN`."""
-    from unirender.pipelines.shadowed_light import forget_shadows
+    from unirender.pipelines.remembered import forget_pictures
     from unirender_reference.render import Renderer
 
     # The suite has s for the materials of its edits; scenes take these in turn.
@@ -98,7 +98,7 @@ def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most:
         return renderer.image(environment, roughness, metallic, spp, seed, batches=1).mean[..., :3]
 
     def model(known: Any) -> Any:
-        forget_shadows()
+        forget_pictures()
         return pipeline.render(known)
 
     def psnr(image: Any) -> float:

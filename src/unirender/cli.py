@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import Ended, causes, interrupted, parse
+from unirender.command_line import Ended, causes, interrupted, out_of_memory, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.notices import NoticeHandler, notice
@@ -137,6 +137,11 @@ def read_light(path: Path) -> "np.ndarray":
     from unirender_reference.lights import load_light
 
     light = load_light(path, normalise=False)
+    if str(light.provenance["rule"]).startswith("photograph"):
+        notice(
+            f"light {path}: taken as a photograph of what lies behind the camera, not as a panorama, which is a "
+            "lat-long HDR, EXR or PFM file"
+        )
     if share := light.provenance.get("negative_share"):
         notice(f"light {path}: {100 * float(share):.1g}% of its radiance is negative and was set to 0")
     return light.environment
@@ -247,6 +252,11 @@ def resumes(command: Any) -> bool:
 
 def refuse(error: BaseException) -> int:
     """Prints an error as one line; returns the exit status."""
+    if out_of_memory(error):
+        error = UnirenderError(
+            f"not enough memory ({error}); expected a machine with more, or less asked for at a time: fewer pixels "
+            "(--size), samples, looks or workers"
+        )
     kind = "" if isinstance(error, UnirenderError) else f"internal error: {type(error).__name__}: "
     hint = "" if isinstance(error, UnirenderError) else " (UNIRENDER_DEBUG=1 shows where)"
     notice(f"error: {kind}{' '.join(str(error).split())}{hint}")

@@ -12,6 +12,7 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
+OUT_OF_MEMORY = re.compile(r"can't allocate memory|out of memory", re.IGNORECASE)
 
 
 def parse(commands: Any, argv: Sequence[str], prog: str, description: str) -> Any:
@@ -69,6 +70,13 @@ class Ended(KeyboardInterrupt):
 def interrupted(error: BaseException) -> bool:
     """Whether an error is Ctrl-C, or comes of it: Dr.Jit's loops wrap it."""
     return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether there was not enough memory: of the machine, or of its GPU; PyTorch has no class of its own for both."""
+    return isinstance(error, MemoryError) or (
+        isinstance(error, RuntimeError) and OUT_OF_MEMORY.search(str(error)) is not None
+    )
 
 
 def causes(error: BaseException | None) -> Iterator[BaseException]:

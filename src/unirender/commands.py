@@ -13,24 +13,40 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.notices import notice
-from unirender.options import InputOptions, ModelOptions, OutputOptions
+from unirender.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
 from unirender.remarks import (
     at_white,
-    check_looks_option,
     check_stops,
     missing_maps,
     normals_away,
     overflow,
     parts_left_out,
-    with_parts_remark,
+    with_frame_remarks,
 )
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from unirender.pipelines.results import EditResult
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
 MUCH_COARSE = 0.05  # share of the object, from which a notice is due
 
 ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a light file
+
+
+def exposed_light(read_light: ReadLight, path: Path, stops: float | None) -> tuple["np.ndarray", str]:
+    """Radiance [h w 3] of a light file with stops added, and the pipeline's rule of its exposure."""
+    light = read_light(path) * 2.0 ** (stops or 0.0)
+    return light, "auto" if stops is None else "keep"
+
+
+def write_edited(folder: Path, result: "EditResult", meta: dict[str, Any], pipeline: "UniRenderPipeline") -> None:
+    """Writes an edited or relit picture with its maps, and into `meta.json` what lies beyond the network's ranges."""
+    from unirender.files import write_result
+
+    image, maps = result.image_linear, result.intrinsics
+    write_result(folder, maps, meta | at_white(image, maps.mask) | overflow(pipeline, maps), image)
 
 
 @dataclass(frozen=True)
@@ -41,26 +57,13 @@ class Decompose:
 
     input: tyro.conf.OmitArgPrefixes[InputOptions]
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
-    closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
-    flat: bool = False
-    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
-    looks: int = 1
-    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
-    longer; 6 give most of it."""
-    tile: bool = False
-    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     frames: bool = False
     """The folder's pictures are successive frames: report how much each map changes from one to the next."""
     export: Path | None = None
     """Write the maps as a scene for other programs, too: a folder with `scene.xml` for Mitsuba 3 and `card.gltf`. It
     may lie inside the output folder."""
+    decomposition: tyro.conf.OmitArgPrefixes[DecompositionOptions] = field(default_factory=DecompositionOptions)
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """How a picture is taken apart, as keyword arguments of the pipeline and for `meta.json`."""
-        return {"looks": self.looks, "closed": self.closed, "flat": self.flat, "tile": self.tile}
 
     def run(self) -> int:
         """Returns the exit status."""
@@ -69,7 +72,7 @@ class Decompose:
         from unirender.scene_export import write_scene
 
         self.model.check()
-        check_looks_option(self.looks, self.model.mode)
+        self.decomposition.check(self.model.mode)
         if self.input.picture.is_dir():
             from unirender.folder_command import run_folder
 
@@ -84,10 +87,11 @@ class Decompose:
                 beside = folder_beside(self.export, self.out.output, folder, overwrite=self.out.overwrite)
                 scene = folders.enter_context(beside)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
-            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **self.options, **sampling)
-            meta = {"command": "decompose", "input": self.input.picture, **of_picture(picture)}
-            meta = write_decomposition(folder, result, meta | self.options | self.model.provenance(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
+            settings = self.decomposition.settings
+            result = pipeline.decompose(picture.image_srgb, picture.mask, camera=camera, **settings, **sampling)
+            meta = {"command": "decompose", **self.input.files, **of_picture(picture), **settings}
+            meta = write_decomposition(folder, result, meta | self.model.provenance(pipeline))
             if scene is not None:
                 write_scene(scene, result.intrinsics, meta)
         print(f"{self.out.output}: roughness {result.roughness:.2f}, metallic {result.metallic:.2f}")
@@ -128,9 +132,8 @@ class Render:
             intrinsics = with_mask(intrinsics)
             meta |= normals_away(intrinsics)
             if self.environment is not None:
-                light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
-                exposure = "auto" if self.exposure is None else "keep"
-                intrinsics = under_light(intrinsics, light, exposure, shadows=self.shadows)
+                light, rule = exposed_light(read_light, self.environment, self.exposure)
+                intrinsics = under_light(intrinsics, light, rule, shadows=self.shadows)
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
             of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
             if of_light:
@@ -160,24 +163,16 @@ class Edit:
     """New metallic of the whole object, in [0, 1]."""
     anchored: bool = True
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
-    closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
-    flat: bool = False
-    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
-    looks: int = 1
-    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
-    longer; 6 give most of it."""
-    tile: bool = False
-    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
+    decomposition: tyro.conf.OmitArgPrefixes[DecompositionOptions] = field(default_factory=DecompositionOptions)
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder, write_result
+        from unirender.files import new_folder
         from unirender.folders import of_picture
 
         self.model.check()
-        check_looks_option(self.looks, self.model.mode)
+        self.decomposition.check(self.model.mode)
         change = {"roughness": self.roughness, "metallic": self.metallic}
         if set(change.values()) == {None}:
             raise UsageError("edit: nothing to change, expected --roughness or --metallic (or both)")
@@ -185,16 +180,14 @@ class Edit:
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "flat": self.flat}
-        options |= {"tile": self.tile}
+        options = {"anchored": self.anchored, **self.decomposition.settings}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
             result = pipeline.edit(picture.image_srgb, picture.mask, camera=camera, **change, **options, **sampling)
-            meta = {"command": "edit", "input": self.input.picture, **of_picture(picture), **change, **options}
+            meta = {"command": "edit", **self.input.files, **of_picture(picture), **change, **options}
             meta |= {"bounded": result.bounded, "coarse": result.coarse_share, **self.model.provenance(pipeline)}
-            meta |= at_white(result.image_linear, result.intrinsics.mask)
-            write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
+            write_edited(folder, result, meta, pipeline)
         if result.coarse_share > MUCH_COARSE:
             notice(
                 f"the predicted light is too coarse to show what roughness {self.roughness:g} reflects on "
@@ -216,46 +209,30 @@ class Relight:
     """Stops to add to the light as it is in the file. None: the light is scaled by the rule of the training data."""
     anchored: bool = True
     """Carry over what the decomposition could not explain: the input times render(after) / render(before)."""
-    closed: bool = True
-    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
-    flat: bool = False
-    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
-    looks: int = 1
-    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
-    longer; 6 give most of it."""
-    tile: bool = False
-    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
     shadows: bool = False
     """The surfaces of the picture cast shadows on one another, as far as the predicted normals say where they are."""
+    decomposition: tyro.conf.OmitArgPrefixes[DecompositionOptions] = field(default_factory=DecompositionOptions)
     model: tyro.conf.OmitArgPrefixes[ModelOptions] = field(default_factory=ModelOptions)
 
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder, write_result
+        from unirender.files import new_folder
         from unirender.folders import of_picture
 
         self.model.check()
-        check_looks_option(self.looks, self.model.mode)
+        self.decomposition.check(self.model.mode)
         check_stops(self.exposure)
         picture, camera = self.input.read(self.model)
-        options = {"anchored": self.anchored, "looks": self.looks, "closed": self.closed, "flat": self.flat}
-        options |= {"tile": self.tile, "shadows": self.shadows}
+        options = {"anchored": self.anchored, **self.decomposition.settings, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
-            light = read_light(self.environment) * 2.0 ** (self.exposure or 0.0)
+            light, rule = exposed_light(read_light, self.environment, self.exposure)
             pipeline, sampling = self.model.load(), self.model.sampling()
-            picture = with_parts_remark(picture, self.model.side(pipeline))
+            picture = with_frame_remarks(picture, self.model.side(pipeline), self.decomposition.tile)
             result = pipeline.relight(
-                picture.image_srgb,
-                light,
-                picture.mask,
-                exposure="auto" if self.exposure is None else "keep",
-                camera=camera,
-                **options,
-                **sampling,
+                picture.image_srgb, light, picture.mask, exposure=rule, camera=camera, **options, **sampling
             )
-            meta = {"command": "relight", "input": self.input.picture, **of_picture(picture), **options}
+            meta = {"command": "relight", **self.input.files, **of_picture(picture), **options}
             meta |= {"light": self.environment, "exposure_stops": self.exposure, **self.model.provenance(pipeline)}
-            meta |= at_white(result.image_linear, result.intrinsics.mask)
-            write_result(folder, result.intrinsics, meta | overflow(pipeline, result.intrinsics), result.image_linear)
+            write_edited(folder, result, meta, pipeline)
         print(f"{self.out.output}")
         return 0

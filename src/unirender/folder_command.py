@@ -14,7 +14,7 @@ from unirender.notices import notice
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition
-from unirender.remarks import parts_left_out
+from unirender.remarks import frame_remarks
 
 if TYPE_CHECKING:
     from unirender.commands import Decompose
@@ -46,7 +46,9 @@ class Reader:
             as_picture(picture.image_srgb, picture.mask)
         except UnirenderError as error:
             raise UnirenderError(f"{path}: {error}") from error
-        said |= self.command.model.camera_remarks(picture) | parts_left_out(picture.mask, self.side)
+        assert picture.mask is not None, "`read_input` gives one"
+        said |= self.command.model.camera_remarks(picture)
+        said |= frame_remarks(picture.mask, self.side, self.command.decomposition.tile)
         for kind, remark in said.items():
             self.remarks.setdefault(kind, []).append(f"{path.name}: {remark}")
         return dataclasses.replace(picture, remarks=said)
@@ -71,7 +73,7 @@ def run_folder(command: "Decompose") -> int:
     pictures = list_pictures(source)
     pipeline = command.model.load()
     read = Reader(command, command.model.side(pipeline))
-    settings = {"command": "decompose", **command.options, **command.model.provenance(pipeline)}
+    settings = {"command": "decompose", **command.decomposition.settings, **command.model.provenance(pipeline)}
     settings["fov"] = command.model.fov
     found = decompose_folder(
         pictures,
@@ -82,7 +84,7 @@ def run_folder(command: "Decompose") -> int:
         masks=masks,
         overwrite=command.out.overwrite,
     )
-    facts = {**settings, "input": source}
+    facts: dict[str, Any] = {**settings, **command.input.files}
     if command.frames:
         results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
         facts["temporal_difference"] = temporal_difference(results)
@@ -100,7 +102,7 @@ def decompose_batch(command: "Decompose", pipeline: "UniRenderPipeline", batch: 
         [picture.image_srgb for picture in batch],
         [picture.mask for picture in batch],
         cameras=[command.model.camera(picture) for picture in batch],
-        **command.options,
+        **command.decomposition.settings,
         **how,
     )
 

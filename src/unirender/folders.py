@@ -35,7 +35,7 @@ SUFFIXES = (".bmp", ".exr", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 RARE_SUFFIXES = (".avif", ".gif", ".j2k", ".jfif", ".jp2", ".mpo", ".pbm", ".pgm", ".pnm", ".ppm", ".qoi", ".tga")
 FIGURES = ("roughness_mean", "metallic_mean", "clipped", "remarks", "std_max")  # of `meta.json`, for the summary
 INPUT_SHA256 = "input_sha256"
-ELSEWHERE = ("device", "input")  # of `meta.json`: another machine or another path to the picture is no other setting
+ELSEWHERE = ("device", "input", "mask")  # of `meta.json`: another machine or another path to a file is no other setting
 ADDED = {"looks": 1, "flat": False}  # settings that an older `meta.json` does not name, and what they were
 AT_ONCE, PIXELS_AT_ONCE = 8, 4_000_000  # looks at pictures of one batch of the network, and pixels of the pictures
 
@@ -143,7 +143,7 @@ def decompose_folder(
         for path in pictures:
             try:
                 mask = mask_of(path, masks)
-                meta = {**settings, "input": path, INPUT_SHA256: input_sha256(path, mask)}
+                meta = {**settings, "input": path, "mask": mask, INPUT_SHA256: input_sha256(path, mask)}
                 if not overwrite and (figures := figures_of(output / path.name, meta)) is not None:
                     if not missing_files(output / path.name, figures):
                         done.figures[path.name] = figures

@@ -160,6 +160,41 @@ class ModelOptions:
 
 
 @dataclass(frozen=True)
+class DecompositionOptions:
+    """How the picture is taken apart."""
+
+    closed: bool = True
+    """Change albedo, s and d so that their rendering is the picture, and the light to agree; else all is predicted."""
+    flat: bool = False
+    """Make the albedo even between its edges; the detail that it loses goes into s and d."""
+    looks: int = 1
+    """Looks at the picture, 1 to 12: mirrored, and with its colour channels exchanged. Their mean is better and takes
+    longer; 6 give most of it."""
+    tile: bool = False
+    """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
+
+    def check(self, mode: str) -> None:
+        """Looks at the values.
+
+        Args:
+            mode: of the model, `mean` or `sample`.
+
+        Raises:
+            UsageError: no such number of looks, or several samples are asked for beside them.
+        """
+        if self.looks != 1:
+            from unirender.pipelines.looks import check_looks
+
+            with usage():
+                check_looks(self.looks, mode)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Keyword arguments of the pipeline's methods, and facts for `meta.json`."""
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
 class OutputOptions:
     """Where the result goes."""
 
@@ -179,6 +214,11 @@ class InputOptions:
     mask: Path | None = None
     """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
     None: the alpha channel, else the whole frame."""
+
+    @property
+    def files(self) -> dict[str, Path | None]:
+        """For `meta.json`."""
+        return {"input": self.picture, "mask": self.mask}
 
     def read(self, model: ModelOptions) -> tuple["Picture", "Camera"]:
         """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UsageError
 from unirender.input_picture import MANY_CLIPPED
 from unirender.notices import notice
-from unirender.option_checks import usage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,19 +31,6 @@ def check_stops(stops: float | None) -> None:
         raise UsageError(f"--exposure {stops}: expected stops between -{MAX_STOPS} and {MAX_STOPS}")
 
 
-def check_looks_option(looks: int, mode: str) -> None:
-    """Looks at `--looks`.
-
-    Raises:
-        UsageError: it is no such number, or several samples are asked for.
-    """
-    if looks != 1:
-        from unirender.pipelines.looks import check_looks
-
-        with usage():
-            check_looks(looks, mode)
-
-
 def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
     """A remark, by kind, where parts of a mask are so small that a network looks only at what is beside them.
 
@@ -65,9 +51,35 @@ def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
     }
 
 
-def with_parts_remark(picture: "Picture", side: int) -> "Picture":
-    """A picture with that remark among its others, and a notice of it."""
-    found = parts_left_out(picture.mask, side)
+def frame_remarks(mask: "np.ndarray", side: int, tile: bool) -> dict[str, str]:
+    """Remarks, by kind, on how a picture that is taken apart sits in a network's square.
+
+    Args:
+        mask: coverage [h w 1].
+        side: of the square, pixels.
+        tile: whether the detail of tiles is asked for.
+    """
+    from unirender.pipelines.framing import Frame
+
+    found = parts_left_out(mask, side)
+    if tile and (seen := Frame.around(mask, side).side) <= side:
+        found["tile"] = (
+            f"--tile adds nothing: the part of the picture that the network looks at has {seen} pixels along a side, "
+            f"no more than its own {side}"
+        )
+    return found
+
+
+def with_frame_remarks(picture: "Picture", side: int, tile: bool) -> "Picture":
+    """A picture with those remarks among its others, and a notice of each.
+
+    Args:
+        picture: with a mask.
+        side: as for `frame_remarks`.
+        tile: likewise.
+    """
+    assert picture.mask is not None, "what is read for a command has one"
+    found = frame_remarks(picture.mask, side, tile)
     for remark in found.values():
         notice(remark)
     return dataclasses.replace(picture, remarks={**picture.remarks, **found})

@@ -37,6 +37,13 @@ def test_a_job_that_takes_too_long_is_stopped_and_the_next_one_runs() -> None:
         assert worker.run(demo_jobs.process) != before
 
 
+def test_a_process_that_has_nothing_to_do_forgets_the_last_picture() -> None:
+    with Worker(demo_jobs.start, seconds=60, idle_seconds=0.5) as worker:
+        assert [worker.run(demo_jobs.look, 7) for _ in range(2)] == [1, 1], "the twin: at once"
+        time.sleep(1.5)
+        assert worker.run(demo_jobs.look, 7) == 2
+
+
 def test_a_process_that_dies_costs_its_job_alone() -> None:
     with Worker(demo_jobs.start, seconds=60) as worker:
         with pytest.raises(UnirenderError, match="died"):

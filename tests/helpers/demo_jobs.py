@@ -4,6 +4,9 @@ import os
 import time
 
 from unirender.errors import UnirenderError
+from unirender.pipelines.remembered import remembered
+
+LOOKS: list[int] = []
 
 
 def start() -> int:
@@ -38,3 +41,14 @@ def die(context: int) -> None:
 
 def process(context: int) -> int:
     return os.getpid()
+
+
+@remembered(most=1)
+def looked_at(picture: int) -> None:
+    LOOKS.append(picture)
+
+
+def look(context: int, picture: int) -> int:
+    """How often a picture was looked at."""
+    looked_at(picture)
+    return len(LOOKS)

@@ -12,6 +12,7 @@ from unirender.pipelines import carried_light
 from unirender.pipelines.carried_light import MOST_RATIO, _smoothed, agreement, with_carried_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
+from unirender.pipelines.remembered import forget_pictures
 from unirender.pipelines.revealed_light import agreeing_light
 
 SIDE = 48
@@ -129,6 +130,10 @@ def test_what_its_own_light_gives_is_derived_once_for_many_lights(monkeypatch: p
     turned = with_carried_light(before, after[1], NAMES, light)
     assert len(lights) == 2
     assert error(turned, fresh) > 1e-3
+    forget_pictures()
+    again = with_carried_light(before, after[1], NAMES, light)
+    assert len(lights) == 3
+    assert error(again, turned) == 0
 
 
 def test_lights_agree_whatever_their_power_and_tint_and_not_where_they_come_from_other_sides() -> None:

@@ -14,13 +14,13 @@ from unirender.lobes import texel_directions
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
+from unirender.pipelines.remembered import forget_pictures
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits
 from unirender.pipelines.shadowed_light import (
     LEAST_ROUGHNESS,
     SHADOW_SIDE,
     SeenShadows,
     _distribution,
-    forget_shadows,
     visible_shares,
 )
 from unirender.symmetries import mirror, quarter_turn
@@ -264,7 +264,7 @@ def test_a_picture_is_looked_at_once_for_all_its_materials(monkeypatch: pytest.M
     changed[len(changed) // 2, len(changed) // 2] = (0, 0, 1)
     visible_shares(smooth.replace(normal=changed), sky())
     assert len(looks) == 2
-    forget_shadows()
+    forget_pictures()
     visible_shares(smooth.replace(normal=changed), sky())
     assert len(looks) == 3
 

@@ -19,6 +19,7 @@ from types import TracebackType
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender.pipelines.remembered import forget_pictures
 from unirender.worker_pool import exit_with_parent
 
 START_SECONDS = 300.0  # for loading a model on a busy machine
@@ -31,10 +32,11 @@ class Worker:
     Args:
         start: makes what every job gets first; importable by name, like the jobs, and so are their arguments.
         seconds: that a job may take.
+        idle_seconds: without a job, after which the process lets go of what it remembers of the last pictures.
     """
 
-    def __init__(self, start: Callable[[], Any], seconds: float) -> None:
-        self.start, self.seconds = start, seconds
+    def __init__(self, start: Callable[[], Any], seconds: float, idle_seconds: float = 60.0) -> None:
+        self.start, self.seconds, self.idle_seconds = start, seconds, idle_seconds
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
@@ -69,7 +71,7 @@ class Worker:
         self._end()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(self.start, theirs), daemon=True)
+        process = context.Process(target=_work, args=(self.start, theirs, self.idle_seconds), daemon=True)
         process.start()
         self._process = process
         theirs.close()
@@ -108,7 +110,7 @@ class Worker:
         return answer
 
 
-def _work(start: Callable[[], Any], pipe: Connection) -> None:
+def _work(start: Callable[[], Any], pipe: Connection, idle_seconds: float) -> None:
     """The process: answers (whether it succeeded, the result or the error) until nobody asks any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends this
     exit_with_parent()
@@ -121,6 +123,8 @@ def _work(start: Callable[[], Any], pipe: Connection) -> None:
     pipe.send(_answered(prepare, None, ()))
     while True:
         try:
+            if not pipe.poll(idle_seconds):
+                forget_pictures()
             job, arguments = pipe.recv()
         except EOFError:
             return

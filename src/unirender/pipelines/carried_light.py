@@ -13,7 +13,6 @@ ratio is what `unirender.pipelines.closure` put there, and holds for its own lig
 gets its own s and d back; under one that has nothing to do with it, nothing is carried.
 """
 
-import functools
 import math
 from collections.abc import Collection
 
@@ -23,7 +22,7 @@ from scipy.ndimage import uniform_filter1d
 
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.maps_key import MapsKey
+from unirender.pipelines.remembered import MapsKey, remembered
 from unirender.pipelines.revealed_light import agreeing_light
 
 MOST_RATIO = 3.0  # either way
@@ -75,7 +74,7 @@ def with_carried_light(
     return after.replace(**carried)
 
 
-@functools.lru_cache(maxsize=1)
+@remembered(most=1)
 def _explained(surface: MapsKey, names: tuple[str, ...], shadows: bool) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """D(L_0), of the last picture: one is mostly put under several lights."""
     light = surface.intrinsics.require("environment")["environment"]

@@ -8,7 +8,6 @@ half vector, of a roughness of `LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE` pi
 as far as a lobe has one light.
 """
 
-import functools
 from collections.abc import Callable, Collection
 
 import numpy as np
@@ -19,7 +18,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions, texels
 from unirender.models.visibility import bin_weights, direction_bins, hidden_chance
 from unirender.pipelines.framing import Frame
-from unirender.pipelines.maps_key import MapsKey
+from unirender.pipelines.remembered import MapsKey, remembered
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.surface_light import QUADRATURE_SHAPE
 
@@ -56,11 +55,6 @@ def seen_shadows(intrinsics: Intrinsics) -> "SeenShadows":
     """
     surface = Intrinsics(**intrinsics.require("normal", "mask"), camera=intrinsics.camera)
     return _looked_at(MapsKey(surface.with_unit_normals()))
-
-
-def forget_shadows() -> None:
-    """Forgets the pictures that are kept: what is timed next is timed as on a new picture."""
-    _looked_at.cache_clear()
 
 
 class SeenShadows:
@@ -169,6 +163,6 @@ def _distribution(
     return 1 / np.square(1 - np.minimum(squared, 1) * (1 - np.square(alpha)))
 
 
-@functools.lru_cache(maxsize=KEPT)
+@remembered(most=KEPT)
 def _looked_at(surface: MapsKey) -> SeenShadows:
     return SeenShadows(surface.intrinsics)
