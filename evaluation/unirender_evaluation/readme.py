@@ -49,7 +49,11 @@ SHOWN = (  # table, protocol, subset
     ("physics", "physics", "main"),
 )
 HEADLINES = SHOWN[:3]
-OURS = "ours-mean"
+OURS, SAMPLED = "ours-mean", "ours-sample"
+SUBSETS = (  # method of the dear rows, scenes it sees without an option, and that option
+    (OPTIMISED, STANDARD.optimise, "--optimise-scenes"),
+    (SAMPLED, STANDARD.sample, "--sample-scenes"),
+)
 NOTES = "### Notes on the rows of these tables"
 STANDING = (
     Question("albedo", "inverse", "single-image", "albedo", "psnr", OURS),
@@ -117,10 +121,11 @@ def place(results: Results, checkpoint: str | None) -> str:
 def run_command(suite: str, records: Iterable[Record]) -> str:
     """The command that prints results with these records."""
     command = f"unirender bench run --suite {suite}"
-    # the light table asks once a scene
-    optimised = {r.sample for r in records if r.method == OPTIMISED and (r.table, r.protocol) == LIGHT}
-    if optimised and len(optimised) != STANDARD.optimise:
-        command += f" --optimise-scenes {len(optimised)}"
+    lit = [record for record in records if (record.table, record.protocol) == LIGHT]  # it asks once a scene
+    for method, usual, option in SUBSETS:
+        scenes = {record.sample for record in lit if record.method == method}
+        if scenes and len(scenes) != usual:
+            command += f" {option} {len(scenes)}"
     return command
 
 

@@ -129,10 +129,18 @@ def test_the_readme_says_where_our_row_stands_on_the_suite_that_strangers_read(t
     assert "`tiny` on `standard`: 2 objects" in standing
 
 
-@pytest.mark.parametrize(("scenes", "option"), [(4, ""), (24, " --optimise-scenes 24"), (0, "")])
-def test_the_command_says_how_many_scenes_were_optimised(scenes: int, option: str) -> None:
-    records = [Record(*LIGHT, OPTIMISED, f"s{i}", f"o{i}", {"light.log_rmse": 1.0}) for i in range(scenes)]
-    assert readme.run_command("large", records) == f"unirender bench run --suite large{option}"
+@pytest.mark.parametrize(
+    ("optimised", "sampled", "options"),
+    [(4, 4, ""), (0, 0, ""), (24, 4, " --optimise-scenes 24"), (24, 12, " --optimise-scenes 24 --sample-scenes 12")],
+)
+def test_the_command_says_how_many_scenes_the_dear_rows_saw(optimised: int, sampled: int, options: str) -> None:
+    counts = {OPTIMISED: optimised, readme.SAMPLED: sampled}
+    records = [
+        Record(*LIGHT, method, f"s{i}", f"o{i}", {"light.log_rmse": 1.0})
+        for method, n in counts.items()
+        for i in range(n)
+    ]
+    assert readme.run_command("large", records) == f"unirender bench run --suite large{options}"
 
 
 def test_the_results_of_another_shipped_checkpoint_have_a_place_of_their_own(
