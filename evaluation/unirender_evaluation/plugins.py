@@ -98,7 +98,7 @@ def named_plugin(spec: str) -> Plugin:
 
 
 def absolute(spec: str) -> str:
-    """The text of a `--method` whose file is found from any folder: a method may change the one that it runs in."""
+    """The text of a `--method` whose file is found from any folder."""
     target, mark, query = spec.partition("?")
     place, separator, name = target.rpartition(":")
     return f"{Path(place).absolute()}{separator}{name}{mark}{query}" if _is_file(place) else spec

@@ -244,6 +244,23 @@ def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> 
             assert np.geterr() == errors
 
 
+def test_a_method_may_change_the_folder_that_it_runs_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All others stay where they are: else a relative --out would lie elsewhere, and a relative --method be gone."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "walker.py").write_text(
+        "import os\nimport numpy as np\nclass Walker:\n    name, config = 'walker', {}\n"
+        "    def __init__(self):\n        os.chdir('weights')\n"
+        "    def render(self, intrinsics):\n        self.saw = os.getcwd()\n        return np.zeros((2, 2, 3))"
+    )
+    for _ in range(2):
+        (row,) = plugin_rows([named_plugin("walker.py:Walker")])
+        for _ in range(2):
+            engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+            assert row.method.saw == str(tmp_path / "weights")
+            assert Path.cwd() == tmp_path
+
+
 def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else another patch version of Python would be another method."""
     bodies = {"plain_mine": "class Mine:\n", "abstract_mine": "from abc import ABC\nclass Mine(ABC):\n"}
