@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -242,6 +243,17 @@ def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> 
             assert (made.dtype, made.device.type, divide) == (torch.float64, device, "raise")
             assert (torch.get_default_dtype(), torch.get_default_device()) == before
             assert np.geterr() == errors
+
+
+def test_a_compiled_neighbour_is_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python prefers the one that Cython or mypyc has left beside it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for suffix in (".py", EXTENSION_SUFFIXES[0]):
+        (tmp_path / f"my_compiled_net{suffix}").write_text("")
+    (tmp_path / "mine.py").write_text(
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): import my_compiled_net"
+    )
+    named_plugin(f"{tmp_path}/mine.py:Mine")
 
 
 def test_a_method_may_change_the_folder_that_it_runs_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
