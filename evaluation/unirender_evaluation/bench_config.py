@@ -114,13 +114,11 @@ def _load_pipeline(folder: Path, device: str) -> Any:
 
 
 def anywhere(config: BenchConfig) -> BenchConfig:
-    """The same with absolute paths, since a cluster's workers may run in another folder, and a stranger's method may
-    change the one that it runs in."""
+    """The same with absolute paths of what is read, since a cluster's workers may run in another folder."""
     named = config.checkpoint
     return replace(
         config,
         suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
-        out=config.out.absolute(),
         checkpoint=named.resolve() if named is not None and named.is_dir() else named,
         method=tuple(map(absolute, config.method)),
         predictions={name: folder.resolve() for name, folder in config.predictions.items()},

@@ -58,7 +58,7 @@ def planned(config: BenchConfig) -> Plan:
     Raises:
         UnirenderError: what would stop the run before it begins: unusable suite, checkpoint, plug-in or predictions.
     """
-    named, config = config.out, anywhere(config)
+    config = anywhere(config)
     here, known = prepare(config), Store.open(config.out / "records.jsonl", mend=False).known
     every = itertools.chain(*(here.jobs(scene) for scene in here.scenes), views_jobs(here, config))
     # Without the jobs themselves, which hold the pictures of their scene.
@@ -66,7 +66,7 @@ def planned(config: BenchConfig) -> Plan:
     labels = dict.fromkeys(label for label, _, _ in facts)
     check = stored_check(check_request(config), here, known.keys())
     return Plan(
-        out=named,
+        out=config.out,
         rows=tuple(
             _planned_row(label, [(done, record) for own, done, record in facts if own == label]) for label in labels
         ),

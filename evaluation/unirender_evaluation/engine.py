@@ -10,7 +10,6 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
-from unirender_evaluation.kept_defaults import kept_defaults
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
 from unirender_evaluation.plausible import picture_doubt
@@ -150,7 +149,7 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
     asked = inputs.get("intrinsics")
     size = inputs["image_srgb"].shape[:2] if asked is None else (asked.height, asked.width)
     try:
-        with kept_defaults():
+        with row.defaults.here():
             result = function(**{argument: _own(value) for argument, value in inputs.items()})
     except (Exception, SystemExit) as error:  # neither ends a run without a word
         raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error

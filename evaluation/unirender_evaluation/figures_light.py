@@ -27,7 +27,7 @@ def light_figure(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Sce
     for scene in scenes:
         seen, true = picture(suite, scene, suite.spec.base), suite.environment(scene)
         for number, subject in enumerate(taking_part):
-            found = subject.ask("decompose", **seen).environment
+            found = getattr(subject.ask("decompose", **seen), "environment", None)
             if found is None:
                 raise UnirenderError(f"light: {subject.label} finds none; leave it out, or the figure with --kinds")
             errors = ball_values(found, true)

@@ -31,8 +31,8 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
         environment = suite.environment(other)
         for number, subject in enumerate(taking_part):
             maps = map_tiles(subject.ask("decompose", **seen), mask)
-            made = [subject.ask("edit", **seen, **edit) if subject.can("edit") else None for edit in edits]
-            made.append(subject.ask("relight", **seen, environment=environment) if subject.can("relight") else None)
+            made = [subject.ask("edit", **seen, **edit) for edit in edits]
+            made.append(subject.ask("relight", **seen, environment=environment))
             pictures = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
             lines.append(Line(subject.label, (input_tile(seen, number), *maps, *pictures), starts=number == 0))
         truth = [*(suite.image(scene, edit) for edit in suite.spec.edits), suite.image(other, base)]
@@ -45,11 +45,11 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
     return Grid(("input", *MAPS, *names, "relit"), tuple(lines), caption)
 
 
-def map_tiles(found: Intrinsics, mask: Mask) -> list[Tile | None]:
+def map_tiles(found: Intrinsics | None, mask: Mask) -> list[Tile | None]:
     """A tile for each of `MAPS` that is there."""
     tiles: list[Tile | None] = []
     for name in MAPS:
-        value = getattr(found, name)
+        value = getattr(found, name, None)
         if value is None:
             tiles.append(None)
         elif name == "environment":

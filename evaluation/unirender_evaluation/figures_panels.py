@@ -7,6 +7,7 @@ the figure is made (`MitsubaTruth`); the comparison's is the suite's own. PSNR i
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Float
 from unirender.color import image_srgb, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
-from unirender_evaluation.engine import answer, ask
+from unirender_evaluation.engine import answer, answered, ask
 from unirender_evaluation.figures import Grid, Line, Tile
 from unirender_evaluation.methods import Image, Mask, capabilities
 from unirender_evaluation.metrics import metric_key
@@ -43,8 +44,8 @@ class Subject:
         return capability in capabilities(self.row.method)
 
     def ask(self, capability: str, **inputs: Any) -> Any:
-        """Its answer, by the rules of the benchmark (`engine.ask`)."""
-        return ask(self.row, capability, "figures", **inputs)
+        """Its answer, by the rules of the benchmark (`engine.ask`); None where it has none."""
+        return answered(partial(ask, self.row, capability, "figures", **inputs)) if self.can(capability) else None
 
 
 class MitsubaTruth:
@@ -207,7 +208,9 @@ def able(subjects: Sequence[Subject], capability: str, what: str) -> list[Subjec
     return found
 
 
-def _compared(image: Image, true: Image, mask: Mask) -> Tile:
+def _compared(image: Image | None, true: Image, mask: Mask) -> Tile | None:
+    if image is None:
+        return None
     psnr = score_image(image, true, mask, quantity="relit")[metric_key("relit", "psnr")]
     return Tile(picture_over_white(image, mask), f"{psnr:.1f} dB")
 

@@ -96,12 +96,9 @@ def pictures_sheet(
         seen, mask = {"image_srgb": picture.image_srgb, "mask": picture.mask, "camera": camera}, picture.mask
         for number, subject in enumerate(able(subjects, "decompose", "sheet of pictures")):
             maps = subject.ask("decompose", **seen)
-            made = [subject.ask("render", intrinsics=maps.replace(mask=mask)) if subject.can("render") else None]
-            made += [subject.ask("edit", **seen, **edit) if subject.can("edit") else None for edit in EDITS]
-            made += [
-                subject.ask("relight", **seen, environment=light) if subject.can("relight") else None
-                for light in lights.values()
-            ]
+            made = [None if maps is None else subject.ask("render", intrinsics=maps.replace(mask=mask))]
+            made += [subject.ask("edit", **seen, **edit) for edit in EDITS]
+            made += [subject.ask("relight", **seen, environment=light) for light in lights.values()]
             tiles = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
             label = picture.name if len(subjects) == 1 else f"{picture.name}, {subject.label}"
             lines.append(Line(label, (input_tile(seen, number), *map_tiles(maps, mask), *tiles), starts=number == 0))

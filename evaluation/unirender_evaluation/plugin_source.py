@@ -52,7 +52,8 @@ def shadowed(kind: type, *makers: Any) -> Iterator[tuple[Path, Path]]:
         for name in sorted({name.partition(".")[0] for name in _names(file, package)} - sys.stdlib_module_names):
             beside = [found for folder in (root, *roots) for found in _files_of(folder, [name])]
             place = [] if name in OURS or not beside else _places(name)
-            if place and place[0].is_file() and place[0] not in beside:
+            folders = {found.parent for found in beside}  # a compiled module stands beside its source
+            if place and place[0].is_file() and place[0].parent not in folders:
                 yield beside[0], place[0]
 
 

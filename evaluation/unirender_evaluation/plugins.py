@@ -24,7 +24,7 @@ from typing import Any, Union, get_args, get_origin
 from urllib.parse import unquote
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.kept_defaults import kept_defaults
+from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
 from unirender_evaluation.plugin_source import shadowed, source_sha256
 
@@ -32,6 +32,7 @@ ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
 ARGUMENTS = "?name=value&name=value"
 BOOLEANS = {"true": True, "false": False}
+_SET_BY: dict[str, OwnDefaults] = {}  # by name of a module: what its import has set; it is imported once
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,13 @@ class Plugin:
         method: answers.
         source: sha256 of the files that it is made of (`plugin_source`).
         made_by: its class, by which name it was asked for, and the arguments: a file may have several of one `config`.
+        defaults: of the process, as it set them so far.
     """
 
     method: Any
     source: str
     made_by: Mapping[str, Any] = field(default_factory=dict)
+    defaults: OwnDefaults = field(default_factory=OwnDefaults, compare=False, repr=False)
 
 
 def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
@@ -65,7 +68,7 @@ def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
                 f"--predictions {name}=FOLDER"
             )
         what = f"plug-in {name!r} ({found[name].value})"
-        loaded = _attempt(what, "load it", found[name].load)
+        loaded = _attempt(what, "load it", found[name].load, _set_by(found[name].module))
         plugins.append(_plugin(loaded, what, name, sys.modules[found[name].module]))
     return plugins
 
@@ -95,7 +98,7 @@ def named_plugin(spec: str) -> Plugin:
 
 
 def absolute(spec: str) -> str:
-    """The text of a `--method` whose file is found from any folder: a method may change the one that it runs in."""
+    """The text of a `--method` whose file is found from any folder."""
     target, mark, query = spec.partition("?")
     place, separator, name = target.rpartition(":")
     return f"{Path(place).absolute()}{separator}{name}{mark}{query}" if _is_file(place) else spec
@@ -113,7 +116,7 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
     """
     if not callable(found):
         raise UsageError(f"{what}: takes no arguments, expected nothing behind its name")
-    signature = _attempt(what, "read its arguments", lambda: inspect.signature(found, eval_str=True))
+    signature = _attempt(what, "read its arguments", lambda: inspect.signature(found, eval_str=True), OwnDefaults())
     taken = {n: p for n, p in signature.parameters.items() if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     arguments: dict[str, Any] = {}
     for entry in query.split("&"):
@@ -171,7 +174,7 @@ def _module_of_file(path: Path, what: str) -> ModuleType:
     _search_last(path.parent)  # for its neighbours
     sys.modules[name] = module
     try:
-        _attempt(what, "import it", lambda: spec.loader.exec_module(module))  # pyright: ignore[reportOptionalMemberAccess] - checked above
+        _attempt(what, "import it", lambda: spec.loader.exec_module(module), _set_by(name))  # pyright: ignore[reportOptionalMemberAccess] - checked above
     except UnirenderError:
         del sys.modules[name]
         raise
@@ -182,7 +185,7 @@ def _module_of_name(name: str, what: str) -> ModuleType:
     _search_last(Path.cwd())
     importlib.invalidate_caches()
     try:
-        return _attempt(what, "import it", lambda: importlib.import_module(name))
+        return _attempt(what, "import it", lambda: importlib.import_module(name), _set_by(name))
     except UnirenderError as error:
         missing = error.__cause__
         if isinstance(missing, ModuleNotFoundError) and missing.name and f"{name}.".startswith(f"{missing.name}."):
@@ -197,10 +200,14 @@ def _search_last(folder: Path) -> None:
         sys.path.append(str(folder))
 
 
-def _attempt(what: str, task: str, run: Callable[[], Any]) -> Any:
-    """Runs foreign code; whatever it raises becomes one clear line."""
+def _set_by(module: str) -> OwnDefaults:
+    return _SET_BY.setdefault(module, OwnDefaults())
+
+
+def _attempt(what: str, task: str, run: Callable[[], Any], defaults: OwnDefaults) -> Any:
+    """Runs foreign code under its own defaults; whatever it raises becomes one clear line."""
     try:
-        with kept_defaults():
+        with defaults.here():
             return run()
     except UnirenderError as error:  # written to be read: one of ours
         raise UnirenderError(f"{what}: could not {task}: {error}") from error
@@ -220,7 +227,8 @@ def _plugin(
             f"{what}: it takes {', '.join(needed)}, expected a value of each, as in PLACE:{name}?{values}, or a "
             "function without arguments that returns the method"
         )
-    method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments))
+    defaults = _set_by(module.__name__).copy()
+    method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments), defaults)
     try:
         check_method(method)
     except UnirenderError as error:
@@ -233,4 +241,4 @@ def _plugin(
         )
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
-    return Plugin(method, source_sha256(type(method), found, module), made_by)
+    return Plugin(method, source_sha256(type(method), found, module), made_by, defaults)

@@ -63,7 +63,7 @@ class PublicRun:
         """With the LPIPS weights that are here, where the set asks for LPIPS."""
         uses = any(column.metric.name.startswith("lpips_") for spec in public.tables for column in spec.columns)
         backbones = tuple(lpips.available()) if uses else ()
-        return cls(public, tuple(rows), out.absolute(), limit, backbones, versions(backbones))
+        return cls(public, tuple(rows), out, limit, backbones, versions(backbones))
 
     def key(self, row: Row, content: str) -> str:
         """The content key of a record; it begins with the core's version, as `Store` wants it.

@@ -12,6 +12,7 @@ import numpy as np
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.decompositions import Decompositions
+from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.light_methods import MeanLight, UniformLight
 from unirender_evaluation.methods import (
     Composite,
@@ -57,6 +58,7 @@ class Row:
         told: what it is handed beyond the inputs that all rows have, by the name of the task's field: "geometry", the
             object's true mesh. Its label and note say so.
         found: what a stranger's method has found so far.
+        defaults: of the process, as a stranger's method set them so far.
     """
 
     info: MethodInfo
@@ -68,6 +70,7 @@ class Row:
     uses: frozenset[str] = frozenset()
     told: frozenset[str] = frozenset()
     found: Decompositions[Intrinsics | None] = field(default_factory=Decompositions, compare=False, repr=False)
+    defaults: OwnDefaults = field(default_factory=OwnDefaults, compare=False, repr=False)
 
     @property
     def config(self) -> dict[str, Any]:
@@ -249,7 +252,8 @@ def plugin_rows(plugins: Sequence[Plugin]) -> list[Row]:
         config = row.info.config
         stated = {name: config[name] for name in ("steps", "samples", "seed") if type(config.get(name)) is int}
         told_apart = {"name": row.info.label, "source": plugin.source, "made_by": dict(plugin.made_by)}
-        rows.append(replace(row, info=replace(row.info, config={**config, "plugin": told_apart}, **stated)))
+        info = replace(row.info, config={**config, "plugin": told_apart}, **stated)
+        rows.append(replace(row, info=info, defaults=plugin.defaults))
     return rows
 
 

@@ -253,9 +253,10 @@ def resumes(command: Any) -> bool:
 def refuse(error: BaseException) -> int:
     """Prints an error as one line; returns the exit status."""
     if out_of_memory(error):
+        said = f" ({error})" if str(error) else ""
         error = UnirenderError(
-            f"not enough memory ({error}); expected a machine with more, or less asked for at a time: fewer pixels "
-            "(--size), samples, looks or workers"
+            f"not enough memory{said}; expected a machine with more, or less asked for at a time: smaller pictures or "
+            "batches, fewer samples, looks or workers"
         )
     kind = "" if isinstance(error, UnirenderError) else f"internal error: {type(error).__name__}: "
     hint = "" if isinstance(error, UnirenderError) else " (UNIRENDER_DEBUG=1 shows where)"

@@ -123,22 +123,17 @@ def test_maps_of_a_stranger_that_cannot_be_scored_are_named() -> None:
 
 
 def test_a_run_is_the_same_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stranger's method may change it."""
+    """A cluster's workers may run in another."""
     monkeypatch.chdir(tmp_path)
     Path("mine").mkdir()
     named = BenchConfig(
         suite="ball.toml",
-        out=Path("run"),
         checkpoint=Path("mine"),
         method=("guess.py:Guess?folder=mine", "package:Guess"),
         predictions={"mine": Path("mine")},
     )
     config = anywhere(named)
-    assert (config.suite, config.out, config.checkpoint) == (
-        str(tmp_path / "ball.toml"),
-        tmp_path / "run",
-        tmp_path / "mine",
-    )
+    assert (config.suite, config.checkpoint) == (str(tmp_path / "ball.toml"), tmp_path / "mine")
     assert config.method == (f"{tmp_path / 'guess.py'}:Guess?folder=mine", "package:Guess")
     assert config.predictions == {"mine": tmp_path / "mine"}
     assert anywhere(BenchConfig(checkpoint=Path("tiny"))).checkpoint == Path("tiny"), "one that ships"

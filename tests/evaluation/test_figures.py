@@ -247,6 +247,32 @@ def shown(grid: Grid, line: int) -> np.ndarray:
     return tile.picture
 
 
+def test_a_stranger_that_returns_none_leaves_holes(suite: Suite) -> None:
+    """As it leaves numbers out of the tables."""
+
+    class Silent:
+        name, config = "silent", {"weights": None}
+
+        def decompose(self, **_: Any) -> None:
+            return None
+
+        edit = relight = render = decompose
+
+    subjects, scenes = [Subject("silent", make_row(Silent(), "external"))], [suite.scenes[0]]
+    truth = StoredTruth(suite)
+    grids = [
+        material_strip(subjects, suite, scenes, "metallic", (0.0, 1.0), truth),
+        relighting_grid(subjects, suite, scenes, 2, truth),
+        overview(subjects, suite, scenes),
+    ]
+    for grid in grids:
+        (line,) = (line for line in grid.lines if line.label == "silent")
+        assert line.tiles[0] is not None
+        assert set(line.tiles[1:]) == {None}
+    with pytest.raises(UnirenderError, match="silent finds none"):
+        light_figure(subjects, suite, scenes)
+
+
 def test_a_figure_that_no_method_can_fill_is_refused_by_name(suite: Suite) -> None:
     with pytest.raises(UnirenderError, match=r"metallic strip: got as albedo, of which none can edit; .* --kinds"):
         material_strip([ALBEDO], suite, suite.scenes[:1], "metallic", (0.5,), StoredTruth(suite))

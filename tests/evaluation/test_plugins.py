@@ -4,6 +4,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -219,22 +220,57 @@ def test_neighbours_of_one_name_are_not_mistaken(tmp_path: Path, monkeypatch: py
         named_plugin(f"{tmp_path}/two/mine.py:Mine")
 
 
-def test_what_a_method_sets_for_the_whole_process_is_put_back(tmp_path: Path) -> None:
-    """Else LPIPS, and our own rows, would run in float64 or elsewhere."""
+def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> None:
+    """Else LPIPS, and our own rows, would run in float64 or elsewhere; and without it the method's net would not fit
+    to what it makes in its next call. Two of a file have what its import set, and each its own."""
     import torch
 
     file = tmp_path / "setting.py"
     file.write_text(
-        "import numpy as np\nimport torch\ntorch.set_default_dtype(torch.float64)\nnp.seterr(all='raise')\n"
-        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics):\n"
-        "        torch.set_default_device('meta')\n        return np.zeros((2, 2, 3))"
+        "import numpy as np\nimport torch\ntorch.set_default_dtype(torch.float64)\nnp.seterr(divide='raise')\n"
+        "class Mine:\n    name, config = 'mine', {}\n"
+        "    def __init__(self):\n        torch.set_default_device('meta')\n"
+        "    def render(self, intrinsics):\n        self.saw = torch.ones(2), np.geterr()['divide']\n"
+        "        np.seterr(over='raise')\n        return np.zeros((2, 2, 3))\n"
+        "class Other(Mine):\n    def __init__(self): ..."
     )
     before, errors = (torch.get_default_dtype(), torch.get_default_device()), np.geterr()
-    (row,) = plugin_rows([named_plugin(f"{file}:Mine")])
-    assert torch.get_default_dtype() == before[0]
-    engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
-    assert (torch.get_default_dtype(), torch.get_default_device()) == before
-    assert np.geterr() == errors
+    for name, device in (("Mine", "meta"), ("Other", "cpu")):
+        (row,) = plugin_rows([named_plugin(f"{file}:{name}")])
+        for _ in range(2):
+            engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+            made, divide = row.method.saw
+            assert (made.dtype, made.device.type, divide) == (torch.float64, device, "raise")
+            assert (torch.get_default_dtype(), torch.get_default_device()) == before
+            assert np.geterr() == errors
+
+
+def test_a_compiled_neighbour_is_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python prefers the one that Cython or mypyc has left beside it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    for suffix in (".py", EXTENSION_SUFFIXES[0]):
+        (tmp_path / f"my_compiled_net{suffix}").write_text("")
+    (tmp_path / "mine.py").write_text(
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): import my_compiled_net"
+    )
+    named_plugin(f"{tmp_path}/mine.py:Mine")
+
+
+def test_a_method_may_change_the_folder_that_it_runs_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All others stay where they are: else a relative --out would lie elsewhere, and a relative --method be gone."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "weights").mkdir()
+    (tmp_path / "walker.py").write_text(
+        "import os\nimport numpy as np\nclass Walker:\n    name, config = 'walker', {}\n"
+        "    def __init__(self):\n        os.chdir('weights')\n"
+        "    def render(self, intrinsics):\n        self.saw = os.getcwd()\n        return np.zeros((2, 2, 3))"
+    )
+    for _ in range(2):
+        (row,) = plugin_rows([named_plugin("walker.py:Walker")])
+        for _ in range(2):
+            engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+            assert row.method.saw == str(tmp_path / "weights")
+            assert Path.cwd() == tmp_path
 
 
 def test_nothing_of_pythons_own_library_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

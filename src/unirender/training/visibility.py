@@ -86,13 +86,13 @@ class TrainVisibility:
 
     def run(self, alone: Alone = contextlib.nullcontext) -> int:
         """Trains, or resumes; returns the exit status."""
+        from unirender.training.checkpoint import check_leftover
+
         self.check()
         if not self.data.is_dir():
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset --vary visibility`"
             )
-        from unirender.training.checkpoint import check_leftover
-
         check_out(self.out)
         check_leftover(self.out, WEIGHTS_FILE)
         with alone(self.out):
