@@ -261,11 +261,11 @@ class Light:
 
 @pytest.mark.parametrize(
     "light",
-    [np.ones((2, 2, 3)), np.ones((1, 4, 8, 3)), np.zeros((4, 8, 3)), np.full((4, 8, 3), 2e30)],
+    [np.ones((2, 2, 3)), np.ones((4, 7, 3)), np.zeros((4, 8, 3)), np.full((4, 8, 3), 2e30)],
 )
 def test_a_plug_in_whose_light_cannot_be_scored_is_named(suite: Suite, light: np.ndarray) -> None:
     row = make_row(Light(light.astype(np.float32)), "external")
-    with pytest.raises(UnirenderError, match=r"method 'same light', decompose \(.*(2 height|not a batch)"):
+    with pytest.raises(UnirenderError, match=r"method 'same light', decompose \(light/.*2 height"):
         answer(row, first(suite))
     inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
     assert answer(row, inverse).maps is not None  # where no light is asked for, nobody looks at it
