@@ -13,7 +13,7 @@ from rich.progress import Progress
 from tiny_suites import make_suite, write_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.benchmark import _work, prepare
 from unirender_evaluation.bounds import CEILING_KEY
 from unirender_evaluation.records import Record
@@ -77,7 +77,9 @@ def test_records_and_pictures_are_those_of_one_machine(
     stored = next(record for record in here if record.method == CEILING_KEY)
     store.lay_by(stored)
     monkeypatch.chdir(tmp_path)
-    _work(elsewhere, replace(config, suite="suite/ball.toml", cluster=scheduler), store, Progress(disable=True))
+    _work(
+        elsewhere, anywhere(replace(config, suite="suite/ball.toml", cluster=scheduler)), store, Progress(disable=True)
+    )
     found = store.used
     assert all(found[r.key] == replace(r, seconds=found[r.key].seconds) for r in here)
     assert any(record.table == "physics" and record.values for record in found.values()), "Mitsuba's, too"

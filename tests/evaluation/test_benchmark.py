@@ -279,7 +279,7 @@ def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
 @pytest.mark.long
 def test_workers_give_the_same_numbers(suite: Suite, tmp_path: Path) -> None:
     here = evaluate(suite, trivial_rows(), tmp_path / "here.jsonl")
-    whole = Run(suite, (), list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
+    whole = Run(suite, trivial_rows(), list(suite.scenes), TEST_VERSIONS, (), tmp_path / "pictures", NO_MITSUBA)
     made = [r for records in run_in_workers(whole, trivial_rows, [suite.scenes[0]], frozenset(), 1) for r in records]
     expected = {r.key: r.values for r in here}
     found = {r.key: r.values for r in made if r.table != "physics"}
