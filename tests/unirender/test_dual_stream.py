@@ -110,6 +110,17 @@ def test_rows_are_decoded_where_asked_for() -> None:
 
 @torch.no_grad()
 @pytest.mark.parametrize("unified", [True, False])
+def test_an_output_is_a_mapping_of_what_was_predicted(unified: bool) -> None:
+    """As diffusers has it, for whom an output without entries is empty."""
+    model, _ = make_model(unified=unified, physics_prior="none")
+    extra, t = torch.zeros(2, 12, 16, 16), torch.tensor([500, 0])
+    out = model(torch.zeros(2, 72, 16, 16), torch.zeros(2, 12, 16, 16), t, t.flip(0), extra, extra, image_rows=None)
+    assert list(out.keys()) == ["attributes", "encoded_image"]
+    assert out[0] is out.attributes
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("unified", [True, False])
 def test_what_was_encoded_stands_for_its_rows_in_another_call(unified: bool) -> None:
     model, _ = make_model(unified=unified, physics_prior="none")
     generator = torch.Generator().manual_seed(0)

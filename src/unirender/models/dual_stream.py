@@ -217,18 +217,18 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         if isinstance(i, Tensor):
             added = self.features_of(i, image_timestep, image_extra)
             i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra, added)
-        output = DualStreamOutput()
+        predicted = rendered = seen_attributes = seen_image = answers = None
         if attribute_rows is not None:
-            seen = output.encoded_image = i[attribute_rows]
-            output.attributes = self.decode(self.attribute_unet, a[attribute_rows], seen, self.image_to_attributes)
+            seen_image = i[attribute_rows]
+            predicted = self.decode(self.attribute_unet, a[attribute_rows], seen_image, self.image_to_attributes)
             if added and added.answers:
-                output.answers = added.answers.each(lambda x: x[attribute_rows])
+                answers = added.answers.each(lambda x: x[attribute_rows])
         if image_rows is not None:
-            seen = output.encoded_attributes = a[image_rows]
-            output.image = self.decode(self.image_unet, i[image_rows], seen, self.attributes_to_image)
+            seen_attributes = a[image_rows]
+            rendered = self.decode(self.image_unet, i[image_rows], seen_attributes, self.attributes_to_image)
             if image_prior is not None:
-                output.image = output.image + image_prior[image_rows]
-        return output
+                rendered = rendered + image_prior[image_rows]
+        return DualStreamOutput(predicted, rendered, seen_attributes, seen_image, answers)
 
     def context(
         self, attributes: Tensor | Encoded, image: Tensor | Encoded, light: Float[Tensor, "b 4 eh ew"] | None

@@ -53,16 +53,15 @@ class SplitDualStreamModel(DualStreamModel):
         def rows_of(rows: slice) -> list[Any]:
             return [x if x is None else x[rows] for x in inputs]
 
-        found = DualStreamOutput()
+        inverse = rendered = DualStreamOutput()
         if attribute_rows is not None:
             inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
-            found.attributes, found.encoded_image = inverse.attributes, inverse.encoded_image
-            found.answers = inverse.answers
         if image_rows is not None:
             lit = None if light is None else light[image_rows]
             rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)
-            found.image, found.encoded_attributes = rendered.image, rendered.encoded_attributes
-        return found
+        return DualStreamOutput(
+            inverse.attributes, rendered.image, rendered.encoded_attributes, inverse.encoded_image, inverse.answers
+        )
 
 
 def remove_decoder(unet: UNet2DConditionModel) -> None:
