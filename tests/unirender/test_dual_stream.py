@@ -13,7 +13,8 @@ from tiny_models import make_model
 from torch import Tensor
 
 from unirender.models.build import build_model
-from unirender.models.dual_stream import DualStreamModel, Encoded, pyramid_channels
+from unirender.models.dual_stream import DualStreamModel, Encoded
+from unirender.models.unet import pyramid_channels
 from unirender.training.presets import PRESETS
 
 

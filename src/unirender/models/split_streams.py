@@ -10,11 +10,11 @@ import functools
 from typing import Any
 
 from diffusers.models.modeling_utils import ModelMixin  # noqa: F401 - by it diffusers knows that this module has models
-from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from unirender.models.dual_stream import ALL_ROWS, DualStreamModel, DualStreamOutput, Encoded
+from unirender.models.unet import remove_decoder
 
 
 class SplitDualStreamModel(DualStreamModel):
@@ -62,10 +62,3 @@ class SplitDualStreamModel(DualStreamModel):
         return DualStreamOutput(
             inverse.attributes, rendered.image, rendered.encoded_attributes, inverse.encoded_image, inverse.answers
         )
-
-
-def remove_decoder(unet: UNet2DConditionModel) -> None:
-    """Takes the layers behind the mid block out of a U-Net."""
-    unet.up_blocks = nn.ModuleList()
-    unet.conv_norm_out, unet.conv_act = None, None
-    del unet.conv_out
