@@ -107,11 +107,7 @@ class Frame:
 
     def camera(self, camera: Camera) -> Camera:
         """The same camera for the square."""
-        half = math.tan(math.radians(camera.fov_deg) / 2) * self.side / self.height
-        top, left = self.corner
-        x = (camera.principal[0] * self.width - left) / self.side
-        y = (camera.principal[1] * self.height - top) / self.side
-        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
+        return camera.of_square(*self.corner, self.side, self.height, self.width)
 
     def enter(self, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "s s c"]:
         """Picture -> square; for premultiplied pictures and coverage."""
