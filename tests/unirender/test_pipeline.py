@@ -28,13 +28,13 @@ from unirender.pipelines.editing import (
     SMALL_CHANGE,
     TRUST_WIDER,
     anchor,
-    constant_map,
     specular_for_roughness,
     specular_share,
     trust,
     under_light,
 )
 from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 

@@ -14,8 +14,8 @@ from unirender.lighting import as_light
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.editing import constant_map
 from unirender.pipelines.framing import thumbnail
+from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.results import Decomposition
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")

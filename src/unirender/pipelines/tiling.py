@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import unit_normal
 
 TILED = ("albedo", "normal")  # not s and d: a crop shows too little of what is lit to say how (docs/model.md)
 TILES_AT_ONCE = 16
