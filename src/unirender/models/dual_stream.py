@@ -4,7 +4,10 @@ One stream denoises the intrinsic attributes, the other the RGB image. Every ski
 encoder is added, through a zero-initialised 1x1 convolution, to the other stream's decoder; both ways, and exchanged
 before either is fused. Each stream has its own timestep, so that one of them can be the clean condition of the other.
 
-Notation: `a` attribute stream, `i` image stream; the *feature pyramid* is that of `unirender.models.unet`.
+    x_0^a, x_0^i = f(x_t^a, x_t^i, t_a, t_i),    h_l^a <- h_l^a + Z_l h_l^i,    h_l^i <- h_l^i + Z'_l h_l^a
+
+Notation: a attribute stream, i image stream; h_l entry l of the *feature pyramid* (`unirender.models.unet`), which goes
+into the stream's decoder; Z, Z' zero convolutions.
 The path of this module is recorded by saved checkpoints: it never moves.
 """
 
