@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from accelerate import cpu_offload
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from PIL import Image
 from tiny_models import SIZE, make_pipeline
 
@@ -495,6 +496,10 @@ def test_diffusers_conventions(pipeline: UniRenderPipeline, tmp_path: Path) -> N
     assert np.abs(get(rough, "albedo") - get(first, "albedo")).mean() < 0.05
     with pytest.raises(UnirenderError, match="no pipeline folder"):
         UniRenderPipeline.from_pretrained(tmp_path / "missing")
+    with pytest.raises(AttributeError, match="no attribute UniRenderPipeline"):  # docs/model.md says so
+        DiffusionPipeline.from_pretrained(tmp_path)
+    part = DualStreamModel.from_pretrained(tmp_path, subfolder="dual_stream")
+    assert all(torch.equal(p, q) for p, q in zip(part.parameters(), pipeline.dual_stream.parameters(), strict=True))
 
 
 def test_offloaded_weights_give_the_same(pipeline: UniRenderPipeline, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,6 +102,8 @@ class DualStreamModel(ModelMixin, ConfigMixin):
 
     _supports_gradient_checkpointing = True
     _no_split_modules: ClassVar[list[str]] = ["BasicTransformerBlock", "ResnetBlock2D"]
+    _repeated_blocks: ClassVar[list[str]] = ["BasicTransformerBlock"]
+    _skip_layerwise_casting_patterns: ClassVar[list[str]] = ["norm"]
 
     @register_to_config
     def __init__(
