@@ -78,6 +78,21 @@ class Camera:
         """Unit directions from each pixel's surface point towards the viewer: `-rays`."""
         return -self.rays(height, width)
 
+    def of_square(self, top: int, left: int, side: int, height: int, width: int) -> "Camera":
+        """The camera of a square part of a picture: the same rays through the same pixels.
+
+        Args:
+            top: its first row; it may reach beyond the picture.
+            left: its first column.
+            side: of the square, pixels.
+            height: of the picture, pixels.
+            width: of the picture, pixels.
+        """
+        half = math.tan(math.radians(self.fov_deg) / 2) * side / height
+        x = (self.principal[0] * width - left) / side
+        y = (self.principal[1] * height - top) / side
+        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
+
     def distance(self, radius: float = 1.0, fill: float = DEFAULT_FILL) -> float:
         """Distance at which a sphere's silhouette fills `fill` of the frame height.
 

@@ -15,7 +15,7 @@ from tiny_models import MODEL, SIZE, TRAIN, make_pipeline
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.calibration import calibrated, check_lines
-from unirender.pipelines.editing import masked_mean
+from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.calibrate import Calibrate, Line, fit, readings, write_calibrated

@@ -12,7 +12,8 @@ from tiny_models import SIZE, make_pipeline
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
-from unirender.pipelines.framing import Frame, divide, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import divide, unit_normal
 from unirender.pipelines.tiling import TILED, add_detail, blend_tiles, tiles, window
 
 TILE = 16

@@ -9,23 +9,21 @@ from PIL import Image
 
 from unirender.display_files import display_colors, display_values
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics, as_numbers
+from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.lighting import as_light
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.editing import constant_map
 from unirender.pipelines.framing import thumbnail
+from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.results import Decomposition
+from unirender.pipelines.settings import TAKING_APART
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
-RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
-# of `decompose` alone, and their defaults
-TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
 
 
 def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:

@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import unit_normal
 
 TILED = ("albedo", "normal")  # not s and d: a crop shows too little of what is lit to say how (docs/model.md)
 TILES_AT_ONCE = 16
@@ -53,11 +54,8 @@ class Tile:
         return np.pad(part, missing)
 
     def camera(self, camera: Camera, height: int, width: int) -> Camera:
-        """The camera of a picture of `height` x `width`, for the tile: the same rays through the same pixels."""
-        half = math.tan(math.radians(camera.fov_deg) / 2) * self.size / height
-        x = (camera.principal[0] * width - self.left) / self.size
-        y = (camera.principal[1] * height - self.top) / self.size
-        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
+        """The camera of a picture of `height` x `width`, for the tile."""
+        return camera.of_square(self.top, self.left, self.size, height, width)
 
 
 def tiles(height: int, width: int, size: int) -> Iterator[Tile]:

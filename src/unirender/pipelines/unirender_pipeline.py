@@ -193,6 +193,7 @@ class UniRenderPipeline(DualStreamPipeline):
         found = decompose_views(
             network, views, how, material=material, closed=closed, flat=flat, tile=tile, calibration=lines
         )
+        self.maybe_free_model_hooks()
         made_with = {"looks": how.looks, "tile": bool(tile), "material": material}
         made_with |= {"closed": bool(closed), "flat": bool(flat)}
         return [
@@ -241,7 +242,9 @@ class UniRenderPipeline(DualStreamPipeline):
         check_switches(shadows=shadows)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
-        return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
+        (image,) = render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)
+        self.maybe_free_model_hooks()
+        return image
 
     def overflow(self, intrinsics: Intrinsics, *, shadows: bool = True) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
@@ -393,7 +396,9 @@ class UniRenderPipeline(DualStreamPipeline):
         # Both renders see the same noise, so that it cancels in what changes.
         seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
         first, second = (Sampling.of(**settings, generator=own) for own in same_noise(seed, 2))
-        (after,) = render_any_size(network, [edited], first, self._report_overflow, derived)
-        if not anchored:
-            return after
-        return anchor(srgb_decode(picture) * cover, render_any_size(network, [before], second)[0], after)
+        (image,) = render_any_size(network, [edited], first, self._report_overflow, derived)
+        if anchored:
+            (unedited,) = render_any_size(network, [before], second)
+            image = anchor(srgb_decode(picture) * cover, unedited, image)
+        self.maybe_free_model_hooks()
+        return image
