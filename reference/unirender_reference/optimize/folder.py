@@ -125,7 +125,7 @@ def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | 
         raise UnirenderError(
             f"{frame.file}: has no alpha channel, and its frame no mask_path; expected one of them (white: object)"
         )
-    pose = (Y_UP @ frame.pose if up == "z" else frame.pose).astype(np.float32)
+    pose = Y_UP @ frame.pose if up == "z" else frame.pose
     camera = frame.camera(*image.shape[:2])
     try:
         view = View(image, mask, camera, pose, name=Path(frame.values["file_path"]).as_posix())
