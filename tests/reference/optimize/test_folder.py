@@ -19,8 +19,10 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender_reference.optimize.folder import read_views, reduced, write_views
 from unirender_reference.optimize.losses import ImageLoss
+from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.state import fingerprint
 from unirender_reference.optimize.views import View, Views
+from unirender_reference.shapes import Sphere
 
 
 def same_views(a: Views, b: Views, tolerance: float) -> None:
@@ -90,6 +92,62 @@ def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path, caplog: 
         caplog.text.count("pictures are 16 x 12, w and h say 32 x 24: focal lengths and cx, cy are multiplied by 0.5")
         == 1
     )
+
+
+def test_a_frame_with_an_angle_of_its_own_takes_no_focal_length_from_the_top(folder: Path):
+    views = read_views(folder)
+
+    def other_at_the_top(content: dict) -> None:
+        content.update(fl_x=99.0, camera_angle_y=1.5)
+        for frame in content["frames"]:
+            focal = frame.pop("fl_x")
+            del frame["fl_y"]
+            frame["camera_angle_x"] = 2 * math.atan(16 / (2 * focal))
+
+    same_views(views, read_views(edited(folder, other_at_the_top)), 0.0)
+
+
+def test_a_focal_length_beside_its_angle_is_the_same_camera(folder: Path):
+    """instant-ngp's converter writes both."""
+    views = read_views(folder)
+
+    def both(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["camera_angle_x"] = 2 * math.atan(16 / (2 * frame["fl_x"]))
+
+    same_views(views, read_views(edited(folder, both)), 0.0)
+
+
+def test_what_nerfstudio_says_of_a_straight_lens_is_taken(folder: Path):
+    views = read_views(folder)
+    straight = {"camera_model": "pinhole", "distortion_params": [0, 0.0, 0, 0, 0, 0]}
+    same_views(views, read_views(edited(folder, lambda content: content.update(straight))), 0.0)
+
+
+def test_paths_with_the_backslashes_of_windows_are_found(folder: Path):
+    views = read_views(folder)
+
+    def of_windows(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["file_path"] = frame["file_path"].replace("/", "\\")
+            frame["mask_path"] = ".\\" + frame["file_path"]
+
+    same_views(views, read_views(edited(folder, of_windows)), 0.0)
+
+
+def test_cameras_far_from_the_worlds_origin_keep_their_places(folder: Path):
+    """Places in metres of a national grid: float32 has steps of half a metre there."""
+    place = Sphere(np.array([5e5, 4e6, 1e2]), 1.0)
+    near = read_views(folder)
+
+    def moved(content: dict) -> None:
+        for frame in content["frames"]:
+            for row, offset in zip(frame["transform_matrix"], place.center, strict=False):
+                row[3] += offset
+
+    far = placed(read_views(edited(folder, moved)), place)
+    for given, found in zip(near.seen, far.seen, strict=True):
+        np.testing.assert_allclose(found.pose, given.pose, rtol=0, atol=1e-6)
 
 
 def test_pictures_without_suffix_in_the_layout_of_nerf_synthetic(folder: Path):
@@ -314,6 +372,12 @@ BAD = {
     "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
     "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
     "slightly oblong pixels": (first(fl_x=40.0, fl_y=39.8), "square pixels"),
+    "focal length against angle": (
+        first(camera_angle_x=1.2),
+        r"focal length 18\.\d+ \(fl_x, fl_y\) and camera_angle_x, which makes it 11\.\d+ pixels in a picture of 16 x 12",
+    ),
+    "camera model": (first(camera_model="FISHEYE624"), r"expected a pinhole \(PINHOLE, "),
+    "listed distortion": (first(distortion_params=[0.01, 0, 0, 0, 0, 0]), r"distorted \(distortion_params not 0\)"),
     "distortion": (first(k1=0.1), r"distorted \(k1 not 0\)"),
     "fisheye": (first(camera_model="OPENCV_FISHEYE"), "expected a pinhole"),
     "fisheye of instant-ngp": (broken(lambda content: content.update(is_fisheye=True)), "is_fisheye is true, expected"),
