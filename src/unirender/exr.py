@@ -68,6 +68,14 @@ def write_environment(
     write_exr(path, image_channels(environment), half=False, attributes=marked)
 
 
+def header_camera(attributes: Mapping[str, str]) -> Camera | None:
+    """The camera that a file's header states as ours do; None where it states none, or what others call a camera."""
+    try:
+        return Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
+    except UnirenderError:
+        return None
+
+
 def on_pole_grid(attributes: Mapping[str, str]) -> bool:
     """Whether a lat-long map with these attributes is an environment of the contract, to be taken as it is.
 

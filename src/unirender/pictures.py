@@ -1,6 +1,5 @@
 """Pictures and masks from files: PNG, JPG and whatever else Pillow knows, and linear OpenEXR."""
 
-import contextlib
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
-from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
+from unirender.exr import channels_rgb, header_camera, read_exr
 
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 OPAQUE = DISPLAY_WHITE  # a coverage from which it is whole: no alpha of 8 bits lies between
@@ -215,7 +214,4 @@ def _read_exr_picture(path: Path) -> Picture:
         if np.abs(alpha - mask[..., 0]).max() > ALPHA_TOLERANCE:
             remarks["alpha"] = f"{name} has values in [{alpha.min():.3g}, {alpha.max():.3g}], clipped to [0, 1]"
         rgb = unpremultiply(rgb, mask)
-    camera = None
-    with contextlib.suppress(UnirenderError):  # other programs may write what they call a camera
-        camera = Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
-    return Picture(image_srgb(rgb), mask, path.name, negative, camera, remarks)
+    return Picture(image_srgb(rgb), mask, path.name, negative, header_camera(attributes), remarks)

@@ -11,16 +11,18 @@ import json
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.camera import Camera
 from unirender.color import srgb_decode, srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
+from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
 from unirender.files import new_folder, write_png
-from unirender.pictures import check_mask, read_mask, read_picture
+from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender_reference.meshes.images import area_means
 from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
 from unirender_reference.optimize.views import SATURATED, View, Views
@@ -117,7 +119,8 @@ def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
 
 def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, sizes: set[str]) -> View:
     """Reads one picture with its mask; a lens in pixels of another size is noted among `sizes`."""
-    image, mask, _ = read_picture_file(frame.file)
+    picture = read_picture_file(frame.file)
+    image, mask = picture.image, picture.mask
     sizes |= frame.other_size(*image.shape[:2])
     if frame.mask is not None:
         mask = read_mask(frame.mask, image.shape[:2])
@@ -134,37 +137,52 @@ def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | 
     return view if longest_side is None else reduced(view, longest_side, linear)
 
 
-def read_picture_file(
-    path: Path,
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None, bool]:
-    """Straight colour, the alpha channel, and whether it is linear radiance (EXR).
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture as its file has it.
+
+    Attributes:
+        image: straight colour: display values in [0, 1], or linear radiance where `linear`.
+        mask: the alpha channel, or None.
+        linear: whether it is an EXR.
+        camera: that its header states (EXR files of ours do), or None.
+    """
+
+    image: Float[np.ndarray, "h w 3"]
+    mask: Float[np.ndarray, "h w 1"] | None
+    linear: bool
+    camera: Camera | None
+
+
+def read_picture_file(path: Path) -> PictureFile:
+    """Reads a picture; what is lost in it is logged.
 
     Raises:
         UnirenderError: the file is missing, broken, or no picture.
     """
     if path.suffix.lower() == ".exr":
-        return *_linear_picture(path), True
+        return _linear_picture(path)
     picture = read_picture(path)
     for remark in picture.remarks.values():
         _log.warning("%s: %s", path, remark)
-    return picture.image_srgb, picture.mask, False
+    return PictureFile(picture.image_srgb, picture.mask, False, picture.camera)
 
 
-def _linear_picture(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None]:
-    """Straight linear radiance and the alpha channel of an EXR."""
-    channels, _ = read_exr(path)
+def _linear_picture(path: Path) -> PictureFile:
+    """An EXR's straight linear radiance; what `negative_share` lets pass is 0."""
+    channels, attributes = read_exr(path)
     try:
         rgb = channels_rgb(channels)
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}; expected a picture") from error
-    alpha = channels.get("A")
-    values = rgb if alpha is None else np.concatenate([rgb, alpha[..., None]], axis=-1)
-    if not np.isfinite(values).all() or rgb.min() < 0:
-        raise UnirenderError(f"{path}: has negative, infinite or NaN values, expected radiance >= 0; repair them first")
-    if alpha is None:
-        return rgb, None
-    mask = check_mask(alpha[..., None], f"{path} (A)")
-    return unpremultiply(rgb, mask), mask
+    name = "A" if "A" in channels else "mask.Y"
+    alpha = channels.get(name)
+    check_finite(rgb if alpha is None else np.dstack([rgb, alpha]), str(path))
+    if negative := negative_share(rgb, str(path)):
+        _log.warning("%s: %.1g%% of the radiance is negative and was set to 0", path, 100 * negative)
+        rgb = np.maximum(rgb, 0)
+    mask = None if alpha is None else check_mask(alpha[..., None], f"{path} ({name})")
+    return PictureFile(rgb if mask is None else unpremultiply(rgb, mask), mask, True, header_camera(attributes))
 
 
 def reduced(view: View, longest_side: int, linear: bool) -> View:
