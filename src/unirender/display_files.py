@@ -14,6 +14,7 @@ from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bi
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
+SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
@@ -73,12 +74,22 @@ def srgb_values_and_remarks(path: Path, name: str) -> tuple[Float[np.ndarray, "h
     """The same, and remarks by kind on what was lost in reading it."""
     image = open_picture(path)
     srgb = in_srgb(image, name)
+    remarks = _gamma_remarks(image)
     full = sixteen_bit_values(path, upright=True) if srgb is image else None
     if full is not None:
-        return full, {}
+        return full, remarks
     with opened(path) as file:
         cut = has_sixteen_bits(file)
-    return display_values(srgb, name), {"depth": SIXTEEN_BITS} if cut else {}
+    return display_values(srgb, name), remarks | ({"depth": SIXTEEN_BITS} if cut else {})
+
+
+def _gamma_remarks(image: Image.Image) -> dict[str, str]:
+    """What is due on a PNG that states another gamma and nothing that counts more (an sRGB chunk, an ICC profile)."""
+    gamma, more = image.info.get("gamma"), {"srgb", "icc_profile"} & image.info.keys()
+    if gamma is None or more or abs(gamma - SRGB_GAMMA) <= SAME_GAMMA:
+        return {}
+    said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), and its values are taken as sRGB"
+    return {"gamma": f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said}
 
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
