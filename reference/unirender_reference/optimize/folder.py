@@ -252,7 +252,7 @@ def _written(view: View, folder: Path, index: int, linear: bool) -> dict[str, ob
         write_exr(folder / file, image_channels(rgba), half=False)
     else:
         write_png(folder / file, np.concatenate([view.image, view.mask], axis=-1))
-    focal = height / (2 * math.tan(math.radians(view.camera.fov_deg) / 2))
+    focal = view.camera.focal(height)
     x, y = view.camera.principal
     return {
         "file_path": file,

@@ -76,10 +76,9 @@ class Frame:
         focal = self._focal(stated[1], stated[0]) * scale
         center = (self._number("cx", stated[1] / 2) * scale, self._number("cy", stated[0] / 2) * scale)
         try:
-            fov_deg = math.degrees(2 * math.atan(height / (2 * focal)))
-            return Camera(fov_deg, (center[0] / width, center[1] / height))
-        except (UnirenderError, ZeroDivisionError) as error:
-            raise UnirenderError(f"{self.name}: focal length {focal:g} pixels, expected more than 0") from error
+            return Camera.from_focal(focal, height, width, center)
+        except UnirenderError as error:
+            raise UnirenderError(f"{self.name}: {error}") from error
 
     def other_size(self, height: int, width: int) -> set[str]:
         """A sentence, if focal length or centre count in pixels of another size than the picture has."""
