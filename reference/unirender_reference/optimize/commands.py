@@ -114,7 +114,7 @@ class Optimize:
         if not self.input.exists():
             raise UnirenderError(f"{self.input}: no such file or folder, expected posed pictures or one picture")
         if self.input.suffix.lower() == ".json" and self.input.is_file():
-            raise UsageError(f"{self.input}: is a file of poses, expected the folder that it lies in: {self.input.parent}")
+            raise UsageError(f"{self.input}: is a file of poses, expected its folder, {self.input.parent}")
         self.check()
         if self.init == "unirender" and predict is None:
             raise UnirenderError("--init unirender: no model at hand, expected the command line to bring one")

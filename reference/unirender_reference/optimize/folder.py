@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -55,8 +56,9 @@ def read_views(
         longest_side: larger pictures are reduced to this many pixels, by means of area in linear light.
 
     Raises:
-        UnirenderError: one sentence that names the file and what is wrong with it.
+        UnirenderError: one sentence that names the file, or the argument, and what is wrong with it.
     """
+    _check_arguments(up, hold_out, most_views, longest_side)
     folder = Path(folder)
     main = next((folder / name for name in SEEN_FILES if (folder / name).is_file()), None)
     if main is None:
@@ -96,6 +98,16 @@ def read_views(
         raise UnirenderError(f"{folder}: {error}") from error
     _warn(views, [*seen, *held_out])
     return views
+
+
+def _check_arguments(up: Up, hold_out: int, most_views: int | None, longest_side: int | None) -> None:
+    if up not in get_args(Up):
+        raise UnirenderError(f"up: got {up!r}, expected one of {', '.join(get_args(Up))}")
+    if hold_out < 0 or hold_out == 1:
+        raise UnirenderError(f"hold_out: got {hold_out}, expected 2 or more, or 0 (those that the folder holds out)")
+    for name, value in (("most_views", most_views), ("longest_side", longest_side)):
+        if value is not None and value < 1:
+            raise UnirenderError(f"{name}: got {value}, expected 1 or more, or None (no limit)")
 
 
 def _warn(views: Views, frames: Sequence[Frame]) -> None:

@@ -77,6 +77,9 @@ class Views:
     def __post_init__(self) -> None:
         if not self.seen:
             raise UnirenderError("views: got none, expected at least one picture with its camera")
+        for view in (*self.seen, *self.held_out):
+            if not isinstance(view, View):
+                raise UnirenderError(f"views: got a {type(view).__name__} among them, expected a View each")
         sizes = {view.image.shape: view.name for view in (*self.seen, *self.held_out)}
         if len(sizes) > 1:
             named = ", ".join(f"{width} x {height} ({name})" for (height, width, _), name in sorted(sizes.items()))

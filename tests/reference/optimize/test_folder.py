@@ -251,6 +251,15 @@ def test_a_little_negative_radiance_is_zero_and_told(folder: Path, caplog: pytes
     assert caplog.text.count("of the radiance is negative and was set to 0") == 3
 
 
+@pytest.mark.parametrize(
+    "options", [{"hold_out": 1}, {"hold_out": -2}, {"most_views": 0}, {"longest_side": 0}], ids=lambda one: str(one)
+)
+def test_numbers_out_of_their_range_are_refused(folder: Path, options: dict[str, int]):
+    (name,) = options
+    with pytest.raises(UnirenderError, match=f"{name}: got .*, expected"):
+        read_views(folder, **options)  # pyright: ignore[reportArgumentType] - a number each
+
+
 def test_a_mean_with_a_clipped_value_is_a_lower_bound():
     """The reduced picture is far below 1 there, and says that it may be more."""
     image, mask = np.full((8, 8, 3), 0.5, np.float32), np.ones((8, 8, 1), np.float32)

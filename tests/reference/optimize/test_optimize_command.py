@@ -263,7 +263,7 @@ def test_wrong_command_lines_of_a_picture(tmp_path: Path):
         with pytest.raises(UsageError, match=message):
             command(tmp_path / "one.png", "--out", tmp_path / "out", *arguments).run()
     (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(UsageError, match="is a file of poses, expected the folder that it lies in"):
+    with pytest.raises(UsageError, match="is a file of poses, expected its folder"):
         command(tmp_path / "transforms.json", "--out", tmp_path / "out").run()
     with pytest.raises(UnirenderError, match="no such file or folder"):
         command(tmp_path / "two", "--up", "z", "--out", tmp_path / "out").run()
