@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode, srgb_encode, unpremultiply
+from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
 from unirender.files import new_folder, write_png
@@ -30,6 +31,7 @@ from unirender_reference.optimize.views import SATURATED, View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
+UNTURNED = "EXIF orientations of the pictures are not followed: poses count in the pixels as they are stored"
 LEAST_SHARE = 1e-6  # of a new pixel: less is rounding
 
 _log = logging.getLogger("unirender.optimize")
@@ -46,7 +48,8 @@ def read_views(
     """Reads a folder of posed pictures; poses stay in its units (`placement.placed` moves them).
 
     A picture needs a mask: the file that its `mask_path` names (white: object), else its alpha channel. PNG is straight
-    colour; EXR is linear and premultiplied by its own alpha channel.
+    colour; EXR is linear and premultiplied by its own alpha channel. EXIF orientations are not followed: poses count in
+    the pixels as they are stored.
 
     Args:
         folder: with `transforms.json` (or `transforms_train.json`).
@@ -84,14 +87,14 @@ def read_views(
     if len(hdr) > 1:
         raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
     linear = hdr.pop()
-    sizes: set[str] = set()
+    notices: set[str] = set()
     views = Views(
-        seen=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in seen),
-        held_out=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in held_out),
+        seen=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in seen),
+        held_out=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in held_out),
         hdr=linear,
     )
-    for size in sorted(sizes):
-        _log.warning("%s: %s", main, size)
+    for notice in sorted(notices):
+        _log.warning("%s: %s", main, notice)
     try:
         views.require_light()
     except UnirenderError as error:
@@ -129,13 +132,15 @@ def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
     return [frames[index * len(frames) // most] for index in range(most)]
 
 
-def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, sizes: set[str]) -> View:
-    """Reads one picture with its mask; a lens in pixels of another size is noted among `sizes`."""
-    picture = read_picture_file(frame.file)
+def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, notices: set[str]) -> View:
+    """Reads one picture with its mask; what is due on the set as a whole goes to `notices`."""
+    picture = read_picture_file(frame.file, upright=False)
     image, mask = picture.image, picture.mask
-    sizes |= frame.other_size(*image.shape[:2])
+    notices |= frame.other_size(*image.shape[:2])
+    if not linear and is_turned(frame.file):
+        notices.add(UNTURNED)
     if frame.mask is not None:
-        mask = read_mask(frame.mask, image.shape[:2])
+        mask = read_mask(frame.mask, image.shape[:2], upright=False)
     if mask is None:
         raise UnirenderError(
             f"{frame.file}: has no alpha channel, and its frame no mask_path; expected one of them (white: object)"
@@ -166,15 +171,15 @@ class PictureFile:
     camera: Camera | None
 
 
-def read_picture_file(path: Path) -> PictureFile:
-    """Reads a picture; what is lost in it is logged.
+def read_picture_file(path: Path, *, upright: bool = True) -> PictureFile:
+    """Reads a picture; what is lost in it is logged. `upright` as of `read_picture`.
 
     Raises:
         UnirenderError: the file is missing, broken, or no picture.
     """
     if path.suffix.lower() == ".exr":
         return _linear_picture(path)
-    picture = read_picture(path)
+    picture = read_picture(path, upright=upright)
     for remark in picture.remarks.values():
         _log.warning("%s: %s", path, remark)
     return PictureFile(picture.image_srgb, picture.mask, False, picture.camera)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from posed_views import painted_view, painted_views
 
 from unirender.camera import Camera
@@ -249,6 +249,20 @@ def test_a_little_negative_radiance_is_zero_and_told(folder: Path, caplog: pytes
         views = read_views(folder)
     assert views.seen[3].image[5, 5].max() == 0
     assert caplog.text.count("of the radiance is negative and was set to 0") == 3
+
+
+def test_poses_count_in_the_pixels_as_they_are_stored(folder: Path, caplog: pytest.LogCaptureFixture):
+    """As in COLMAP, nerfstudio and instant-ngp: a phone's note how it was held turns neither picture nor mask."""
+    views = read_views(folder)
+    for orientation in (3, 6):  # upside down; on its side, which has other proportions
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        for path in folder.glob("images/*.png"):
+            Image.open(path).save(path, exif=exif)
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "unirender"):
+            same_views(views, read_views(folder), 0.0)
+        assert caplog.text.count("EXIF orientations of the pictures are not followed") == 1
 
 
 @pytest.mark.parametrize(
