@@ -31,6 +31,7 @@ from unirender.exr import (
     intrinsics_channels,
     intrinsics_from_channels,
     on_pole_grid,
+    radiance_fits_half,
     read_exr,
     write_environment,
     write_exr,
@@ -144,6 +145,8 @@ def write_result(
 ) -> None:
     """Writes maps, pictures and `meta.json` into an existing (temporary) folder; see `new_folder`.
 
+    EXR files have half precision, or float32 where radiance does not fit into half (`exr.radiance_fits_half`).
+
     Args:
         folder: where.
         intrinsics: maps to write, or None.
@@ -158,7 +161,9 @@ def write_result(
             of_maps = attributes
             if intrinsics.environment is not None and _is_lit(intrinsics):
                 of_maps = attributes | {LIGHT_ATTRIBUTE: _light_sha256(intrinsics.environment)}
-            write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=of_maps)
+            channels = intrinsics_channels(intrinsics)
+            half = radiance_fits_half(channels)
+            write_exr(folder / INTRINSICS_FILE, channels, half=half, attributes=of_maps)
         if intrinsics.environment is not None:
             write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
@@ -166,7 +171,8 @@ def write_result(
     if image_linear is not None:
         mask = None if intrinsics is None else intrinsics.mask
         rgba = image_linear if mask is None else np.concatenate([image_linear, mask], axis=-1)
-        write_exr(folder / IMAGE_FILE, image_channels(rgba), attributes=attributes)
+        channels = image_channels(rgba)
+        write_exr(folder / IMAGE_FILE, channels, half=radiance_fits_half(channels), attributes=attributes)
         picture = image_srgb(image_linear if mask is None else unpremultiply(image_linear, mask))
         write_png(folder / "image.png", picture if mask is None else np.concatenate([picture, mask], axis=-1))
     write_meta(folder, meta, None if intrinsics is None else intrinsics.camera)
