@@ -13,6 +13,7 @@ from unirender.icc import in_srgb
 from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
+RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
@@ -23,8 +24,10 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     """A picture file in a format of Pillow's, decoded and, if `upright`, turned as its EXIF orientation says.
 
     Raises:
-        UnirenderError: no readable picture, or one of more than `MAX_PIXELS`.
+        UnirenderError: no readable picture, a camera's raw file, or one of more than `MAX_PIXELS`.
     """
+    if Path(path).suffix.lower() in RAW_SUFFIXES:
+        raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)

@@ -111,9 +111,10 @@ def read_mask_file(
     exr = path.suffix.lower() == ".exr"
     mask = _read_exr_mask(path) if exr else coverage(stored_values(path, upright=upright))
     if mask.shape[:2] != size:
+        on_its_side = " as its EXIF orientation turns it; turn the mask likewise" if mask.shape[1::-1] == size else ""
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
-            "like the picture"
+            f"like the picture{on_its_side}"
         )
     low, high = float(mask.min()), float(mask.max())
     if low < -MASK_BEYOND or high > 1 + MASK_BEYOND:
@@ -138,7 +139,7 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     if not (mask > 0.5).any():
         raise UnirenderError(
             f"{name}: the mask is empty: no pixel is covered by more than half, and the most by {mask.max():.3g}, "
-            "expected white (or opaque) pixels on the object"
+            "expected white (255 of 8 bits) or opaque pixels on the object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
 

@@ -65,6 +65,12 @@ def tiles(height: int, width: int, size: int) -> Iterator[Tile]:
             yield Tile(top, left, size)
 
 
+def tiles_of(mask: Float[np.ndarray, "h w 1"], size: int) -> list[Tile]:
+    """Those that show something of an object."""
+    height, width = mask.shape[:2]
+    return [tile for tile in tiles(height, width, size) if mask[tile.slices].any()]
+
+
 def _starts(length: int, size: int) -> list[int]:
     count = 1 + max(0, math.ceil((length - size) / (size // 2)))
     return [round(i * (length - size) / (count - 1)) for i in range(count)] if count > 1 else [0]
@@ -95,7 +101,7 @@ def blend_tiles(
         predict: the network.
     """
     height, width = mask.shape[:2]
-    seen = [tile for tile in tiles(height, width, size) if mask[tile.slices].any()]
+    seen = tiles_of(mask, size)
     weight, total = window(size), np.zeros_like(mask)
     sums: list[dict[str, np.ndarray]] = []
     for first in range(0, len(seen), TILES_AT_ONCE):

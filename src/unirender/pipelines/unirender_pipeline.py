@@ -27,6 +27,7 @@ from unirender.pipelines.editing import anchor, check_exposure, specular_for_rou
 from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.inputs import (
     as_environment,
+    as_list,
     as_material,
     as_picture,
     check_decomposition,
@@ -82,8 +83,8 @@ class UniRenderPipeline(DualStreamPipeline):
         """Takes a picture apart into maps and light (inverse rendering).
 
         Args:
-            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (its EXIF orientation is
-                not looked at).
+            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (an EXIF orientation is
+                not applied, and logged).
             mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
@@ -171,8 +172,8 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
         check_switches(tile=tile, closed=closed, flat=flat)
-        images_srgb = list(images_srgb)
-        masks = [None] * len(images_srgb) if masks is None else list(masks)
+        images_srgb = as_list("images_srgb", images_srgb)
+        masks = [None] * len(images_srgb) if masks is None else as_list("masks", masks)
         cameras = list_cameras(cameras, len(images_srgb))
         if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
             raise UnirenderError(
