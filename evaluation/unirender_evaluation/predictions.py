@@ -62,7 +62,8 @@ class PredictionFolder:
 
     def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
         if not folder.is_dir():
-            raise UnirenderError(f"predictions: {folder}: no such folder, expected one with a subfolder per picture")
+            found = "a file, unpack it if it is an archive" if folder.is_file() else "no such folder"
+            raise UnirenderError(f"predictions: {folder}: {found}; expected a folder with a subfolder per picture")
         if not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
                 f"predictions: {folder} has no subfolders, expected one per picture, each named as in the inputs "
@@ -83,11 +84,11 @@ class PredictionFolder:
         return self._conventions
 
     def sha256(self) -> str:
-        """Over names and contents of all files that are read."""
+        """Over names and contents of all files that are read, also of those in folders that are links."""
         digest = hashlib.sha256()
-        named = (FILE, *LIGHT_FILES)
-        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name in named) and p.is_file())
-        for path in sorted(read):
+        beside = [self.folder / FILE]
+        answers = (p for p in self.folder.glob("*/*") if p.suffix in SUFFIXES or p.name in LIGHT_FILES)
+        for path in sorted(p for p in (*beside, *answers) if p.is_file()):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 

@@ -393,6 +393,47 @@ def test_conventions_are_the_contract_by_default(tmp_path: Path) -> None:
         read_conventions(tmp_path)
 
 
+def test_an_edit_behind_a_link_to_a_folder_is_part_of_the_key(suite: Suite, tmp_path: Path) -> None:
+    """The answers are kept elsewhere: those of an edited one were taken for scored."""
+    answer_all(suite, tmp_path / "kept")
+    (tmp_path / "mine").mkdir()
+    for folder in (tmp_path / "kept").iterdir():
+        (tmp_path / "mine" / folder.name).symlink_to(folder)
+    before = prediction_rows({"mine": tmp_path / "mine"})[0].config
+    assert before == prediction_rows({"mine": tmp_path / "kept"})[0].config
+    next((tmp_path / "kept").glob("*/*.exr")).unlink()
+    assert prediction_rows({"mine": tmp_path / "mine"})[0].config != before
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("intrinsics.EXR", "intrinsics.exr"),
+        ("Albedo.png", "albedo.png"),
+        ("albedo.jpg", "albedo.png"),
+        ("albedo.exr", "albedo.R, albedo.G, albedo.B of intrinsics.exr"),
+        ("roughness.EXR", "roughness.Y of intrinsics.exr"),
+        ("edit_m1_r05.exr", "edit_m100_r050.exr"),
+    ],
+)
+def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, name: str, meant: str) -> None:
+    answer_all(suite, tmp_path)
+    path = tmp_path / first(suite, "rendering", "from-image").folder / name
+    path.write_bytes(b"")
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: answers no question about this picture (did you mean {meant}?), expected edit_")
+
+
+def test_another_methods_folder_and_an_archive_are_named_as_such(suite: Suite, tmp_path: Path) -> None:
+    answer_all(suite, tmp_path / "all" / "other")
+    (problem,) = problems_of(suite, tmp_path / "all")
+    assert problem.startswith(f"{tmp_path / 'all' / 'other'}: has folders of ")
+    assert problem.endswith(f"score it by itself, with --predictions NAME={tmp_path / 'all' / 'other'}")
+    (tmp_path / "mine.zip").write_bytes(b"PK")
+    with pytest.raises(UnirenderError, match=r"mine\.zip: a file, unpack it if it is an archive; expected a folder"):
+        prediction_rows({"mine": tmp_path / "mine.zip"})
+
+
 def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -> None:
     """Nobody looks for an answer there; the export's own files lie there rightly. A link to nothing is no file."""
     export_inputs(suite, tmp_path)
