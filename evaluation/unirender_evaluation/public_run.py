@@ -3,7 +3,7 @@
     records.jsonl records.csv           every value, with its content key
     run.json                            the rows
     tables.md tables.tex tables.json    with the protocol line
-    missing.txt                         what a folder of predictions has no answer to, a line each, if the run has one
+    missing.txt                         what a stranger's row has no answer to, a line each, if the run has one
 
 Running the same command again reuses what is done: a record depends on the content of its sample's files, the row's
 configuration, the resolution and the code that measures.
@@ -129,6 +129,10 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
             computed += _work(what, sample, contents[-1], store)
             progress.update(bar, advance=1, description=f"{what.public.name}: {sample.key}")
     records = [record for record in store.close() if record.values]
+    by_plugins = _unanswered(what.rows, samples, records)
+    write_missing(what.out, counted | by_plugins)
+    say_missing(what.out, by_plugins, say)
+    missing |= {label: names for label, (names, _) in by_plugins.items()}
     info = _info(what, records, contents)
     write_run(what.out / "run.json", info)
     write_csv(what.out / "records.csv", records)
@@ -144,6 +148,16 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     say_rows_without_values(what.rows, records, say)
     console.print(f"{computed} new records of {len(records)}; {what.out / 'tables.md'}, .tex, .json", highlight=False)
     return PublicResult(tuple(records), tuple(tables), missing, computed)
+
+
+def _unanswered(
+    rows: Sequence[Row], samples: Sequence[Sample], records: Sequence[Record]
+) -> dict[str, tuple[list[str], int]]:
+    """Of each row that is a plug-in, by its label: the questions without a value, and how many one picture answers."""
+    plugins = [row.info for row in rows if row.info.kind == "external" and row.predictions is None]
+    every = [f"{sample.table}/{sample.key}" for sample in samples if sample.one_picture]
+    found = {(record.method, f"{record.table}/{record.sample}") for record in records}
+    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in plugins}
 
 
 def check_folders(what: PublicRun) -> None:
