@@ -34,7 +34,8 @@ def check_files(spec: SuiteSpec, sources: Sequence[ObjectSource], lights: Mappin
     }
     problems = [*_links(spec), *(line for files in found.values() for line in _same(files))]
     if problems:
-        raise UnirenderError(f"suite {spec.name!r}: " + "\n".join(problems))
+        listed = "\n".join(f"  {line}" for line in problems)
+        raise UnirenderError(f"suite {spec.name!r}: its folders have what a truth cannot be made from:\n{listed}")
     _keep_truth(spec, found)
 
 
