@@ -121,14 +121,15 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     say_missing(what.out, counted, say)
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    contents, computed = [], 0
+    before, contents = set(store.known), []
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
         bar = progress.add_task(what.public.name, total=len(samples))
         for sample in samples:
             contents.append(sample.sha256())
-            computed += _work(what, sample, contents[-1], store)
+            _work(what, sample, contents[-1], store)
             progress.update(bar, advance=1, description=f"{what.public.name}: {sample.key}")
     records = [record for record in store.close() if record.values]
+    computed = len({record.key for record in records} - before)
     by_plugins = _unanswered(what.rows, samples, records)
     write_missing(what.out, counted | by_plugins)
     say_missing(what.out, by_plugins, say)
@@ -173,8 +174,8 @@ def check_folders(what: PublicRun) -> None:
         raise PredictionError(problems)
 
 
-def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> int:
-    """Scores the rows that have no record of the sample; returns how many."""
+def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> None:
+    """Scores the rows that have no record of the sample."""
     rows = {what.key(row, content): row for row in what.rows if takes_part(row, sample)}
     due = {key: row for key, row in rows.items() if not store.has(key)}
     inputs = what.public.inputs(sample) if any(row.predictions is None for row in due.values()) else {}
@@ -187,7 +188,6 @@ def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> int:
         values = what.public.score(sample, answer, networks)
         name = row.info.key
         store.add(Record(sample.table, sample.protocol, name, sample.key, sample.object, values, key, seconds=seconds))
-    return len(due)
 
 
 def _info(what: PublicRun, records: Sequence[Record], contents: Sequence[str]) -> RunInfo:

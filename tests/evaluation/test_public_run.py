@@ -129,6 +129,7 @@ def test_none_is_no_answer(tmp_path: Path) -> None:
     orb = StanfordOrb(make_orb(tmp_path / "orb"), 32, 60.0)
     result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp)]), tmp_path / "out")
     assert {record.method for record in result.records} == {"ramp"}
+    assert result.computed == len(result.records), "of the records that the run has"
     asked = [record.method for record in read_records(tmp_path / "out" / "records.jsonl")]
     assert asked.count("silent") == asked.count("ramp") > 0
 
