@@ -239,12 +239,13 @@ def _file_problems(predictions: PredictionFolder, path: Path, question: Question
             predictions.read_picture(path, question.mask)
         else:
             normal = predictions.read_maps(path, question.mask, question.camera).get("normal")
-            if normal is not None and _is_grey(normal[question.mask[..., 0] > 0]):
+            inside = None if normal is None else normal[question.mask[..., 0] > 0]
+            if inside is not None and _is_grey(inside) and (inside.any() or path.suffix == ".png"):
                 yield f"{path}: the three channels of its normal are equal, expected x, y and z; write it in colour"
     except UnirenderError as error:
         yield str(error).removeprefix("predictions: ")
 
 
 def _is_grey(normals: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether directions were made from one channel."""
-    return bool(normals.any()) and float(np.ptp(np.abs(normals), axis=-1).max()) < SAME
+    """Whether directions were made from one channel, or are none at all."""
+    return float(np.ptp(np.abs(normals), axis=-1).max()) < SAME

@@ -46,6 +46,7 @@ LIGHT_FILES = (f"{LIGHT_ANSWER}.exr", f"{LIGHT_ANSWER}.hdr")
 SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
+NO_NORMAL = (0.01, 1.5)  # lengths: 0 in 8 bits has up to 0.007, and black and white, behind an object, have 1.7
 BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
@@ -209,7 +210,8 @@ class PredictionFolder:
         if name == "normal":
             value = 2 * value - 1
             length = np.linalg.norm(value, axis=-1, keepdims=True)
-            value = np.divide(value, length, out=np.zeros_like(value), where=(length > 1e-3) & (mask > 0))
+            there = (length > NO_NORMAL[0]) & (length < NO_NORMAL[1]) & (mask > 0)
+            value = np.divide(value, length, out=np.zeros_like(value), where=there)
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
         return self._converted({name: value})

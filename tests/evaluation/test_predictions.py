@@ -239,6 +239,25 @@ def test_grey_normals_are_a_problem(suite: Suite, tmp_path: Path) -> None:
     assert problem.startswith(f"{path}: the three channels of its normal are equal, expected x, y and z")
 
 
+@pytest.mark.parametrize("level", [0, 127, 128, 255])
+def test_a_picture_s_background_is_no_normal(suite: Suite, tmp_path: Path, level: int) -> None:
+    """Along the outline, where a method's mask is smaller: of length 0, as in an EXR, and no direction."""
+    task = first(suite, "inverse", "single-image")
+    path = tmp_path / task.folder / "normal.png"
+    path.parent.mkdir()
+    found = suite.intrinsics(task.scene, task.scene.materials[0]).require("normal")["normal"].copy()
+    found[:, 14:16] = 0
+    levels = np.where(found.any(axis=-1, keepdims=True), np.round((found + 1) / 2 * 255), level)
+    Image.fromarray(levels.astype(np.uint8)).save(path)
+    assert problems_of(suite, tmp_path) == ()
+    read = engine.answer(prediction_rows({"mine": tmp_path})[0], task).maps
+    assert read is not None
+    np.testing.assert_allclose(read.require("normal")["normal"], found, rtol=0, atol=0.01)
+    Image.new("RGB", levels.shape[1::-1], (level, level, level)).save(path)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: the three channels of its normal are equal")
+
+
 @pytest.mark.parametrize("colour", ["linear", "srgb"])
 def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, colour: str) -> None:
     """What the check lets through is scored with numbers."""
