@@ -1,17 +1,20 @@
-"""The files that a suite's truth is made from: none is left out without a word, none counts twice, and those of a truth
+"""The files that a suite's truth is made from: none is left out or counts twice without a word, and those of a truth
 that is there are still the same.
 """
 
+import logging
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.suite_lights import SuiteLight
 from unirender_evaluation.suite_objects import ObjectSource
 from unirender_evaluation.suite_spec import SuiteSpec, read_spec
 from unirender_evaluation.suites import Suite
+
+logger = logging.getLogger(__name__)
 
 Hashes = Mapping[str, str]  # path below the folder -> sha256 of the file
 
@@ -22,21 +25,26 @@ def file_hashes(entries: Iterable[Mapping[str, int | str]]) -> dict[str, str]:
 
 
 def check_files(spec: SuiteSpec, sources: Sequence[ObjectSource], lights: Mapping[str, SuiteLight]) -> None:
-    """Looks at the files of the folders, once all of them can be read.
+    """Looks at the files of the folders, once all of them can be read; warns of those that show one thing.
 
     Raises:
-        UnirenderError: a link to a folder, whose files are not taken; two files that are the same; or a file that is
-            another one than that of the truth that is there.
+        UnirenderError: a link to a folder, whose files are not taken; or a file that is another one than that of the
+            truth that is there.
     """
+    if links := list(_links(spec)):
+        listed = "\n".join(f"  {line}" for line in links)
+        raise UnirenderError(f"suite {spec.name!r}: a truth takes no files behind links to folders:\n{listed}")
     found = {
         "objects": file_hashes(source.provenance() for source in sources),
         "lights": file_hashes(light.provenance for light in lights.values()),
     }
-    problems = [*_links(spec), *(line for files in found.values() for line in _same(files))]
-    if problems:
-        listed = "\n".join(f"  {line}" for line in problems)
-        raise UnirenderError(f"suite {spec.name!r}: its folders have what a truth cannot be made from:\n{listed}")
     _keep_truth(spec, found)
+    for kind, files in found.items():
+        for names, what in _alike(files):
+            logger.warning(
+                "suite %r: %s: %s, and count as %d %s; leave all but one out (`without`)",
+                *(spec.name, ", ".join(names), what, len(names), kind),
+            )
 
 
 def _links(spec: SuiteSpec) -> Iterator[str]:
@@ -46,13 +54,13 @@ def _links(spec: SuiteSpec) -> Iterator[str]:
     for folder, patterns in ((folder, patterns) for folder, patterns in taken if folder is not None):
         for link in _linked_folders(folder):
             if any(_may_hold(link.relative_to(folder).as_posix(), pattern) for pattern in patterns):
-                yield f"{link}: a link to a folder, whose files are not taken; copy it, or remove the link"
+                yield f"{link}: copy the folder, or remove the link"
 
 
 def _linked_folders(folder: Path) -> Iterator[Path]:
     for root, folders, _ in os.walk(folder):
-        paths = (Path(root, name) for name in sorted(folders) if not name.startswith("."))
-        yield from (path for path in paths if path.is_symlink())
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        yield from (path for name in folders if (path := Path(root, name)).is_symlink())
 
 
 def _may_hold(folder: str, pattern: str) -> bool:
@@ -61,14 +69,18 @@ def _may_hold(folder: str, pattern: str) -> bool:
     return f"{folder}/".startswith(start) or start.startswith(f"{folder}/")
 
 
-def _same(files: Hashes) -> Iterator[str]:
-    """Files with the same content: samples of one object, or light, would count as those of two."""
-    names: defaultdict[str, list[str]] = defaultdict(list)
+def _alike(files: Hashes) -> Iterator[tuple[list[str], str]]:
+    """Files that show one thing, and why: the same content, or the same name in two formats."""
+    contents: defaultdict[str, list[str]] = defaultdict(list)
+    stems: defaultdict[str, list[str]] = defaultdict(list)
     for name, sha256 in files.items():
-        names[sha256].append(name)
-    for same in names.values():
-        if len(same) > 1:
-            yield f"{', '.join(same)}: the same file; remove all but one, or name them under `without`"
+        contents[sha256].append(name)
+        stems[str(PurePosixPath(name).with_suffix(""))].append(name)
+    same = [names for names in contents.values() if len(names) > 1]
+    yield from ((names, "have the same content") for names in same)
+    yield from (
+        (names, "look like one in several formats") for names in stems.values() if len(names) > 1 and names not in same
+    )
 
 
 def _keep_truth(spec: SuiteSpec, found: Mapping[str, Hashes]) -> None:

@@ -260,30 +260,40 @@ def checked(spec: SuiteSpec) -> None:
     check_files(spec, suite_sources(spec), load_lights(spec, list(pool), pool))
 
 
-def test_links_to_folders_and_equal_files_are_refused(tmp_path: Path) -> None:
-    """What is behind a link would be left out without a word; a copy would count as another object or light."""
+def test_links_to_folders_are_refused_and_files_of_one_thing_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What is behind a link would be left out without a word; a copy counts as another object or light."""
     write_meshes(tmp_path / "models", ["chairs/a.obj", "chairs/b.obj", "tables/c.obj"])
     write_pictures(tmp_path / "lights", 3)
     more = '[folders]\nobjects = "models"\nlights = "lights"\n[[meshes]]\nfiles = "chairs/*"\n[light_files]\n'
     spec = spec_with(tmp_path, more, objects="[]", ceiling_scenes="[]", bundled_lights="0", procedural_lights="[]")
     (tmp_path / "models" / "tables" / "more").symlink_to(tmp_path / "models" / "chairs")
-    (tmp_path / "models" / ".hidden").symlink_to(tmp_path)
+    (tmp_path / "models" / ".hidden").mkdir()
+    (tmp_path / "models" / ".hidden" / "more").symlink_to(tmp_path)
     checked(spec)  # no link where files of the pattern are
-    (tmp_path / "models" / "chairs" / "more").symlink_to(tmp_path / "models" / "tables")
-    (tmp_path / "lights" / "more").symlink_to(tmp_path)
+    assert not caplog.messages
+    trimesh.load(tmp_path / "models" / "chairs" / "b.obj").export(tmp_path / "models" / "chairs" / "b.ply")
     (tmp_path / "models" / "chairs" / "d.obj").write_bytes((tmp_path / "models" / "chairs" / "a.obj").read_bytes())
     (tmp_path / "lights" / "copy.png").write_bytes((tmp_path / "lights" / "1.png").read_bytes())
+    checked(spec)
+    assert [message.partition(", and count as ")[::2] for message in caplog.messages] == [
+        (
+            f"suite 'tiny': {names}",
+            f"2 {kind}; leave all but one out (`without`)",
+        )
+        for names, kind in (
+            ("chairs/a.obj, chairs/d.obj: have the same content", "objects"),
+            ("chairs/b.obj, chairs/b.ply: look like one in several formats", "objects"),
+            ("1.png, copy.png: have the same content", "lights"),
+        )
+    ]
+    links = [tmp_path / "models" / "chairs" / "more", tmp_path / "lights" / "more"]
+    for link in links:
+        link.symlink_to(tmp_path / "models" / "tables")
     with pytest.raises(UnirenderError) as refused:
         checked(spec)
-    lines = [line.strip() for line in str(refused.value).splitlines()]
-    behind = "a link to a folder, whose files are not taken; copy it, or remove the link"
-    same = "the same file; remove all but one, or name them under `without`"
-    assert lines[1:] == [
-        f"{tmp_path / 'models' / 'chairs' / 'more'}: {behind}",
-        f"{tmp_path / 'lights' / 'more'}: {behind}",
-        f"chairs/a.obj, chairs/d.obj: {same}",
-        f"1.png, copy.png: {same}",
-    ]
+    assert str(refused.value).splitlines()[1:] == [f"  {link}: copy the folder, or remove the link" for link in links]
 
 
 def test_a_truth_of_other_lights_is_kept(tmp_path: Path) -> None:

@@ -212,10 +212,10 @@ TETRAHEDRON = "v -1 -1 -1\nv 1 -1 -1\nv 0 1 -1\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3
 
 
 def write_mesh_suite(folder: Path, names: str) -> Path:
-    """A suite of small pictures of meshes of equal shape, without its truth."""
+    """A suite of small pictures of equal meshes, without its truth."""
     (folder / "meshes").mkdir()
     for name in names:
-        (folder / "meshes" / f"{name}.obj").write_text(f"# {name}\n{TETRAHEDRON}")
+        (folder / "meshes" / f"{name}.obj").write_text(TETRAHEDRON)
     text = suite_path("tiny").read_text()
     for name, value in MESHES_ALONE.items():
         text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
