@@ -46,6 +46,7 @@ LIGHT_FILES = (f"{LIGHT_ANSWER}.exr", f"{LIGHT_ANSWER}.hdr")
 SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
+NO_NORMAL = (0.01, 1.5)  # lengths: 0 in 8 bits has up to 0.007, and black and white, behind an object, have 1.7
 BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
@@ -62,7 +63,8 @@ class PredictionFolder:
 
     def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
         if not folder.is_dir():
-            raise UnirenderError(f"predictions: {folder}: no such folder, expected one with a subfolder per picture")
+            found = "a file, unpack it if it is an archive" if folder.is_file() else "no such folder"
+            raise UnirenderError(f"predictions: {folder}: {found}; expected a folder with a subfolder per picture")
         if not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
                 f"predictions: {folder} has no subfolders, expected one per picture, each named as in the inputs "
@@ -83,11 +85,11 @@ class PredictionFolder:
         return self._conventions
 
     def sha256(self) -> str:
-        """Over names and contents of all files that are read."""
+        """Over names and contents of all files that are read, also of those in folders that are links."""
         digest = hashlib.sha256()
-        named = (FILE, *LIGHT_FILES)
-        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name in named) and p.is_file())
-        for path in sorted(read):
+        beside = [self.folder / FILE]
+        answers = (p for p in self.folder.glob("*/*") if p.suffix in SUFFIXES or p.name in LIGHT_FILES)
+        for path in sorted(p for p in (*beside, *answers) if p.is_file()):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
@@ -215,7 +217,8 @@ class PredictionFolder:
         if name == "normal":
             value = 2 * value - 1
             length = np.linalg.norm(value, axis=-1, keepdims=True)
-            value = np.divide(value, length, out=np.zeros_like(value), where=(length > 1e-3) & (mask > 0))
+            there = (length > NO_NORMAL[0]) & (length < NO_NORMAL[1]) & (mask > 0)
+            value = np.divide(value, length, out=np.zeros_like(value), where=there)
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
         return self._converted({name: value})

@@ -50,10 +50,14 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
 
     Only a result folder (one with `meta.json`) is ever replaced, and none that others were written into.
+
+    Args:
+        path: where it is to be.
+        overwrite: whether a result that is there is replaced; None: it is not, and nobody can ask for it.
 
     Raises:
         UsageError: `path` is the working directory or lies around it.
@@ -67,7 +71,8 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
         raise UnirenderError(f"{shown}: is a file, expected a folder to write to")
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            raise UnirenderError(f"{shown}: exists and is not empty; choose another folder or pass --overwrite")
+            option = "" if overwrite is None else " or pass --overwrite"
+            raise UnirenderError(f"{shown}: exists and is not empty; choose another folder{option}")
         if (path / SUMMARY_FILE).is_file():
             raise UnirenderError(
                 f"{shown}: has a {SUMMARY_FILE}, so that it holds the results of a folder of pictures, expected one "

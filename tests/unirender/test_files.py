@@ -89,12 +89,14 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
         fail_half_way()
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    with pytest.raises(UnirenderError, match="--overwrite"), new_folder(out):
+    with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
         pass
     (out / "meta.json").unlink()
     with pytest.raises(UnirenderError, match=r"no meta\.json"), new_folder(out, overwrite=True):
         pass  # a folder that is no result is never replaced
     (tmp_path / "file").write_text("")
+    with pytest.raises(UnirenderError, match=r"choose another folder$"), new_folder(out):  # of a command without it
+        pass
     with pytest.raises(UnirenderError, match="is a file"), new_folder(tmp_path / "file"):
         pass
 
