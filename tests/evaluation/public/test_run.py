@@ -6,7 +6,6 @@ import io
 import json
 import re
 from dataclasses import replace
-from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -104,12 +103,13 @@ def test_only_what_changed_is_measured_again(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("public", [StanfordOrb, Iiw, Maw])
 def test_every_module_that_measures_is_in_the_keys(public: type) -> None:
-    """By name, since a name that is none would go unnoticed; and all that a reader imports of `public_*`."""
-    folder = package_folder("unirender_evaluation")
-    named = {path.stem for name in public.modules for path in folder.glob(f"{name}.py")}
-    assert all(any(fnmatch(stem, name) for stem in named) for name in public.modules)
+    """All that a reader imports of its package."""
+    folder = package_folder("unirender_evaluation") / "public"
+    named = {path.stem for name in public.modules for path in folder.parent.glob(f"{name}.py")}
     text = Path(inspect.getfile(public)).read_text()
-    assert set(re.findall(r"unirender_evaluation(?:\.| import )(public_\w+)", text)) <= named
+    imported = set(re.findall(r"unirender_evaluation\.public(?:\.| import )(\w+)", text))
+    assert imported
+    assert {path.stem for path in folder.glob("*.py")} >= named >= imported
 
 
 class Silent:
