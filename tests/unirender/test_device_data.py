@@ -13,12 +13,12 @@ from tiny_models import TRAIN
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.command import Train
+from unirender.training.config import Augmentation
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset, make_batch
 from unirender.training.device_data import DeviceSource, fits, packed_bytes, room
 from unirender.training.device_groups import DeviceGroups
 from unirender.training.facts import training_facts
 from unirender.training.memory import TrainingBytes
-from unirender.training.presets import Augmentation
 from unirender.training.run import train
 from unirender.training.source import ShardSource
 from unirender.training.trainer import RunConfig, Trainer

@@ -11,8 +11,9 @@ from tiny_models import TRAIN, make_batch
 from unirender.errors import UsageError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
+from unirender.training.config import TrainConfig
 from unirender.training.config_check import check_config
-from unirender.training.presets import PRESETS, TrainConfig
+from unirender.training.presets import PRESETS
 from unirender.training.start import read_start
 from unirender.training.trainer import RunConfig, Trainer
 

@@ -40,10 +40,11 @@ from unirender.training.checkpoint import (
     save_state,
 )
 from unirender.training.command import Train
+from unirender.training.config import LossConfig, OptimizerConfig, TrainConfig
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
 from unirender.training.live import live_report, standing
-from unirender.training.presets import PRESETS, LossConfig, OptimizerConfig, TrainConfig, get_preset
+from unirender.training.presets import PRESETS, get_preset
 from unirender.training.reader import BatchReader
 from unirender.training.run import train
 from unirender.training.source import ShardSource

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from unirender.models.added import Added, Answers
-from unirender.training.presets import ENCODER_SIDE
+from unirender.models.config import ENCODER_SIDE
 
 SIDE = ENCODER_SIDE  # pixels along each side of the picture that it sees
 WIDTHS, BLOCKS = (32, 64, 128, 256), (1, 2, 2, 2)  # channels and residual blocks of each stage, finest first

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UsageError
 from unirender.notices import notice
 from unirender.training.command import Alone, Train
-from unirender.training.presets import TrainConfig
+from unirender.training.config import TrainConfig
 
 if TYPE_CHECKING:
     import torch

@@ -28,6 +28,7 @@ from unirender.models.build import build_model
 from unirender.models.priors import Maps
 from unirender.training.beginning import Beginning
 from unirender.training.checkpoint import STATE_FILE, save_state
+from unirender.training.config import OptimizerConfig, TrainConfig
 from unirender.training.config_check import check_config
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
@@ -37,7 +38,6 @@ from unirender.training.muon import make_optimizer
 from unirender.training.not_finite import too_large, wrong_data
 from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
-from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups

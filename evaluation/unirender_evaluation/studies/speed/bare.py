@@ -20,7 +20,7 @@ from unirender.errors import UnirenderError
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.packing import TRIPLETS
-from unirender.training.presets import TrainConfig
+from unirender.training.config import TrainConfig
 
 LAST = NUM_TIMESTEPS - 1
 

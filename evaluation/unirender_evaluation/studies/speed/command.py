@@ -10,7 +10,8 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 from unirender.option_checks import at_least, usage
 from unirender.options import Device, DType, ModelOptions
-from unirender.training.presets import TrainConfig, get_preset
+from unirender.training.config import TrainConfig
+from unirender.training.presets import get_preset
 from unirender_evaluation.studies.speed.parts import NEED_DATA, PARTS, PartName
 
 if TYPE_CHECKING:

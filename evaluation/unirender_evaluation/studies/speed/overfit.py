@@ -21,7 +21,8 @@ import numpy as np
 from unirender.color import image_srgb, unpremultiply
 from unirender.intrinsics import Intrinsics
 from unirender.score import Score
-from unirender.training.presets import OptimizerConfig, TrainConfig, get_preset
+from unirender.training.config import OptimizerConfig, TrainConfig
+from unirender.training.presets import get_preset
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key, psnr_from_mse
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.studies.speed.timing import Part, side_by_side

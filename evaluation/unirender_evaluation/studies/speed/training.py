@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from unirender.training.presets import TrainConfig
+from unirender.training.config import TrainConfig
 from unirender_evaluation.studies.speed.timing import Part, aim_text, medians, side_by_side
 from unirender_evaluation.table_text import TextTable
 

@@ -10,7 +10,8 @@ import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from unirender.training.presets import TrainConfig, get_preset
+from unirender.training.config import TrainConfig
+from unirender.training.presets import get_preset
 
 PLAIN = "plain"
 BASE_PRESET = "tiny_plain"
