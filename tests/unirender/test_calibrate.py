@@ -18,7 +18,8 @@ from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.editing import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.calibrate import Calibrate, Line, fit, readings, write_calibrated
+from unirender.training.calibrate import Calibrate, readings, write_calibrated
+from unirender.training.calibration_line import Line, fit
 from unirender.training.data import GroupDataset
 from unirender.training.facts import dataset_facts
 from unirender.training.same_objects import object_of, objects_of
