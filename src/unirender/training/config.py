@@ -1,9 +1,10 @@
-"""What a training is told: network, loss, optimiser, augmentation. Torch-free, as the command line needs it.
+"""What a training is told: network, loss, optimiser, augmentation, run. Torch-free, as the command line needs it.
 
 Rows of ready ones: `unirender.training.presets`; the ranges of the numbers: `unirender.training.config_check`.
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from unirender.models.config import ModelConfig
@@ -86,3 +87,21 @@ class TrainConfig:
     p_t: float = 0.5  # share of random t instead of T
     map_dropout: float = 0.0  # probability that each of albedo, s, d, environment is withheld when rendering
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """How long a run is and what it leaves behind. The run ends with whichever of `steps` and `minutes` comes first."""
+
+    out: Path
+    steps: int | None = None
+    minutes: float | None = None  # of training, over all resumes
+    log_every: int = 20  # steps
+    save_minutes: float = 3.0
+    picture_minutes: float = 5.0
+    refresh_minutes: float | None = None  # look for new shards; None: never
+    parallel: int = 1  # parts of a batch that run side by side, each on one CPU thread; changes the noise drawn
+    accumulate: int = 1  # times that they do so for one step, to save memory; changes the noise drawn
+    keep_best: str | None = None  # the score by which a validated run keeps its best pipeline in `best/`; None: none
+    preset: str | None = None  # the row that the config began as, for the model card
+    scored_on: str | None = None  # in words: what the validation measures on, for the model card

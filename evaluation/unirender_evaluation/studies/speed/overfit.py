@@ -141,7 +141,8 @@ def picture_errors(packing: Any, found: Intrinsics, truth: Intrinsics) -> dict[s
 
 def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype: Any) -> list[Point]:
     """Trains on one pair for so many minutes; a point for every measure, the first before the first step."""
-    from unirender.training.trainer import RunConfig, Trainer
+    from unirender.training.config import RunConfig
+    from unirender.training.trainer import Trainer
 
     batch = {name: value.expand(config.batch_size, -1, -1, -1) for name, value in pair.items()}
     points: list[Point] = []

@@ -40,9 +40,10 @@ def throughput(
     Raises:
         UnirenderError: unusable shards, or pictures of another size than the preset's.
     """
+    from unirender.training.config import RunConfig
     from unirender.training.export import averaged_pipeline
     from unirender.training.source import ShardSource
-    from unirender.training.trainer import RunConfig, Trainer
+    from unirender.training.trainer import Trainer
     from unirender_evaluation.studies.speed.bare import BarePasses
 
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, cycle_warmup=0.0))
