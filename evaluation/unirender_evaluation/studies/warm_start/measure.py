@@ -39,7 +39,6 @@ from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE
 from unirender_reference.optimize.single_config import SingleConfig
 
 Geometry = Literal["known-mesh", "predicted-normals", "true-normals"]
-GEOMETRIES: tuple[Geometry, ...] = ("known-mesh", "predicted-normals", "true-normals")
 COLD, WARM, PREDICTION = "cold", "warm", "prediction"
 TABLE, PICTURE = "warm-start", "picture"  # the prediction's protocol: it is told no geometry
 USES = frozenset({MODEL, MULTIVIEW, OPTIMIZER, REFERENCE})
