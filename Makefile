@@ -23,6 +23,9 @@ OUT ?= results
 # Of the multi-view table, which is not the paper's: 3 minutes each. `unirender bench run` takes 4.
 VIEW_OBJECTS ?= 2
 
+# Where it is set, every process of every run would compile the sources and the tests again: 30 s for each of pytest's.
+export PYTHONDONTWRITEBYTECODE :=
+
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --constraint constraints.txt $(PIP_ARGS)

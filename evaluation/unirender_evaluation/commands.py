@@ -8,20 +8,20 @@ import tyro
 
 from unirender.option_checks import at_least
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
-from unirender_evaluation.derived_light_study_command import BenchDerivedLight
-from unirender_evaluation.optimiser_study_commands import BenchIngredients, BenchRace
 from unirender_evaluation.physics_command import BenchPhysics
-from unirender_evaluation.public_command import BenchPublic
+from unirender_evaluation.public.command import BenchPublic
 from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
 from unirender_evaluation.run_command import BenchRun
-from unirender_evaluation.sampling_study_command import BenchSampling
 from unirender_evaluation.shard_scores_command import BenchShards
-from unirender_evaluation.speed_study_command import BenchSpeed
+from unirender_evaluation.studies.derived_light.command import BenchDerivedLight
+from unirender_evaluation.studies.optimiser.commands import BenchIngredients, BenchRace
+from unirender_evaluation.studies.sampling.command import BenchSampling
+from unirender_evaluation.studies.speed.command import BenchSpeed
+from unirender_evaluation.studies.training.command import BenchTraining
+from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
+from unirender_evaluation.studies.warm_start.command import BenchWarmStart
 from unirender_evaluation.throughput_command import BenchThroughput
-from unirender_evaluation.training_study_command import BenchTraining
 from unirender_evaluation.truth_commands import BenchCheck, BenchTruth
-from unirender_evaluation.unknown_mesh_command import BenchUnknownMesh
-from unirender_evaluation.warm_start_command import BenchWarmStart
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.optimiser_study import write_files
-from unirender_evaluation.optimiser_study_ingredients import ingredients
-from unirender_evaluation.speed_study_parts import PARTS
-from unirender_evaluation.training_study import BASE_PRESET, training_choices
+from unirender_evaluation.studies.folder import write_files
+from unirender_evaluation.studies.optimiser.ingredients import ingredients
+from unirender_evaluation.studies.speed.parts import PARTS
+from unirender_evaluation.studies.training.choices import BASE_PRESET, training_choices
 
 PLOT_FOLDER = "_static"
 HEADING = "### "  # of a table: pages include it below a heading of the second level

@@ -21,7 +21,6 @@ import numpy as np
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Composite, Image, quantise
-from unirender_evaluation.optimiser_study import write_files
 from unirender_evaluation.physics_ambiguity import POSTERIOR, Points, material_point
 from unirender_evaluation.physics_questions import Posterior, true_maps
 from unirender_evaluation.physics_stage import Stage
@@ -30,6 +29,7 @@ from unirender_evaluation.physics_tests import TESTS
 from unirender_evaluation.physics_tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate
+from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.truth_render import item_seed
 

@@ -118,18 +118,6 @@ OPTIMIZED = ("optimized_*",)
 VIEWS = ("multiview_*",)
 ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-ins do
 MITSUBA_ROW = ("mitsuba_method",)
-# Commands of their own, whose records hold `modules_version` of what measures.
-STUDIES = (
-    "derived_light_study*",
-    "optimiser_study*",
-    "public_*",
-    "sampling_study*",
-    "speed_study*",
-    "study_rows",
-    "training_study*",
-    "unknown_mesh*",
-    "warm_start*",
-)
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
     "adaptive*",
@@ -177,7 +165,7 @@ PARTS: Mapping[str, Part] = {
             *(
                 f"unirender_evaluation/{name}.py"
                 for name in (
-                    *(*COMMANDS, *FROM_RECORDS, *PICTURES, *STUDIES, "versions"),
+                    *(*COMMANDS, *FROM_RECORDS, *PICTURES, "versions"),
                     *(*OPTIMIZED, *VIEWS, *ADAPTERS, *MITSUBA_ROW),
                 )
             ),
@@ -273,10 +261,19 @@ def part_version(part: Part, folders: Mapping[str, Path]) -> str:
 
 
 def modules_version(*names: str) -> str:
-    """sha256 over modules of this package (patterns of their names): what a study's figures depend on besides parts."""
+    """sha256 over modules of this package: what a study's figures depend on besides parts.
+
+    Args:
+        names: patterns of their paths below the package, without `.py`.
+
+    Raises:
+        ValueError: a pattern names no module.
+    """
     package = "unirender_evaluation"
-    part = Part({package: tuple(f"{name}.py" for name in names)}, ())
-    return part_version(part, {package: package_folder(package)})
+    root = package_folder(package)
+    if unknown := [name for name in names if not any(root.glob(f"{name}.py"))]:
+        raise ValueError(f"modules of {package}: {', '.join(unknown)}: there is none of that name")
+    return part_version(Part({package: tuple(f"{name}.py" for name in names)}, ()), {package: root})
 
 
 def lpips_version(backbones: Sequence[str]) -> str:

@@ -9,7 +9,17 @@ import pytest
 import torch
 from diffusers.pipelines.marigold.pipeline_marigold_intrinsics import MarigoldIntrinsicsPipeline
 from diffusers.schedulers.scheduling_lcm import LCMScheduler
-from tiny_adapter_folders import APPEARANCE, LIGHTING, LINEAR, SCHEDULE, write_intrinsics, write_normals
+from tiny_adapter_folders import (
+    ANSWER,
+    APPEARANCE,
+    LIGHTING,
+    LINEAR,
+    SCHEDULE,
+    SIZE,
+    of_inside,
+    write_intrinsics,
+    write_normals,
+)
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
@@ -17,9 +27,6 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.adapters_folder import on_background
 from unirender_evaluation.adapters_marigold import MarigoldIntrinsics, MarigoldNormals
 from unirender_evaluation.adapters_marigold_maps import check_properties, decoded_targets, target_maps
-
-ANSWER = (0.6, 0.0, -0.2)  # of the decoder; 0.8, 0.5, 0.4 in [0, 1]
-SIZE = (30, 21)  # no multiple of anything
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +43,6 @@ def seen() -> dict[str, Any]:
     mask[4] = 0.5
     image = (np.round(rng.uniform(0, 1, (*SIZE, 3)) * 255) / 255 * (mask > 0)).astype(np.float32)
     return {"image_srgb": image, "mask": mask, "camera": Camera()}
-
-
-def of_inside(value: np.ndarray, seen: dict[str, Any]) -> np.ndarray:
-    """The one value that a map has inside the mask; it is 0 outside."""
-    inside = seen["mask"][..., 0] > 0
-    assert not value[~inside].any()
-    assert np.ptp(value[inside], axis=0).max() < 1e-6
-    return value[inside][0]
 
 
 def test_each_map_is_what_the_folder_says_of_it(tmp_path: Path, seen: dict[str, Any]) -> None:

@@ -12,16 +12,13 @@ from diffusers.pipelines.stable_diffusion.pipeline_stable_diffusion_instruct_pix
     StableDiffusionInstructPix2PixPipeline,
 )
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from tiny_adapter_folders import APPEARANCE, SCHEDULE, TRAILING, write_intrinsics, write_rgbx
+from tiny_adapter_folders import ANSWER, APPEARANCE, SCHEDULE, SIZE, TRAILING, of_inside, write_intrinsics, write_rgbx
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender_evaluation.adapters_conditioned import fit
 from unirender_evaluation.adapters_rgbx import PROMPTS, RgbToX
-
-ANSWER = (0.6, 0.0, -0.2)  # of the decoder; 0.8, 0.5, 0.4 in [0, 1]
-SIZE = (30, 21)  # no multiple of anything
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +33,6 @@ def seen() -> dict[str, Any]:
     mask[4:-4, 3:-3] = 1
     image = np.random.default_rng(0).uniform(0, 1, (*SIZE, 3)).astype(np.float32) * mask
     return {"image_srgb": image, "mask": mask, "camera": Camera()}
-
-
-def of_inside(value: np.ndarray, seen: dict[str, Any]) -> np.ndarray:
-    """The one value that a map has inside the mask; it is 0 outside."""
-    inside = seen["mask"][..., 0] > 0
-    assert not value[~inside].any()
-    assert np.ptp(value[inside], axis=0).max() < 1e-6
-    return value[inside][0]
 
 
 def test_each_map_is_converted_from_a_stated_answer(tmp_path: Path, seen: dict[str, Any]) -> None:

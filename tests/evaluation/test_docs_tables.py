@@ -9,21 +9,19 @@ import pytest
 from rich.console import Console
 
 from unirender.errors import UnirenderError
-from unirender_evaluation import (
-    derived_light_study_run,
-    sampling_study_run,
-    speed_study_run,
-    training_study_run,
-    unknown_mesh_run,
-    warm_start_run,
-)
 from unirender_evaluation.docs_tables import HEADING, STUDIES, main, missing, study_of
-from unirender_evaluation.optimiser_study_ingredients import ingredients
-from unirender_evaluation.speed_study import Part
-from unirender_evaluation.speed_study_parts import PARTS, PartName
-from unirender_evaluation.study_rows import StudyRow
+from unirender_evaluation.studies.derived_light import run as derived_light_run
+from unirender_evaluation.studies.optimiser.ingredients import ingredients
+from unirender_evaluation.studies.rows import StudyRow
+from unirender_evaluation.studies.sampling import run as sampling_run
+from unirender_evaluation.studies.speed import run as speed_run
+from unirender_evaluation.studies.speed.parts import PARTS, PartName
+from unirender_evaluation.studies.speed.timing import Part
+from unirender_evaluation.studies.training import run as training_run
+from unirender_evaluation.studies.training.choices import training_choices
+from unirender_evaluation.studies.unknown_mesh import run as unknown_mesh_run
+from unirender_evaluation.studies.warm_start import run as warm_start_run
 from unirender_evaluation.table_text import TextTable
-from unirender_evaluation.training_study import training_choices
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PIECES = [study.piece for study in STUDIES]
@@ -38,15 +36,15 @@ def speed(folder: Path, parts: Sequence[PartName] = PARTS) -> Path:
         return lambda: Part(name, (TABLE,), {"ms": 12.5})
 
     with (folder.parent / "console.txt").open("w") as out:
-        speed_study_run.run(folder, {name: measured(name) for name in parts}, (("cores", "2"),), Console(file=out))
+        speed_run.run(folder, {name: measured(name) for name in parts}, (("cores", "2"),), Console(file=out))
     return folder
 
 
 def sampling(folder: Path) -> Path:
     """A folder with the files of `unirender bench sampling`."""
     folder.mkdir()
-    (folder / f"{sampling_study_run.NAME}.md").write_text(TABLE.markdown())
-    for number, name in enumerate((sampling_study_run.STEPS_PLOT, sampling_study_run.RELIABILITY_PLOT)):
+    (folder / f"{sampling_run.NAME}.md").write_text(TABLE.markdown())
+    for number, name in enumerate((sampling_run.STEPS_PLOT, sampling_run.RELIABILITY_PLOT)):
         (folder / name).write_bytes(bytes([137, number]))
     return folder
 
@@ -159,7 +157,7 @@ def test_a_row_that_another_preset_does_not_have_is_not_missing(tmp_path: Path) 
 
 def test_the_names_are_those_that_the_studies_write() -> None:
     """Of those that keep their name in one place."""
-    named = (derived_light_study_run, sampling_study_run, speed_study_run, training_study_run, unknown_mesh_run)
+    named = (derived_light_run, sampling_run, speed_run, training_run, unknown_mesh_run)
     assert {f"{module.NAME}.md" for module in (*named, warm_start_run)} < {study.tables for study in STUDIES}
 
 

@@ -18,6 +18,7 @@ from unirender_evaluation.versions import (
     Part,
     Versions,
     lpips_version,
+    modules_version,
     package_folder,
     part_version,
     versions,
@@ -96,8 +97,8 @@ def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str
     "name",
     [
         *("__init__", "schema", "schema_check", "merge", "score_api", "commands", "results_commands", "results_check"),
-        *("throughput", "throughput_command", "crosscheck", "figures_command", "report_pages", "public_metrics"),
-        *("table_list", "docs_tables", "study_rows", "suite_check", "suite_home", "suite_lights"),
+        *("throughput", "throughput_command", "crosscheck", "figures_command", "report_pages"),
+        *("table_list", "docs_tables", "suite_check", "suite_home", "suite_lights"),
     ],
 )
 def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
@@ -105,6 +106,20 @@ def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
     assert any(fnmatch(path, pattern) for pattern in PARTS["core"].without)
     patterns = [p for part in PARTS.values() for p in part.files.get("unirender_evaluation", ()) if p != "*.py"]
     assert not [pattern for pattern in patterns if fnmatch(f"{name}.py", pattern)]
+
+
+def test_packages_beside_the_benchmark_are_in_no_key() -> None:
+    root = package_folder("unirender_evaluation")
+    patterns = [pattern for part in PARTS.values() for pattern in part.files.get("unirender_evaluation", ())]
+    covered = {path.relative_to(root) for pattern in patterns for path in root.glob(pattern)}
+    assert covered
+    assert {path.parent for path in covered} == {Path()}
+
+
+def test_a_study_whose_modules_were_moved_does_not_go_on_without_them() -> None:
+    assert modules_version("public/orb*") != modules_version("public/orb")
+    with pytest.raises(ValueError, match="public/gone"):
+        modules_version("public/orb", "public/gone")
 
 
 @pytest.mark.parametrize("name", ["mix_command", "mix_folder", "meshes/mix", "meshes/write_obj"])

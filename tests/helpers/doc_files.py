@@ -17,8 +17,8 @@ from PIL import Image
 
 from unirender.training.groups import read_groups
 from unirender_evaluation.conventions import read_conventions
-from unirender_evaluation.public_iiw import Iiw
-from unirender_evaluation.public_maw import Maw
+from unirender_evaluation.public.iiw import Iiw
+from unirender_evaluation.public.maw import Maw
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.optimize.folder import read_views

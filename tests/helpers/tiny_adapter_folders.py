@@ -1,10 +1,11 @@
-"""Very small folders of public pipelines with random weights, written by diffusers' own pipelines."""
+"""Very small folders of public pipelines with random weights, written by diffusers' own pipelines; what they answer."""
 
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from diffusers.pipelines.marigold.pipeline_marigold_intrinsics import MarigoldIntrinsicsPipeline
 from diffusers.pipelines.marigold.pipeline_marigold_normals import MarigoldNormalsPipeline
@@ -16,6 +17,8 @@ from tiny_stable_diffusion import tiny_text_encoder, tiny_unet, tiny_vae, write_
 from transformers import CLIPTokenizer
 
 Colour = tuple[float, float, float]
+ANSWER = (0.6, 0.0, -0.2)  # of the decoder; 0.8, 0.5, 0.4 in [0, 1]
+SIZE = (30, 21)  # no multiple of anything
 LINEAR = {"prediction_space": "linear", "up_to_scale": False}
 SCALED = {"prediction_space": "linear", "up_to_scale": True}
 # As Marigold's published training configurations have them.
@@ -98,3 +101,11 @@ def _saved(pipeline: Any, folder: Path) -> Path:
     shutil.rmtree(folder / "tokenizer")
     shutil.copytree(folder.with_suffix(".words"), folder / "tokenizer")
     return folder
+
+
+def of_inside(value: np.ndarray, seen: dict[str, Any]) -> np.ndarray:
+    """The one value that a map has inside the mask; it is 0 outside."""
+    inside = seen["mask"][..., 0] > 0
+    assert not value[~inside].any()
+    assert np.ptp(value[inside], axis=0).max() < 1e-6
+    return value[inside][0]

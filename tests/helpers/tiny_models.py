@@ -11,7 +11,7 @@ from unirender.models.conditioning import Conditioning
 from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training.presets import LossConfig, OptimizerConfig, TrainConfig
+from unirender.training.config import LossConfig, OptimizerConfig, TrainConfig
 
 SIZE = 32
 

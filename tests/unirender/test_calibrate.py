@@ -18,12 +18,14 @@ from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.calibrate import Calibrate, Line, fit, readings, write_calibrated
+from unirender.training.calibrate import Calibrate, readings, write_calibrated
+from unirender.training.calibration_line import Line, fit
+from unirender.training.config import RunConfig
 from unirender.training.data import GroupDataset
 from unirender.training.facts import dataset_facts
 from unirender.training.same_objects import object_of, objects_of
 from unirender.training.start import read_start
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 
 @pytest.fixture(scope="module")

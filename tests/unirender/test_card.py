@@ -15,9 +15,10 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_names
 from unirender.training.card import CARD_FILE, card_text
+from unirender.training.config import RunConfig
 from unirender.training.export import export_pipeline
 from unirender.training.source import ShardSource
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 FACTS: dict[str, Any] = {
     "preset": "tiny",

@@ -9,9 +9,10 @@ import torch
 from tiny_models import TRAIN
 
 from unirender.errors import UnirenderError
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.config_check import RANGES, check_config
-from unirender.training.presets import PRESETS, TrainConfig
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.presets import PRESETS
+from unirender.training.trainer import Trainer
 
 
 def changed(config: Any, name: str, value: float) -> Any:

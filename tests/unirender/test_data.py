@@ -26,10 +26,10 @@ from unirender.training.augment import (
     Draw,
     draw,
 )
+from unirender.training.config import Augmentation
 from unirender.training.data import BATCH_MAPS, GroupDataset
 from unirender.training.environments import turned_environments
 from unirender.training.groups import Pair, list_shards, read_groups, split_of
-from unirender.training.presets import Augmentation
 from unirender.training.reader import BatchReader
 from unirender.training.source import ShardSource
 

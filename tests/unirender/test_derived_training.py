@@ -28,11 +28,11 @@ from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.training import derived
 from unirender.training.augment import NO_AUGMENTATION
+from unirender.training.config import Augmentation, LossConfig
 from unirender.training.data import BATCH_MAPS, DERIVED_FLAGS, DERIVED_MAPS, GroupDataset
 from unirender.training.derived import DerivedLight
 from unirender.training.groups import list_shards, read_groups
 from unirender.training.losses import LossFunction
-from unirender.training.presets import Augmentation, LossConfig
 from unirender.training.reader import BatchReader
 
 ALWAYS = Augmentation(mix=0.7, tint=0.3, permute=0.6, turn=0.6, derived=1.0)

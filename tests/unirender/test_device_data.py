@@ -13,15 +13,15 @@ from tiny_models import TRAIN
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.augment import NO_AUGMENTATION
 from unirender.training.command import Train
+from unirender.training.config import Augmentation, RunConfig
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset, make_batch
 from unirender.training.device_data import DeviceSource, fits, packed_bytes, room
 from unirender.training.device_groups import DeviceGroups
 from unirender.training.facts import training_facts
 from unirender.training.memory import TrainingBytes
-from unirender.training.presets import Augmentation
 from unirender.training.run import train
 from unirender.training.source import ShardSource
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 EVERYTHING = Augmentation(mix=0.7, permute=0.5, turn=0.5, repaint=0.5, derived=0.6, shadowed=0.5, move=0.5)
 ONE_BY_ONE = {

@@ -11,10 +11,11 @@ from tiny_models import TRAIN, make_batch
 from unirender.errors import UsageError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.config_check import check_config
-from unirender.training.presets import PRESETS, TrainConfig
+from unirender.training.presets import PRESETS
 from unirender.training.start import read_start
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 NO_RENDERING = dataclasses.replace(TRAIN.loss, cycle=0.0)
 INVERSE = dataclasses.replace(TRAIN, trains="inverse", p_render=0.0, loss=NO_RENDERING)

@@ -27,11 +27,12 @@ from unirender.models.packing import TRIPLETS
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
+from unirender.training.config import LossConfig, RunConfig
 from unirender.training.export import export_pipeline
 from unirender.training.losses import LossFunction
-from unirender.training.presets import PRESETS, LossConfig
+from unirender.training.presets import PRESETS
 from unirender.training.source import ShardSource
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 T = 999
 ENCODED = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, light="encoder"))

@@ -12,8 +12,9 @@ from torch import Tensor
 from unirender.errors import UnirenderError
 from unirender.training import loss_scale
 from unirender.training.checkpoint import load_state
+from unirender.training.config import RunConfig
 from unirender.training.loss_scale import FIRST, LEAST, LossScale
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 CPU = torch.device("cpu")
 

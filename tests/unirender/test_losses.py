@@ -19,10 +19,10 @@ from unirender.models.codec import KLCodec
 from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
+from unirender.training.config import LossConfig
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, compressed, timestep_weights
 from unirender.training.losses import DROPPABLE, LossFunction
-from unirender.training.presets import LossConfig
 
 T = 999
 MAPS = {"material", "albedo", "normal", "specular", "diffuse", "environment"}

@@ -10,6 +10,7 @@ from tiny_models import TRAIN
 from torch import Tensor, nn
 
 from unirender.models.build import build_model
+from unirender.training.config import OptimizerConfig
 from unirender.training.memory import training_bytes
 from unirender.training.muon import (
     STEP_RMS,
@@ -24,7 +25,7 @@ from unirender.training.muon import (
     matrix_shape,
     orthogonal_factor,
 )
-from unirender.training.presets import OptimizerConfig, get_preset
+from unirender.training.presets import get_preset
 
 MUON = OptimizerConfig(kind="muon", learning_rate=1e-2)
 

@@ -13,10 +13,10 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.models.packing import TRIPLETS
 from unirender.training import consistency, losses, passes
+from unirender.training.config import LossConfig, TrainConfig
 from unirender.training.loss_scale import FIRST
 from unirender.training.losses import LossFunction
 from unirender.training.passes import BatchGradient, Split
-from unirender.training.presets import LossConfig, TrainConfig
 from unirender.training.processes import Processes
 
 BATCH = 8

@@ -26,13 +26,14 @@ from unirender.models.picture_encoder import (
 from unirender.models.unet import pyramid_channels, pyramid_strides
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.config_check import check_config
 from unirender.training.export import export_pipeline
 from unirender.training.memory import training_bytes
-from unirender.training.presets import PRESETS, TrainConfig
+from unirender.training.presets import PRESETS
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trained import encoder_of
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 ENCODED = dataclasses.replace(
     TRAIN,

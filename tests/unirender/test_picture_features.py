@@ -17,10 +17,10 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_features import STAGES, PictureFeatures, read_vgg, statistics
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.export import export_pipeline
-from unirender.training.presets import TrainConfig
 from unirender.training.start import begin_with_network, load_features
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 from unirender_evaluation.lpips import LpipsNetwork
 
 FEATURED = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, picture_features="vgg16"))

@@ -10,10 +10,11 @@ from tiny_models import TRAIN, make_batch
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.command import Train
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.config_check import check_config
-from unirender.training.presets import PRESETS, TrainConfig
+from unirender.training.presets import PRESETS
 from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 RENDERER = dataclasses.replace(TRAIN, trains="renderer", p_render=1.0)
 SPLIT = dataclasses.replace(RENDERER, model=dataclasses.replace(TRAIN.model, unified=False))

@@ -16,8 +16,9 @@ from unirender import cli
 from unirender.command_line import Ended
 from unirender.training import stopping
 from unirender.training.checkpoint import load_state
+from unirender.training.config import RunConfig
 from unirender.training.stopping import SIGNALS, stopping_gently
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 STEPS = 4
 pytestmark = pytest.mark.usefixtures("a_hangup_counts")

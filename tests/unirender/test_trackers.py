@@ -15,9 +15,10 @@ from tiny_models import TRAIN
 from unirender.cli import main
 from unirender.errors import UsageError
 from unirender.training.command import Train
+from unirender.training.config import RunConfig
 from unirender.training.source import ShardSource
 from unirender.training.trackers import check_trackers, known_trackers, make_trackers, numbers, tracking
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 
 NAME = "test_lines"
 

@@ -40,15 +40,16 @@ from unirender.training.checkpoint import (
     save_state,
 )
 from unirender.training.command import Train
+from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
 from unirender.training.live import live_report, standing
-from unirender.training.presets import PRESETS, LossConfig, OptimizerConfig, TrainConfig, get_preset
+from unirender.training.presets import PRESETS, get_preset
 from unirender.training.reader import BatchReader
 from unirender.training.run import train
 from unirender.training.source import ShardSource
 from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import RunConfig, Trainer, learning_rate
+from unirender.training.trainer import Trainer, learning_rate
 from unirender.training.validation import Validate
 
 CPU = torch.device("cpu")

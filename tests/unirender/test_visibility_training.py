@@ -22,8 +22,9 @@ from unirender.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
 from unirender.training.checkpoint import load_state
 from unirender.training.stopping import SIGNALS
-from unirender.training.visibility import TrainVisibility, rate, split, terms, train_visibility
+from unirender.training.visibility import TrainVisibility, rate, split, train_visibility
 from unirender.training.visibility_data import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
+from unirender.training.visibility_loss import terms
 
 SIZE = 32
 
@@ -167,7 +168,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
         calls.append(1)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return rate(*arguments)  # type: ignore[arg-type] - as it is called
+        return rate(*arguments)  # pyright: ignore[reportArgumentType] - as it is called
 
     monkeypatch.setattr(visibility, "SAVE_SECONDS", 0.0)
     monkeypatch.setattr(visibility, "rate", asked_after_two)
@@ -191,7 +192,7 @@ def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
 
     def asked(*arguments: object) -> float:
         os.kill(os.getpid(), number)
-        return rate(*arguments)  # type: ignore[arg-type] - as it is called
+        return rate(*arguments)  # pyright: ignore[reportArgumentType] - as it is called
 
     monkeypatch.setattr(visibility, "rate", asked)
     with pytest.raises(SystemExit) as stopped:

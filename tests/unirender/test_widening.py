@@ -9,9 +9,10 @@ from both_directions import decompose, render
 from tiny_models import MODEL, TRAIN, make_batch, make_model
 
 from unirender.errors import UnirenderError
+from unirender.training.config import RunConfig
 from unirender.training.presets import PRESETS
 from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 from unirender.training.widening import Channels, can_widen, repeated, widen, widened
 
 NARROW = {"block_out_channels": (16, 32, 32), "attention_levels": (2,), "norm_num_groups": 8}

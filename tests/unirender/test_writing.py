@@ -18,11 +18,12 @@ from unirender import cli
 from unirender.errors import UnirenderError
 from unirender.training.average import Average
 from unirender.training.checkpoint import load_state, save_state
+from unirender.training.config import RunConfig
 from unirender.training.export import export_pipeline
 from unirender.training.pictures import save_sheet
 from unirender.training.processes import ALONE
 from unirender.training.run_log import RunLog
-from unirender.training.trainer import RunConfig, Trainer
+from unirender.training.trainer import Trainer
 from unirender.writing import unusable, writing
 
 NO_SPACE = "No space left on device"

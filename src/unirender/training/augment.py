@@ -21,8 +21,8 @@ from unirender.symmetries import mirror as mirror
 from unirender.symmetries import permute_channels as permute_channels
 from unirender.symmetries import quarter_turn as quarter_turn
 from unirender.symmetries import turn_rotation as turn_rotation
+from unirender.training.config import Augmentation
 from unirender.training.moving import ROLL_DEG, SHIFT, ZOOM, Move
-from unirender.training.presets import Augmentation
 
 METALLIC_NODES = (0.0, 0.5, 1.0)
 

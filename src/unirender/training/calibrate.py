@@ -1,13 +1,7 @@
 """`unirender calibrate`: how sure a checkpoint is of materials, set right on objects that are new to it.
 
-Of objects that it never saw a network says too extreme things, since it learned those of its training by heart: where
-it says roughness 0.9 the truth averages lower, where it says 0.1 higher. The line of least squares through new objects
-takes that back, for roughness and metallic each:
-
-    truth ~ k predicted + c
-
-Every object counts the same. Only a line is kept that lowers the error on objects that it was not fitted to, by more
-than chance. It stands in the configuration of the checkpoint's pipeline, whose weights stay as they are.
+The lines (`unirender.training.calibration_line`) stand in the configuration of the checkpoint's pipeline, whose weights
+stay as they are.
 """
 
 import contextlib
@@ -26,11 +20,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+    from unirender.training.calibration_line import Line
     from unirender.training.data import GroupDataset
 
-FOLDS = 5  # parts of the objects, each of which is scored with the line of the others
-LEAST_OBJECTS = 2 * FOLDS
-LEAST_SPREAD = 0.01  # standard deviation of predictions: below it they are one number, and the line is level
 INDEX = "model_index.json"
 
 
@@ -71,36 +63,7 @@ class Calibrate:
         return 0
 
 
-@dataclass(frozen=True)
-class Line:
-    """truth ~ slope * predicted + offset.
-
-    Attributes:
-        slope: 1 where the network is as sure as it should be, less where it is too sure.
-        offset: of the line.
-        before: mean squared error of the predictions.
-        after: the same of the lines' values, each at objects that its line was not fitted to.
-        chance: half of the 95 % interval of the difference.
-    """
-
-    slope: float
-    offset: float
-    before: float
-    after: float
-    chance: float
-
-    @property
-    def better(self) -> bool:
-        """Whether the line is worth having."""
-        return self.before - self.after > self.chance
-
-    def __str__(self) -> str:
-        gain = f"lower by {self.before - self.after:.4f} ± {self.chance:.4f} with lines of other objects"
-        kept = "" if self.better else ": not kept"
-        return f"{self.slope:.3f} x predicted + {self.offset:.3f}; mean squared error {self.before:.4f}, {gain}{kept}"
-
-
-def calibrate(options: Calibrate) -> dict[str, Line]:
+def calibrate(options: Calibrate) -> "dict[str, Line]":
     """Fits the lines and writes the copy, if there are any worth having; returns these.
 
     Raises:
@@ -114,6 +77,7 @@ def calibrate(options: Calibrate) -> dict[str, Line]:
     from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
+    from unirender.training.calibration_line import LEAST_OBJECTS, fit
     from unirender.training.data import GroupDataset
     from unirender.training.export import read_history
     from unirender.training.facts import dataset_facts
@@ -197,7 +161,7 @@ def readings(
     from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.masked_maps import masked_mean
     from unirender.training.augment import from_maps
-    from unirender.training.presets import Augmentation
+    from unirender.training.config import Augmentation
 
     drawn = Augmentation(permute=0.0, turn=0.0)
     of_group: dict[int, list[int]] = {}
@@ -222,41 +186,8 @@ def readings(
     return np.array(groups), np.array(found), np.array(truth)
 
 
-def fit(objects: 'Int[np.ndarray, " n"]', found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]') -> Line:
-    """The line of least squares; its errors are those of lines that are fitted to four fifths of the objects.
-
-    All objects weigh the same, however many pictures there are of them.
-    """
-    import numpy as np
-
-    _, objects, count = np.unique(objects, return_inverse=True, return_counts=True)
-    weight = 1 / count[objects]
-    part = objects % FOLDS
-    after = np.zeros_like(found)
-    for fold in range(FOLDS):
-        own = part == fold
-        slope, offset = _line(found[~own], truth[~own], weight[~own])
-        after[own] = np.clip(slope * found[own] + offset, 0, 1)
-    errors = [np.bincount(objects, weight * np.square(value - truth)) for value in (found, after)]
-    chance = 1.96 * float((errors[1] - errors[0]).std()) / len(count) ** 0.5
-    return Line(*_line(found, truth, weight), float(errors[0].mean()), float(errors[1].mean()), chance)
-
-
-def _line(
-    found: 'Float[np.ndarray, " n"]', truth: 'Float[np.ndarray, " n"]', weight: 'Float[np.ndarray, " n"]'
-) -> tuple[float, float]:
-    """Slope, not below 0, and offset."""
-    import numpy as np
-
-    x, y = (float(np.average(value, weights=weight)) for value in (found, truth))
-    variance = float(np.average(np.square(found - x), weights=weight))
-    covariance = float(np.average((found - x) * (truth - y), weights=weight))
-    slope = max(covariance / variance, 0.0) if variance > LEAST_SPREAD**2 else 0.0
-    return slope, y - slope * x
-
-
 def write_calibrated(
-    checkpoint: Path, folder: Path, name: str, lines: Mapping[str, Line], about: Mapping[str, Any]
+    checkpoint: Path, folder: Path, name: str, lines: "Mapping[str, Line]", about: Mapping[str, Any]
 ) -> None:
     """Copies a pipeline folder and adds the lines, to its configuration and to the account of its training, if there is
     one.

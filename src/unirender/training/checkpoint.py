@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from unirender.errors import UnirenderError
-from unirender.training.presets import TrainConfig
+from unirender.training.config import TrainConfig
 from unirender.writing import writing
 
 STATE_FILE = "state.pt"

@@ -13,8 +13,9 @@ from unirender.models.config import ENVIRONMENT_SIZE
 from unirender.option_checks import check_seed, usage
 from unirender.options import Device, DType
 from unirender.paths import cache_dir
+from unirender.training.config import TrainConfig
 from unirender.training.config_check import check_config
-from unirender.training.presets import TrainConfig, get_preset
+from unirender.training.presets import get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
 from unirender.models.config import ENCODER_SIDE
-from unirender.training.presets import TrainConfig
+from unirender.training.config import TrainConfig
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.packing import TRIPLETS, srgb_encode
 from unirender.models.priors import PRIORS
+from unirender.training.config import LossConfig
 from unirender.training.loss_terms import Errors, gradients, noise_like, predict, weighted_mean
-from unirender.training.presets import LossConfig
 
 ALL = slice(None)
 

@@ -21,9 +21,9 @@ from jaxtyping import Int
 
 from unirender.errors import UnirenderError
 from unirender.training.augment import Draw, draw
+from unirender.training.config import Augmentation
 from unirender.training.data import GroupDataset
 from unirender.training.groups import Group, Pair
-from unirender.training.presets import Augmentation
 
 Member = tuple[int, int]  # number of a group, number of a pair in it
 

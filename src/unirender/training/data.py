@@ -31,10 +31,10 @@ from unirender.training.augment import (
     mix_lights,
     permute_channels,
 )
+from unirender.training.config import Augmentation
 from unirender.training.derived import DerivedLight, open_derived
 from unirender.training.groups import Pair, Shard, list_shards, open_packed, read_environments
 from unirender.training.moving import moved
-from unirender.training.presets import Augmentation
 from unirender.training.repaint import mean_colour, recoloured, repaint
 from unirender.training.rows import SampleRows, basis_rows, shared_maps, trailing, with_material
 

@@ -25,9 +25,9 @@ from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
 from unirender.pipelines.inputs import told_derived
+from unirender.training.config import LossConfig
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights
-from unirender.training.presets import LossConfig
 from unirender.training.trained import encoder_of
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without

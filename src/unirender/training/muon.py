@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unirender.training.presets import OptimizerConfig
+from unirender.training.config import OptimizerConfig
 
 STEPS, A, B, C = 5, 3.4445, -4.775, 2.0315  # of the iteration; Jordan et al.
 STEP_RMS = 0.2  # of AdamW's update; Liu et al.

@@ -27,9 +27,9 @@ from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
 from unirender.errors import UnirenderError
 from unirender.models.priors import Maps
+from unirender.training.config import TrainConfig
 from unirender.training.loss_terms import COLOURS, Errors, LossTerms, gradients
 from unirender.training.losses import LossFunction
-from unirender.training.presets import TrainConfig
 from unirender.training.processes import ALONE, Processes
 
 OWN_ROWS = ("image", "environment", "composite", "cycle", "answers")  # terms whose means have weights of their own

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from unirender.errors import UnirenderError
 from unirender.training.augment import DEFAULT_AUGMENTATION
+from unirender.training.config import Augmentation
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset, make_batch
-from unirender.training.presets import Augmentation
 
 
 class BatchReader(Iterator[Batch]):

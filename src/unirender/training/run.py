@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UsageError
 from unirender.notices import notice
 from unirender.training.command import Alone, Train
-from unirender.training.presets import TrainConfig
+from unirender.training.config import RunConfig, TrainConfig
 
 if TYPE_CHECKING:
     import torch
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from unirender.training.memory import TrainingBytes
     from unirender.training.processes import Processes
     from unirender.training.source import ShardSource
-    from unirender.training.trainer import RunConfig, Trainer
+    from unirender.training.trainer import Trainer
     from unirender.training.validation import Validate
 
 
@@ -104,10 +104,8 @@ def _train(
     return pipeline
 
 
-def run_config(options: Train, config: TrainConfig, out: Path, parallel: int) -> "RunConfig":
+def run_config(options: Train, config: TrainConfig, out: Path, parallel: int) -> RunConfig:
     """How long the run is and what it leaves behind; `parallel`: parts of a batch that run side by side."""
-    from unirender.training.trainer import RunConfig
-
     return RunConfig(
         out,
         steps=config.steps if options.steps is None and options.minutes is None else options.steps,

@@ -5,10 +5,10 @@ from typing import Any, Protocol, runtime_checkable
 
 from unirender.errors import UnirenderError
 from unirender.training.augment import DEFAULT_AUGMENTATION
+from unirender.training.config import Augmentation
 from unirender.training.contrasts import ContrastDataset
 from unirender.training.data import ALL_ROWS, Batch, GroupDataset
 from unirender.training.groups import split_of
-from unirender.training.presets import Augmentation
 from unirender.training.reader import BatchReader
 
 

@@ -17,8 +17,8 @@ from typing import Any
 from accelerate.tracking import LOGGER_TYPE_TO_CLASS, GeneralTracker, get_available_trackers
 
 from unirender.errors import UsageError
+from unirender.training.config import TrainConfig
 from unirender.training.live import Report
-from unirender.training.presets import TrainConfig
 
 TRACKER_FOLDER = "trackers"
 PROJECT = "unirender"

@@ -10,7 +10,6 @@ clock; weights, optimiser and random state are alike on all.
 """
 
 import contextlib
-import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,7 +27,9 @@ from unirender.models.build import build_model
 from unirender.models.priors import Maps
 from unirender.training.beginning import Beginning
 from unirender.training.checkpoint import STATE_FILE, save_state
+from unirender.training.config import OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.config_check import check_config
+from unirender.training.due import Due
 from unirender.training.ema import Ema
 from unirender.training.live import Report, standing
 from unirender.training.loss_scale import LossScale
@@ -37,7 +38,6 @@ from unirender.training.muon import make_optimizer
 from unirender.training.not_finite import too_large, wrong_data
 from unirender.training.passes import BatchGradient, Split
 from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
-from unirender.training.presets import OptimizerConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
@@ -45,24 +45,6 @@ from unirender.training.state import resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
-
-
-@dataclasses.dataclass(frozen=True)
-class RunConfig:
-    """How long a run is and what it leaves behind. The run ends with whichever of `steps` and `minutes` comes first."""
-
-    out: Path
-    steps: int | None = None
-    minutes: float | None = None  # of training, over all resumes
-    log_every: int = 20  # steps
-    save_minutes: float = 3.0
-    picture_minutes: float = 5.0
-    refresh_minutes: float | None = None  # look for new shards; None: never
-    parallel: int = 1  # parts of a batch that run side by side, each on one CPU thread; changes the noise drawn
-    accumulate: int = 1  # times that they do so for one step, to save memory; changes the noise drawn
-    keep_best: str | None = None  # the score by which a validated run keeps its best pipeline in `best/`; None: none
-    preset: str | None = None  # the row that the config began as, for the model card
-    scored_on: str | None = None  # in words: what the validation measures on, for the model card
 
 
 def learning_rate(config: OptimizerConfig, step: int, progress: float) -> float:
@@ -189,54 +171,50 @@ class Trainer:
         if resumed and main:
             say(standing(self.step, self.seconds / 60, self.run.steps, self.run.minutes))
         write_config(self)
-        fixed: Maps | None = None
-
-        def look() -> None:
-            if not main:
-                return
-            if fixed is not None:
-                self.picture(fixed)
-            if validation is not None:
-                self.log.tell(validation.run(self), report)
-
-        def due(name: str, minutes: float | None) -> bool:
-            if minutes is None or time.monotonic() - clock[name] < 60 * minutes:
-                return False
-            clock[name] = time.monotonic()
-            return True
-
-        look()
-        clock = {name: time.monotonic() for name in ("step", "save", "picture", "refresh")}
+        self._look(None, validation, report)
+        due = Due(save=self.run.save_minutes, picture=self.run.picture_minutes, refresh=self.run.refresh_minutes)
+        shown: Maps = {}  # of the first batch: the same in every picture
         logged = self.step, self.seconds
         with stopping_gently() as request:
             while self.progress < 1:
-                clock["step"] = time.monotonic()  # pictures, validation and saves are no training
+                start = time.monotonic()  # pictures, validation and saves are no training
                 batch = source.next()
-                if fixed is None:
-                    fixed = {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
+                shown = shown or {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-                seconds = self.seconds + time.monotonic() - clock["step"]
-                refresh = due("refresh", self.run.refresh_minutes)
-                self.seconds, refreshing, stopping = self.processes.share((seconds, refresh, request.signal))
+                seconds = self.seconds + time.monotonic() - start
+                self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
-                    speed = (self.step - logged[0]) * self.config.batch_size / (self.seconds - logged[1])
-                    logged = self.step, self.seconds
-                    rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
                     with request.unheard():
-                        self.log.tell(rates | self.log.means(), report)
-                if main and (stopping is not None or due("save", self.run.save_minutes)):
+                        self._tell_losses(*logged, report)
+                    logged = self.step, self.seconds
+                if main and (stopping is not None or due("save")):
                     self.save(source)
                 if stopping is not None:
                     self.processes.share(None)  # all wait: when one has ended, torchrun ends the one that saves
                     raise Ended(stopping)
                 with request.unheard():
-                    if main and due("picture", self.run.picture_minutes):
-                        look()
+                    if main and due("picture"):
+                        self._look(shown, validation, report)
                     if refreshing:
                         self._refresh(source, report)
         if main:
             self.save(source)
-        look()
+        self._look(shown, validation, report)
+
+    def _tell_losses(self, step: int, seconds: float, report: Report) -> None:
+        """Logs the means of the losses, and the speed since a step and its seconds of training."""
+        speed = (self.step - step) * self.config.batch_size / (self.seconds - seconds)
+        rates = {"step": self.step, "minutes": self.seconds / 60, "samples_per_s": speed}
+        self.log.tell(rates | self.log.means(), report)
+
+    def _look(self, shown: Maps | None, validation: Validation | None, report: Report) -> None:
+        """Draws these samples, if there are any, and validates, if that is asked for; process 0 alone."""
+        if not self.processes.is_main:
+            return
+        if shown:
+            self.picture(shown)
+        if validation is not None:
+            self.log.tell(validation.run(self), report)
 
     def _start_alike(self, source: BatchSource) -> None:
         """Gives all processes the weights, and the data, of process 0.

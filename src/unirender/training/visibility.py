@@ -1,16 +1,7 @@
 """`unirender train-visibility`: teaches the network of shadows which directions objects hide from themselves.
 
-The loss of an object is
-
-    mean_w BCE(P, V) + LIGHT_WEIGHT mean_L log(E_L + E_0),
-    E_L = mean_p ((sum_ck L_k (H_pck - W_pck P_pck)) / mean_p(sum_ck L_k W_pck))^2
-
-that is, how likely each direction is hidden, and the squared error of d under random lights L in decibels: what is
-nearly right of a ball that hides nothing should not be paid for with what is gained on a chair. H and W are the
-integrals of the cosine over the hidden and over all directions of class c and bin k, P the network's answer.
-
-A run resumes by running the same command again: the order of objects and all that is random is a function of the seed
-and the step.
+The loss of an object is in `unirender.training.visibility_loss`. A run resumes by running the same command again: the
+order of objects and all that is random is a function of the seed and the step.
 """
 
 import contextlib
@@ -31,17 +22,11 @@ from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:
     import torch
-    from torch import Tensor
 
     from unirender.models.visibility import VisibilityNet
     from unirender.training.visibility_data import VisibilityItem
 
 HELD_OUT = 25  # every so many-th object is for validation
-LIGHT_WEIGHT = 0.1
-LEAST_ERROR = 1e-4  # E_0
-LIGHTS = 4  # of each kind for an object
-SPREAD = 1.5  # standard deviation of the log of the bins' radiance in lights of the first kind
-LAMP, LAMP_SHARE = 40.0, 0.04  # radiance of lamps beside a uniform 1, and the share of bins that have one: the second
 WARMUP = 50  # steps
 FLAT = 0.5  # of the steps, after which the learning rate falls to 0
 EMA_DECAY = 0.995
@@ -150,6 +135,7 @@ class _Run:
         from unirender.models.visibility import VisibilityNet
         from unirender.training.checkpoint import load_state
         from unirender.training.ema import Ema
+        from unirender.training.visibility_loss import validate
 
         self.options, self.items, self.held_out = options, items, held_out
         self.asked = {**dataclasses.asdict(options), "data": dict(shards), "out": None}
@@ -185,6 +171,8 @@ class _Run:
         """One step of the optimiser."""
         import torch
 
+        from unirender.training.visibility_loss import LIGHT_WEIGHT, terms
+
         options = self.options
         for group in self.optimizer.param_groups:
             group["lr"] = options.learning_rate * rate(self.step / options.steps, self.step)
@@ -210,6 +198,7 @@ class _Run:
 
         from unirender.models.visibility import VisibilityNet
         from unirender.training.checkpoint import save_state
+        from unirender.training.visibility_loss import mean, validate
         from unirender.whole_files import replace_file
 
         parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
@@ -220,7 +209,7 @@ class _Run:
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
         with writing(path := self.options.out / WEIGHTS_FILE):
             replace_file(path, save(halves))
-        means = dict(zip(("bce", "log_error"), map(_mean, zip(*self.losses, strict=True)), strict=True))
+        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
         self.losses.clear()
         self._tell(means | validate(shown, self.held_out, self.options.seed))
 
@@ -267,39 +256,3 @@ def drawn(
         item = half if half.surface.any() else item
     item = item.turned(int(rng.integers(4)), bool(rng.integers(2)))
     return item, torch.Generator().manual_seed(int(rng.integers(1 << 62)))
-
-
-def terms(net: "VisibilityNet", item: "VisibilityItem", rng: "torch.Generator") -> "tuple[Tensor, Tensor]":
-    """The two terms of the loss of an object: BCE, and the mean log error under lights that are drawn."""
-    import numpy as np
-    import torch
-    import torch.nn.functional as F
-
-    from unirender.models.visibility import BINS, CLASSES, at_pixels, net_input
-
-    weight = item.weight.astype(np.float32)
-    hidden = torch.from_numpy(np.minimum(item.hidden, weight))
-    x, window = net_input(item.normal, item.surface, item.depth, weight)
-    y = net(torch.from_numpy(x)[None].contiguous(memory_format=torch.channels_last))[0]
-    y = at_pixels(y, item.surface, window).reshape(-1, len(CLASSES), BINS)
-    w = torch.from_numpy(weight)
-    bce = -(hidden * F.logsigmoid(y) + (w - hidden) * F.logsigmoid(-y)).sum() / w.sum()
-    skies = torch.exp(SPREAD * torch.randn(LIGHTS, BINS, generator=rng))
-    lamps = 1 + LAMP * (torch.rand(LIGHTS, BINS, generator=rng) < LAMP_SHARE)
-    light = torch.cat([skies, lamps]).T
-    error = (hidden - w * y.sigmoid()).sum(dim=1) @ light / (w.sum(dim=1) @ light).mean(dim=0)
-    return bce, torch.log(error.square().mean(dim=0) + LEAST_ERROR).mean()
-
-
-def validate(net: "VisibilityNet", items: "Sequence[VisibilityItem]", seed: int) -> dict[str, float]:
-    """The two terms, means over held-out objects, under the same lights each time."""
-    import torch
-
-    with torch.no_grad():
-        found = [terms(net, item, torch.Generator().manual_seed(seed + i)) for i, item in enumerate(items)]
-    bce, error = zip(*found, strict=True)
-    return {"held_out_bce": _mean(bce), "held_out_log_error": _mean(error)}
-
-
-def _mean(values: "Sequence[Any]") -> float:
-    return sum(float(value) for value in values) / len(values)

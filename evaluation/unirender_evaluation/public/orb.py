@@ -1,0 +1,301 @@
+"""Stanford-ORB (Kuang et al. 2023): objects photographed in several places, with scanned shape and measured light.
+
+    FOLDER/blender_LDR/<capture>/test/<id>.png      photographs, sRGB; test_mask/<id>.png; the same for train
+    FOLDER/blender_HDR/<capture>/test/<id>.exr      the same photographs, linear
+    FOLDER/blender_LDR/<capture>/transforms_test.json   camera_angle_x (radians); frames: file_path ("test/0000") and
+                                                        transform_matrix (camera to world, OpenGL axes)
+    .../transforms_train.json, transforms_novel.json    novel: photographs of the object elsewhere, the poses in this
+                                                        capture's world; each frame has scene_name and camera_angle_x
+    FOLDER/ground_truth/<capture>/surface_normal/<id>.npy    camera axes, as ours
+                                 /z_depth/<id>.npy, /env_map/<id>.exr (linear, in camera axes)
+                                 /pseudo_gt_albedo/<id>.png (sRGB), or .npy (taken as linear)
+
+A capture is one object in one place, `<object>_scene<number>`. Two questions. *Decompose*: the maps of a test
+photograph. *Relight*: the object of one capture as it was photographed in another. The benchmark asks that of all views
+of a capture: a folder of predictions can answer always, a method that sees one picture where some photograph of the
+capture was taken from nearly the other's camera.
+
+Layout, conventions and metrics are those of the set's README and of its evaluation code. Not verified: that blender_LDR
+is blender_HDR clipped and encoded, the exposure of env_map against the photographs, and what a pseudo_gt_albedo in .npy
+holds. Checked on made data only.
+"""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.camera import Camera
+from unirender.color import srgb_decode
+from unirender.errors import UnirenderError
+from unirender.exr import channels_rgb, read_exr
+from unirender_evaluation.lpips import Lpips
+from unirender_evaluation.methods import quantise
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.public import orb_scoring as scoring
+from unirender_evaluation.public.metrics import ERODED, eroded
+from unirender_evaluation.public.orb_frames import HDR, LDR, Capture, Frame, captures, relightings
+from unirender_evaluation.public.sets import (
+    MAPS,
+    Answer,
+    PublicSetError,
+    Sample,
+    block_mean,
+    missing_files,
+    need_folder,
+    read_array,
+    read_display,
+    read_photograph,
+)
+from unirender_evaluation.specs import TableSpec
+
+NAME = "stanford-orb"
+RESOLUTION = 512  # of the benchmark
+TOLERANCE_DEG = 2.0
+LAYOUT = "Stanford-ORB's folders blender_LDR, ground_truth and, for relighting, blender_HDR"
+MAP_TRUTHS = {"normal": ("surface_normal", (".npy",)), "depth": ("z_depth", (".npy",)),
+              "albedo": ("pseudo_gt_albedo", (".png", ".npy"))}  # fmt: skip
+
+
+class StanfordOrb:
+    """Reader of the set; see the module for the folder.
+
+    Args:
+        folder: where the set is.
+        resolution: columns at which everything is handed out and compared; the benchmark's own is 512.
+        tolerance_deg: how far two cameras may differ to count as one (`orb_frames.difference_deg`).
+    """
+
+    name = NAME
+    tables: tuple[TableSpec, ...] = (scoring.MAPS_TABLE, scoring.RELIT_TABLE)
+    modules: tuple[str, ...] = ("public/orb*", "public/metrics", "public/sets")
+    variant = Variant("masked")
+    averaged_first: str | None = "captures"
+
+    def __init__(self, folder: Path, resolution: int = RESOLUTION, tolerance_deg: float = TOLERANCE_DEG) -> None:
+        self.folder, self.resolution, self.tolerance_deg = folder, resolution, tolerance_deg
+
+    @cached_property
+    def _captures(self) -> list[Capture]:
+        need_folder(self.folder / LDR, self.name, LAYOUT)
+        found, problems = captures(self.folder)
+        if not found:
+            problems.append(f"{self.folder / LDR}: has no capture, expected folders like teapot_scene001")
+        if problems:
+            raise PublicSetError(self.name, problems)
+        return found
+
+    @cached_property
+    def _tests(self) -> dict[str, Frame]:
+        """Test photographs by the key of their sample."""
+        return {f"{frame.capture}_{frame.id}": frame for capture in self._captures for frame in capture.test}
+
+    @cached_property
+    def _relit(self) -> dict[str, tuple[Frame | None, Frame]]:
+        """By the key of their sample: the photograph that a method sees, if there is one, and that which is asked."""
+        if not (self.folder / HDR).is_dir():
+            return {}
+        return {
+            f"{capture.name}/{_relight_name(frame)}": (capture.nearest(frame, self.tolerance_deg), frame)
+            for capture, frame in relightings(self._captures)
+        }
+
+    @cached_property
+    def _samples(self) -> tuple[Sample, ...]:
+        named = {capture.name: capture for capture in self._captures}
+        found = [
+            self._map_sample(key, frame, named[frame.capture])
+            for key, frame in self._tests.items()
+            if frame_truths(self.folder, frame)
+        ]
+        for key, (source, frame) in self._relit.items():
+            found.append(self._relight_sample(key, source, frame, named[key.split("/")[0]]))
+        whats = {".png": "a photograph, a mask or an albedo", ".exr": "a linear photograph or a light"}
+        problems = [
+            line
+            for path in dict.fromkeys(file for sample in found for file in sample.files)
+            for line in missing_files([path], whats.get(path.suffix, "a file of the set"))
+        ]
+        if not found:
+            problems.append(f"{self.folder}: has nothing to compare with, expected {LAYOUT}")
+        if problems:
+            raise PublicSetError(self.name, problems)
+        return tuple(found)
+
+    def samples(self) -> tuple[Sample, ...]:
+        """The maps of every test photograph that has a truth, and every relighting."""
+        return self._samples
+
+    def unit(self, sample: str) -> str:
+        """The capture that a method was given."""
+        return self._tests[sample].capture if sample in self._tests else sample.split("/")[0]
+
+    def _map_sample(self, key: str, frame: Frame, capture: Capture) -> Sample:
+        truths = frame_truths(self.folder, frame).values()
+        files = (frame.photo(self.folder), frame.mask(self.folder), capture.files[0], *truths)
+        return Sample(scoring.MAPS_TABLE.name, key, capture.object, "decompose", key, MAPS, files)
+
+    def _relight_sample(self, key: str, source: Frame | None, frame: Frame, capture: Capture) -> Sample:
+        light = frame.truth(self.folder, "env_map", ".exr")
+        sees = source is not None and light.parent.is_dir()
+        files = [frame.photo(self.folder, HDR), frame.mask(self.folder), *capture.files]
+        if source is not None and sees:
+            files += [source.photo(self.folder), source.mask(self.folder), light]
+        name = scoring.RELIT_TABLE.name
+        return Sample(
+            name, key, capture.object, "relight", capture.name, _relight_name(frame), tuple(files), one_picture=sees
+        )
+
+    def inputs(self, sample: Sample) -> dict[str, Any]:
+        """The photograph at the run's resolution, in 8 bits; for relighting also the other place's light."""
+        frame = self._tests[sample.key] if sample.asks == "decompose" else self._relit[sample.key][0]
+        if frame is None:
+            raise UnirenderError(f"{sample.key}: no photograph was taken from the camera of the relit one")
+        mask = self._mask(frame)
+        path = frame.photo(self.folder)
+        linear = srgb_decode(read_photograph(path))
+        full = read_display(frame.mask(self.folder), 1)
+        if full.shape[:2] != linear.shape[:2]:
+            raise UnirenderError(
+                f"{frame.mask(self.folder)}: is {_size(full)} pixels, expected {_size(linear)} as its photograph {path}"
+            )
+        picture = quantise(block_mean(linear * full, self.resolution, str(path)), mask)
+        found: dict[str, Any] = {"image_srgb": picture, "mask": mask, "camera": frame.camera(*mask.shape[:2])}
+        if sample.asks == "relight":
+            light = self._relit[sample.key][1].truth(self.folder, "env_map", ".exr")
+            found["environment"] = contract_environment(read_radiance(light))
+        return found
+
+    def frame(self, sample: Sample) -> tuple[tuple[int, int], Camera]:
+        """The run's resolution, square as the set is."""
+        frame = self._tests[sample.key] if sample.asks == "decompose" else self._relit[sample.key][1]
+        return (self.resolution, self.resolution), frame.camera(self.resolution, self.resolution)
+
+    def score(self, sample: Sample, answer: Answer, lpips: Sequence[Lpips]) -> dict[str, float]:
+        """The benchmark's metrics of maps, or of a relit picture, each with a factor per channel and without."""
+        if sample.asks == "relight":
+            frame = self._relit[sample.key][1]
+            if answer.image is None:
+                return {}
+            mask, path = self._mask(frame), frame.photo(self.folder, HDR)
+            truth = self._reduced(read_radiance(path), path, frame)
+            return scoring.score_relit(answer.image, truth, mask, lpips)
+        frame = self._tests[sample.key]
+        mask = self._mask(frame)
+        found = frame_truths(self.folder, frame)
+        truths = {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
+        return scoring.score_maps(answer, truths, mask, lpips)
+
+    def _mask(self, frame: Frame) -> Float[np.ndarray, "h w 1"]:
+        path = frame.mask(self.folder)
+        full = read_display(path, 1)
+        if full.shape[0] != full.shape[1]:
+            raise UnirenderError(f"{path}: is {_size(full)} pixels, expected a square, as all pictures of the set are")
+        mask = block_mean(full, self.resolution, str(path))
+        if not eroded(mask).any():
+            raise UnirenderError(f"{path}: shows no object that is larger than the edge which is left out")
+        return mask
+
+    def _reduced(self, value: Float[np.ndarray, "h w c"], path: Path, frame: Frame) -> Float[np.ndarray, "h2 w2 c"]:
+        """A map at the run's resolution, which has to be a square like the mask of its frame."""
+        if value.shape[0] != value.shape[1]:
+            raise UnirenderError(
+                f"{path}: is {_size(value)} pixels, expected a square like its mask {frame.mask(self.folder)}"
+            )
+        return block_mean(value, self.resolution, str(path))
+
+    def _truth(
+        self, name: str, path: Path, frame: Frame, counted: Float[np.ndarray, "h w 1"]
+    ) -> Float[np.ndarray, "h w c"]:
+        """A map of the truth, with a look at the values that count: those of the eroded mask."""
+        if path.suffix == ".png":
+            return srgb_decode(self._reduced(read_display(path, 3), path, frame))
+        full = read_array(path, 1 if name == "depth" else 3)
+        found = self._reduced(full, path, frame)
+        block = len(full) // len(found)  # means of unit vectors are shorter: what is stored is looked at
+        inside = np.kron(counted[..., 0] > 0, np.ones((block, block), bool))
+        scoring.check_truth(name, full[: len(inside), : len(inside)][inside], str(path))
+        return found
+
+    def why_absent(self, table: str) -> str | None:
+        """How many photographs could be relit by a method, where it is none."""
+        relit = [sample for sample in self.samples() if sample.asks == "relight"]
+        if table != scoring.RELIT_TABLE.name or not relit or any(sample.one_picture for sample in relit):
+            return None
+        return (
+            f"relighting: 0 of {len(relit)} photographs were taken from within {self.tolerance_deg:g} degrees of a "
+            "photograph of the capture that is relit; see --tolerance-deg"
+        )
+
+    def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
+        """(what, value) pairs: what exactly the table of that name measures."""
+        shared = (
+            ("resolution", f"{self.resolution} columns, means over blocks"),
+            ("mask", f"over one half, shrunk by {ERODED} x {ERODED} px; both sides black outside it"),
+            *scoring.ABOUT,
+        )
+        if table == scoring.MAPS_TABLE.name:
+            return (("given", "one photograph (8-bit sRGB) with its mask and camera"), *shared, *scoring.ABOUT_MAPS)
+        relit = [sample for sample in self.samples() if sample.asks == "relight"]
+        seen = sum(sample.one_picture for sample in relit)
+        return (
+            ("given", "one photograph (8-bit sRGB) with its mask and camera, and the other place's light"),
+            (
+                "asked",
+                f"the object in another place, {len(relit)} photographs; of methods that see one picture only the "
+                f"{seen} from within {self.tolerance_deg:g} degrees of a photograph of the capture",
+            ),
+            *shared,
+            *scoring.ABOUT_RELIT,
+        )
+
+
+def _size(value: Float[np.ndarray, "h w c"]) -> str:
+    return f"{value.shape[1]} x {value.shape[0]}"
+
+
+def _relight_name(frame: Frame) -> str:
+    return f"relight_{frame.capture}_{frame.id}"
+
+
+def frame_truths(folder: Path, frame: Frame) -> dict[str, Path]:
+    """The truths of a photograph whose folder is there, by map; a file may still be missing in it."""
+    found = {}
+    for name, (kind, suffixes) in MAP_TRUTHS.items():
+        paths = [frame.truth(folder, kind, suffix) for suffix in suffixes]
+        if paths[0].parent.is_dir():
+            found[name] = next((path for path in paths if path.is_file()), paths[0])
+    return found
+
+
+def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """R, G, B of an EXR file, negative values as 0 (the benchmark does the same).
+
+    Raises:
+        UnirenderError: no readable file, no such channels, or values that are not finite.
+    """
+    try:
+        rgb = channels_rgb(read_exr(path)[0])
+    except UnirenderError as error:
+        raise UnirenderError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    if not np.isfinite(rgb).all():
+        bad = int((~np.isfinite(rgb)).any(axis=-1).sum())
+        raise UnirenderError(f"{path}: {bad} pixels are NaN or infinite, expected finite radiance; repair them first")
+    return np.maximum(rgb, 0)
+
+
+def contract_environment(stored: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """An env_map on the contract's grid.
+
+    Both have +y up and rows on the poles. There the middle column looks along -z, into the scene, and the first and
+    last column, both behind the camera, are one direction; here -z is at the border, and columns are centres.
+    """
+    width = stored.shape[1]
+    turn = (np.arange(width) + 0.5) / width  # of the contract's columns, from -z over +x
+    position = np.mod(turn + 0.5, 1.0) * (width - 1)
+    first = np.minimum(position.astype(np.int64), width - 2)
+    share = (position - first)[:, None]
+    return (stored[:, first] * (1 - share) + stored[:, first + 1] * share).astype(np.float32)

@@ -1,7 +1,0 @@
-"""The parts of the speed study by name. Light to import; what they are: `speed_study`."""
-
-from typing import Literal
-
-PartName = Literal["network", "mitsuba", "start", "training", "overfit"]
-PARTS: tuple[PartName, ...] = ("network", "mitsuba", "start", "training", "overfit")
-NEED_DATA: frozenset[PartName] = frozenset({"training", "overfit"})

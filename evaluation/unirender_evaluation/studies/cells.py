@@ -1,0 +1,51 @@
+"""What the tables of studies share: columns, and cells that say how far a row is from the one it is compared with."""
+
+import math
+from dataclasses import dataclass
+
+from unirender_evaluation.metrics import METRICS
+from unirender_evaluation.specs import Column
+from unirender_evaluation.statistics import Estimate
+from unirender_evaluation.table_formats import format_number
+
+
+def study_column(group: str, quantity: str, metric: str) -> Column:
+    """A column of one of the benchmark's metrics; the paper has no number for it."""
+    return Column(group, quantity, METRICS[metric], published=False)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number of a row.
+
+    Attributes:
+        mean: over objects.
+        n: how many.
+        difference: from the row that all are compared with (None in that row itself), paired.
+    """
+
+    mean: float
+    n: int
+    difference: Estimate | None
+
+    @property
+    def decided(self) -> bool:
+        """Whether the interval of the difference excludes 0."""
+        return self.difference is not None and (self.difference.low > 0 or self.difference.high < 0)
+
+
+def cell_text(cell: Cell, decimals: int) -> str:
+    """`27.90 (**-1.20 ± 0.40**)`."""
+    text = format_number(cell.mean, decimals)
+    if cell.difference is None:
+        return text
+    change = signed(cell.difference.mean, decimals)
+    if not math.isnan(cell.difference.half_width):
+        change += f" ± {format_number(cell.difference.half_width, decimals)}"
+    return f"{text} (**{change}**)" if cell.decided else f"{text} ({change})"
+
+
+def signed(value: float, decimals: int) -> str:
+    """With its sign, unless it is 0 as printed."""
+    text = f"{value:+.{decimals}f}"
+    return text if float(text) else text[1:]

@@ -1,0 +1,40 @@
+"""A run of `unirender bench derived-light`: measures with progress, prints, writes."""
+
+import hashlib
+from datetime import UTC, datetime
+
+from rich.console import Console
+
+from unirender_evaluation.records import Record
+from unirender_evaluation.studies.derived_light.measure import DerivedLight, measure, methods, settings
+from unirender_evaluation.studies.derived_light.tables import table, to_json
+from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.progress import collect
+from unirender_evaluation.versions import installed_version
+
+NAME = "derived_light"
+
+
+def run(what: DerivedLight, console: Console) -> list[Record]:
+    """Measures what is missing and writes `derived_light.md` and `derived_light.json`; returns all records.
+
+    Args:
+        what: the measurement.
+        console: for progress and the table.
+    """
+    with open_folder(what.out):
+        pictures = (1 + len(what.objects)) * len(what.lights)
+        total = pictures * sum(len(methods(question)) for question in what.questions)
+        records, computed = collect(measure(what), total, "derived light", console)
+        made = table(records, what.questions, what.lights)
+        about = {
+            **settings(what),
+            "mitsuba": installed_version("mitsuba"),
+            "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
+            "date": datetime.now(UTC).date().isoformat(),
+        }
+        line = ", ".join(f"{name} {about[name]}" for name in ("resolution", "mitsuba", "code", "date"))
+        write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{line}.\n", f"{NAME}.json": to_json(records, about)})
+        made.show(console)
+        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        return records

@@ -1,0 +1,113 @@
+"""What the studies of the optimiser share: the objects of the multi-view table, content keys, the protocol."""
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.console import Console
+
+from unirender_evaluation.multiview_scenes import MultiviewScene, multiview_scenes, suite_scene
+from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
+from unirender_evaluation.store import content_key
+from unirender_evaluation.studies.progress import study_bar
+from unirender_evaluation.suites import Scene, Suite, load_suite
+from unirender_evaluation.versions import (
+    MULTIVIEW,
+    OPTIMIZER,
+    REFERENCE,
+    SEPARATOR,
+    Versions,
+    installed_version,
+    modules_version,
+    versions,
+)
+
+USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
+
+
+@dataclass(frozen=True)
+class Study:
+    """The objects of a study.
+
+    Attributes:
+        suite: the suite.
+        scenes: one for each object.
+        settings: cameras and samples.
+        code: versions of what its figures depend on.
+        seed: of what is compared.
+    """
+
+    suite: Suite
+    scenes: tuple[Scene, ...]
+    settings: MultiviewSettings
+    code: str
+    seed: int
+
+    @classmethod
+    def of(
+        cls,
+        suite: str,
+        objects: int,
+        seed: int,
+        own: str,
+        settings: MultiviewSettings = STANDARD,
+        found: Versions | None = None,
+    ) -> "Study":
+        """The study of a suite's first scenes of `objects` objects, as the multi-view table has them.
+
+        Args:
+            suite: a bundled suite, or the path of a suite's TOML file.
+            objects: how many, evenly spaced.
+            seed: of what is compared.
+            own: the module that measures, part of the code's version.
+            settings: cameras and samples.
+            found: versions of the code; None: of what is installed.
+
+        Raises:
+            UnirenderError: no such suite, or its truth was changed.
+        """
+        loaded = load_suite(suite)
+        code = (found or versions()).of(USES) + f"{SEPARATOR}{own} {modules_version(own)}"
+        return cls(loaded, tuple(multiview_scenes(list(loaded.scenes), objects)), settings, code, seed)
+
+    def scene(self, scene: Scene) -> MultiviewScene:
+        """The pictures of an object and its truth; rendered when they are asked for."""
+        return suite_scene(self.suite, scene, self.settings)
+
+    def key(self, scene: Scene, what: str, config: Mapping[str, Any]) -> str:
+        """The content key of a measurement: truth, cameras, question, configuration and code."""
+        question = f"{what}/{json.dumps(asdict(self.settings), sort_keys=True)}"
+        return content_key(self.suite, scene, question, config, self.code)
+
+    def protocol(self, **more: str) -> tuple[tuple[str, str], ...]:
+        """(what, value) pairs: everything one must know to compare a figure of the study with one's own."""
+        settings, names = self.settings, ", ".join(scene.object for scene in self.scenes)
+        size = self.suite.spec.resolution
+        digest = content_key(self.suite, self.scenes[0], "protocol", {}, self.code)[:12]
+        return (
+            ("objects", f"{len(self.scenes)} ({names}), one light and one material each"),
+            ("given", f"{settings.seen} pictures of {size} x {size} px (8-bit sRGB), masks, cameras, the true mesh"),
+            (
+                "maps",
+                f"buffers of all {settings.seen + settings.held_out} cameras, {settings.buffer_spp} rays per pixel",
+            ),
+            ("mask", "inside the true mask, weighted by coverage"),
+            ("seed", str(self.seed)),
+            ("suite", f"{self.suite.spec.name} {self.suite.sha256[:12]}"),
+            *more.items(),
+            ("clock", f"wall clock of one process, {os.cpu_count()} cores, compilation of kernels included"),
+            ("code", f"Mitsuba {installed_version('mitsuba')}, {digest}, {datetime.now(UTC).date().isoformat()}"),
+        )
+
+
+def work_through(jobs: Mapping[str, Callable[[], None]], console: Console, title: str) -> None:
+    """Runs jobs in turn, with a bar that names the one at work."""
+    with study_bar(console) as progress:
+        bar = progress.add_task(title, total=len(jobs), visible=bool(jobs))
+        for label, job in jobs.items():
+            progress.update(bar, description=f"{title}: {label}")
+            job()
+            progress.advance(bar)

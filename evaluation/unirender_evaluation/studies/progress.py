@@ -1,0 +1,35 @@
+"""The bar of a study that measures record by record."""
+
+from collections.abc import Iterable
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from unirender_evaluation.records import Record
+
+
+def study_bar(console: Console) -> Progress:
+    """A bar with what is at work, how many are done and the time that remains."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=not console.is_terminal)
+
+
+def collect(
+    measured: Iterable[tuple[Record, bool]], total: int, title: str, console: Console
+) -> tuple[list[Record], int]:
+    """All records, and how many of them are new, under a bar.
+
+    Args:
+        measured: records, and whether each was measured now; measured as they are asked for.
+        total: how many there will be.
+        title: what the bar says until the first record is there; then it names the last one.
+        console: to show it on.
+    """
+    records, computed = [], 0
+    with study_bar(console) as progress:
+        bar = progress.add_task(title, total=total)
+        for record, new in measured:
+            records.append(record)
+            computed += new
+            progress.update(bar, advance=1, description=f"{record.sample}: {record.protocol}, {record.method}")
+    return records, computed

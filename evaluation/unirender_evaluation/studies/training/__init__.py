@@ -1,0 +1,1 @@
+"""What the choices of training are worth, on one small network: `bench training`."""

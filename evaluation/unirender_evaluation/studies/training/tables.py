@@ -1,0 +1,84 @@
+"""The table of training choices: means over scenes, and paired differences from the first row."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
+from unirender_evaluation.comparisons import values_of
+from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import INTERVAL, paired_difference
+from unirender_evaluation.studies.cells import Cell, cell_text, study_column
+from unirender_evaluation.studies.training.choices import PLAIN, QUESTIONS, Choice
+from unirender_evaluation.table_formats import header
+from unirender_evaluation.table_text import TextTable
+
+COLUMNS = (
+    study_column("albedo", "albedo", "psnr"),
+    study_column("normal", "normal", "cosine"),
+    study_column("roughness", "roughness", "mse"),
+    study_column("metallic", "metallic", "mse"),
+    study_column("render of true maps", "render", "psnr"),
+    study_column("edit", "edit", "psnr"),
+    study_column("own maps, own render", "again", "psnr"),
+    study_column("own maps, Mitsuba", "again_mitsuba", "psnr"),
+)
+NOTE = (
+    f"Mean over scenes; in brackets the paired difference from the first row, ± half of its "
+    f"{INTERVAL}; **bold** where the interval excludes 0, each number by itself: of equal rows one in twenty "
+    "or more does by chance. Masked, sRGB. Own maps: the network's decomposition (not closed), rendered by the network "
+    "and shaded by Mitsuba, against the picture. The networks are far from fully trained: the table says what helps "
+    "early, at this size."
+)
+
+
+def cells(records: Sequence[Record], method: str) -> tuple[Cell, ...]:
+    """The cells of a row in the order of `COLUMNS`."""
+    clusters = {record.sample: record.object for record in records}
+    found = []
+    for column in COLUMNS:
+        key = column.key(DEFAULT_VARIANT)
+        own, plain = values_of(records, method, key), values_of(records, PLAIN, key)
+        difference = None if method == PLAIN else paired_difference(own, plain, clusters)
+        found.append(Cell(sum(own.values()) / len(own), len(own), difference))
+    return tuple(found)
+
+
+def table(rows: Sequence[Choice], records: Sequence[Record]) -> TextTable:
+    """A row for each choice, those that answer one question together."""
+    sections = []
+    for group, members in groupby(rows, key=lambda row: row.group):
+        lines = []
+        for row in members:
+            texts = [
+                cell_text(c, column.metric.decimals)
+                for c, column in zip(cells(records, row.name), COLUMNS, strict=True)
+            ]
+            lines.append((f"{QUESTIONS[group]}: {row.label}" if group else row.label, *texts))
+        sections.append(tuple(lines))
+    titles = ("training", *(f"{column.group} {header(column)}" for column in COLUMNS))
+    count = len({record.sample for record in records})
+    return TextTable(f"Choices of training: n = {count}", titles, tuple(sections), (NOTE,))
+
+
+def to_json(rows: Sequence[Choice], records: Sequence[Record], run: Mapping[str, Any]) -> str:
+    """Configurations, means, differences with their intervals, and every record."""
+    lines = {
+        row.name: {
+            "label": row.label,
+            "config": asdict(row.config),
+            "cells": {
+                c.key(DEFAULT_VARIANT): {"mean": cell.mean, "n": cell.n, "difference": _estimate(cell)}
+                for c, cell in zip(COLUMNS, cells(records, row.name), strict=True)
+            },
+        }
+        for row in rows
+    }
+    every = [json.loads(record.to_json()) for record in records]
+    return json.dumps({"run": dict(run), "rows": lines, "records": every}, indent=1, ensure_ascii=False) + "\n"
+
+
+def _estimate(cell: Cell) -> dict[str, float | int] | None:
+    return None if cell.difference is None else asdict(cell.difference)

@@ -1,0 +1,1 @@
+"""Shape, material and light from posed pictures alone: `bench unknown-mesh`."""

@@ -1,0 +1,73 @@
+"""A run of `unirender bench unknown-mesh`: measures with progress, prints, writes."""
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+from rich.console import Console
+
+from unirender_evaluation.multiview_scenes import scene_material
+from unirender_evaluation.records import Record
+from unirender_evaluation.stratification import Material
+from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.unknown_mesh import tables
+from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
+from unirender_evaluation.suites import Scene
+from unirender_evaluation.versions import installed_version
+from unirender_reference.optimize.live import live_report
+from unirender_reference.optimize.report import Progress
+
+NAME = "unknown_mesh"
+
+
+def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: bool = True) -> list[Record]:
+    """Measures what is missing and writes `unknown_mesh.md` and `unknown_mesh.json`.
+
+    Args:
+        what: the measurement.
+        scenes: at least one.
+        console: for progress and tables.
+        progress: show where an optimisation stands.
+    """
+    names = {scene.key: scene_name(scene, scene_material(what.suite, scene)) for scene in scenes}
+    with open_folder(what.out):
+        records, computed = [], 0
+        with contextlib.ExitStack() as shown:
+
+            def listener(scene: Scene) -> Progress | None:
+                shown.close()
+                console.print(f"{names[scene.key]}: {what.folder(scene)}", highlight=False, markup=False)
+                return shown.enter_context(live_report(console)) if progress else None
+
+            for record, new in measure(what, scenes, listener):
+                shown.close()
+                records.append(record)
+                computed += new
+        made = tables.tables(records, names, what.settings)
+        about = description(what)
+        lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+        content = tables.to_json(records, names, about)
+        write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
+        for table in made:
+            table.show(console)
+        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        return records
+
+
+def scene_name(scene: Scene, material: Material) -> str:
+    """Object, family and material."""
+    return f"{scene.object} ({scene.family}, metallic {material[0]:g}, roughness {material[1]:g})"
+
+
+def description(what: UnknownMesh) -> dict[str, str]:
+    """What a reader must know to compare."""
+    return {
+        "suite": f"{what.suite.spec.name} {what.suite.sha256[:12]}",
+        "resolution": f"{what.suite.spec.resolution}",
+        "mitsuba": str(installed_version("mitsuba")),
+        "cores": str(os.cpu_count()),
+        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
+        "date": datetime.now(UTC).date().isoformat(),
+    }

@@ -1,0 +1,149 @@
+"""The tables of the warm start: a block for each geometry, and the paired differences."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from unirender_evaluation.comparisons import values_of
+from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
+from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, Metric
+from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.records import Record
+from unirender_evaluation.specs import Column
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference
+from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, STEPS, WARM
+from unirender_evaluation.table_formats import format_estimate, format_number, header
+from unirender_evaluation.table_text import TextTable
+
+TITLES = {
+    "known-mesh": "known mesh (normals and shadows)",
+    "predicted-normals": "no mesh, predicted normals",
+    "true-normals": "no mesh, true normals as a map (for reference)",
+}
+LABELS = {COLD: "cold", WARM: "warm", PREDICTION: "prediction alone"}
+PAIRS = ((WARM, COLD), (WARM, PREDICTION))
+
+
+def _column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
+    return Column(group, quantity, METRICS[metric] if isinstance(metric, str) else metric, overrides, published=False)
+
+
+COLUMNS = (
+    _column("albedo", "albedo", "psnr"),
+    _column("albedo (aligned)", "albedo", "psnr", scale="aligned"),
+    _column("roughness", "roughness", "mse"),
+    _column("metallic", "metallic", "mse"),
+    _column("light", "environment", SCALED_LOG_RMSE),
+    _column("light", "environment", PEAK_ANGLE),
+    _column("normal", "normal", "cosine"),
+    _column("relit", "relit", "psnr"),
+    _column("relit (aligned)", "relit", "psnr", scale="aligned"),
+    _column("fit", "fit", "psnr"),
+    _column("", "time", STEPS),
+    _column("", "time", SECONDS),
+)
+
+
+def block(records: Sequence[Record], geometry: str) -> list[Record]:
+    """The records of one geometry, and those of the prediction on the same scenes."""
+    own = [record for record in records if record.protocol == geometry]
+    scenes = {record.sample for record in own}
+    return own + [record for record in records if record.protocol == PICTURE and record.sample in scenes]
+
+
+def tables(records: Sequence[Record], geometries: Sequence[str]) -> list[TextTable]:
+    """A table for each geometry, a figure a row: cold, warm, the prediction, and the paired differences."""
+    titles = ("figure", *LABELS.values(), *(f"{LABELS[a]} - {LABELS[b]}" for a, b in PAIRS))
+    made = []
+    for geometry in geometries:
+        own = block(records, geometry)
+        count = len({record.sample for record in own})
+        rows = tuple(
+            (
+                f"{column.group} {header(column)}".strip(),
+                *(_mean(own, method, column) for method in LABELS),
+                *(_difference(own, a, b, column) for a, b in PAIRS),
+            )
+            for column in COLUMNS
+        )
+        made.append(
+            TextTable(
+                f"Warm start, {TITLES[geometry]}: n = {count}",
+                titles,
+                (rows,),
+                NOTES if geometry == geometries[-1] else (),
+            )
+        )
+    return made
+
+
+NOTES = (
+    f"Differences are paired by picture: mean [{INTERVAL}]. Inside the true "
+    "mask, weighted by coverage. Fit and relit: `shade` of the result under its own light, against the picture, and "
+    "under the object's other light, against Mitsuba's path tracing of the truth. Aligned: one "
+    "least-squares factor in linear light, for albedo of the object, for relit of each picture.",
+    "Seconds: of the optimisation; a warm start's prediction comes on top. Cold and warm have the same configuration; "
+    "a stage ends early when a step gains little.",
+)
+
+
+def difference(records: Sequence[Record], a: str, b: str, column: Column) -> Estimate | None:
+    """a - b of one column over the scenes that both have; None where there is none or one is infinite."""
+    key = column.key(DEFAULT_VARIANT)
+    first, second = (values_of(records, method, key) for method in (a, b))
+    common = first.keys() & second.keys()
+    if not common or not all(math.isfinite(values[sample]) for values in (first, second) for sample in common):
+        return None
+    return paired_difference(first, second, {record.sample: record.object for record in records})
+
+
+def _difference(records: Sequence[Record], a: str, b: str, column: Column) -> str:
+    found, digits = difference(records, a, b, column), column.metric.decimals
+    if found is None:
+        return "-"
+    interval = "" if math.isnan(found.low) else f" [{_signed(found.low, digits)}, {_signed(found.high, digits)}]"
+    return f"{_signed(found.mean, digits)}{interval}"
+
+
+def _signed(value: float, digits: int) -> str:
+    return f"{round(value, digits) + 0.0:+.{digits}f}"  # + 0.0: no minus before a rounded 0
+
+
+def mean(records: Sequence[Record], method: str, column: Column) -> Estimate | None:
+    """The mean of one column; None where there is no value."""
+    own = [record for record in records if record.method == method and column.key(DEFAULT_VARIANT) in record.values]
+    if not own:
+        return None
+    return mean_estimate([record.values[column.key(DEFAULT_VARIANT)] for record in own], [r.object for r in own])
+
+
+def _mean(records: Sequence[Record], method: str, column: Column) -> str:
+    found = mean(records, method, column)
+    return "-" if found is None else format_estimate(found, column.metric.decimals)[0]
+
+
+def to_json(records: Sequence[Record], geometries: Sequence[str], run: Mapping[str, Any]) -> str:
+    """Means, differences with their intervals, and every record."""
+    blocks = {}
+    for geometry in geometries:
+        own = block(records, geometry)
+        means = {method: {c.key(DEFAULT_VARIANT): _plain(mean(own, method, c)) for c in COLUMNS} for method in LABELS}
+        pairs = {
+            f"{a} - {b}": {c.key(DEFAULT_VARIANT): _plain(difference(own, a, b, c)) for c in COLUMNS} for a, b in PAIRS
+        }
+        blocks[geometry] = {"mean": means, "difference": pairs}
+    every = [json.loads(record.to_json()) for record in records]
+    content = {"run": dict(run), "geometries": blocks, "records": every}
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _plain(found: Estimate | None) -> dict[str, float | str | int | None] | None:
+    if found is None:
+        return None
+    values = {"mean": found.mean, "low": found.low, "high": found.high}
+    texts = {
+        name: None if math.isnan(value) else value if math.isfinite(value) else format_number(value, 0)
+        for name, value in values.items()
+    }
+    return {**texts, "n": found.n, "objects": found.clusters}

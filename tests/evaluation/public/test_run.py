@@ -1,0 +1,369 @@
+"""`unirender bench public`: records and tables of a run, a second run, plug-in and folder alike, refusals."""
+
+import csv
+import inspect
+import io
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from public_folders import make_iiw, make_maw, make_orb
+from rich.console import Console
+
+from unirender import cli
+from unirender.errors import UnirenderError
+from unirender.exr import image_channels, intrinsics_channels, write_exr
+from unirender.files import write_png
+from unirender.intrinsics import Intrinsics
+from unirender_evaluation.methods import InputAsAlbedo
+from unirender_evaluation.plugins import Plugin
+from unirender_evaluation.prediction_check import PredictionError
+from unirender_evaluation.public import answers
+from unirender_evaluation.public import run as public_run
+from unirender_evaluation.public.answers import takes_part
+from unirender_evaluation.public.iiw import Iiw
+from unirender_evaluation.public.maw import Maw
+from unirender_evaluation.public.orb import StanfordOrb
+from unirender_evaluation.public.rows import trivial_rows
+from unirender_evaluation.public.run import PublicResult, PublicRun, run
+from unirender_evaluation.public.sets import PublicSet
+from unirender_evaluation.public.tables import averaged
+from unirender_evaluation.records import Record, read_records
+from unirender_evaluation.rows import Row, plugin_rows, prediction_rows
+from unirender_evaluation.versions import Versions, package_folder
+from unirender_reference.folder_lock import LOCK, locked, made_folder
+
+
+class Ramp:
+    """A stranger's method: an albedo that rises to the right, a slanted normal, and the light's mean as the answer."""
+
+    name = "ramp"
+    config: dict[str, float] = {}  # noqa: RUF012 - as a stranger writes it
+
+    def decompose(self, image_srgb, mask, camera):
+        height, width = mask.shape[:2]
+        albedo = np.broadcast_to(np.linspace(0.1, 0.9, width)[None, :, None], (height, width, 3))
+        normal = np.broadcast_to(np.array([0.6, 0, 0.8]), (height, width, 3))
+        return Intrinsics(albedo=albedo, normal=normal, mask=mask, camera=camera)
+
+    def relight(self, image_srgb, mask, camera, environment=None, specular=None, diffuse=None):
+        assert environment is not None
+        return (environment.mean(axis=(0, 1)) * mask).astype(np.float32)
+
+
+def done(public: PublicSet, rows: list[Row], out: Path, limit: int | None = None) -> PublicResult:
+    """A run without LPIPS, which other tests hold."""
+    what = PublicRun(public, tuple(rows), out, limit, (), Versions("test", {"model": "1", "lpips": "1"}))
+    return run(what, Console(file=io.StringIO(), width=200))
+
+
+def of(result: PublicResult, method: str) -> dict[tuple[str, str], dict[str, float]]:
+    return {(r.table, r.sample): dict(r.values) for r in result.records if r.method == method}
+
+
+def test_a_run_writes_records_and_tables_and_a_second_one_measures_nothing(tmp_path: Path) -> None:
+    iiw, out = Iiw(make_iiw(tmp_path / "iiw")), tmp_path / "out"
+    first = done(iiw, trivial_rows(iiw), out)
+    assert first.computed == len(first.records) == 4
+    values = of(first, "input-as-albedo")["iiw", "100"]
+    assert values == {"albedo.whdr": 0, "albedo.whdr_equal": 0, "albedo.whdr_unequal": 0}
+    assert of(first, "mean-albedo")["iiw", "101"]["albedo.whdr"] == pytest.approx(2 / 3)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert {"records.jsonl", "records.csv", "tables.md", "tables.tex", "tables.json", "run.json"} <= set(before)
+    with (out / "records.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert {line["sample"] for line in lines} == {"100", "101"}
+    assert len(lines) == 12
+    text = before["tables.md"].decode()
+    for words in ("delta 0.1", "trained on single objects", "checked on made data", "n: 2 samples"):
+        assert words in text
+    assert "\\toprule" in before["tables.tex"].decode()
+    assert done(iiw, trivial_rows(iiw), out).computed == 0
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_only_what_changed_is_measured_again(tmp_path: Path) -> None:
+    folder, out = make_iiw(tmp_path / "iiw"), tmp_path / "out"
+    iiw = Iiw(folder)
+    done(iiw, trivial_rows(iiw)[:1], out)
+    assert done(iiw, trivial_rows(iiw), out).computed == 2  # one more row
+    path = folder / "data" / "100.json"
+    path.write_text(path.read_text().replace('"darker": "1"', '"darker": "2"'))
+    iiw = Iiw(folder)
+    changed = done(iiw, trivial_rows(iiw), out)
+    assert changed.computed == 2
+    assert of(changed, "input-as-albedo")["iiw", "100"]["albedo.whdr"] == pytest.approx(2 / 3)
+    assert done(Iiw(folder, 15), trivial_rows(iiw), out).computed == 4  # another resolution
+    later = PublicRun(iiw, tuple(trivial_rows(iiw)), out, None, (), Versions("changed", {}))
+    assert run(later, Console(file=io.StringIO())).computed == 4  # other code
+
+
+@pytest.mark.parametrize("public", [StanfordOrb, Iiw, Maw])
+def test_every_module_that_measures_is_in_the_keys(public: type) -> None:
+    """All that a reader imports of its package."""
+    folder = package_folder("unirender_evaluation") / "public"
+    named = {path.stem for name in public.modules for path in folder.parent.glob(f"{name}.py")}
+    text = Path(inspect.getfile(public)).read_text()
+    imported = set(re.findall(r"unirender_evaluation\.public(?:\.| import )(\w+)", text))
+    assert imported
+    assert {path.stem for path in folder.glob("*.py")} >= named >= imported
+
+
+class Silent:
+    """Has no answer."""
+
+    name = "silent"
+    config: dict[str, float] = {}  # noqa: RUF012 - as a stranger writes it
+
+    def decompose(self, image_srgb, mask, camera):
+        return None
+
+    def relight(self, image_srgb, mask, camera, environment=None, specular=None, diffuse=None):
+        return None
+
+
+def test_none_is_no_answer(tmp_path: Path) -> None:
+    """It is asked all that it is there for, and stands in no table."""
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32, 60.0)
+    result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp)]), tmp_path / "out")
+    assert {record.method for record in result.records} == {"ramp"}
+    assert result.computed == len(result.records), "of the records that the run has"
+    asked = [record.method for record in read_records(tmp_path / "out" / "records.jsonl")]
+    assert asked.count("silent") == asked.count("ramp") > 0
+
+
+def test_what_a_plug_in_leaves_open_is_listed(tmp_path: Path) -> None:
+    """None for one photograph, no `relight`; what no single picture answers is nobody's gap."""
+
+    class Half:
+        name, config = "half", Ramp.config
+
+        def decompose(self, image_srgb, mask, camera):
+            return None if np.array_equal(image_srgb, left_out) else Ramp().decompose(image_srgb, mask, camera)
+
+    orb, out = StanfordOrb(make_orb(tmp_path / "orb"), 32), tmp_path / "out"
+    samples = [sample for sample in orb.samples() if sample.one_picture]
+    left_out = orb.inputs(samples[0])["image_srgb"]
+    result = done(orb, plugin_rows([Plugin(Half(), "test")]), out)
+    open_ = [f"{sample.table}/{sample.key}" for sample in (samples[0], *samples[3:])]
+    assert result.missing == {"half": open_}
+    assert (out / "missing.txt").read_text() == "".join(f"half: {name}\n" for name in open_)
+    assert f"half: no answer to 1: {samples[0].key}." in (out / "tables.md").read_text()
+
+
+def test_a_table_that_nothing_can_be_asked_for_is_explained(tmp_path: Path) -> None:
+    """The relighting of Stanford-ORB, where no photograph is from nearly the other's camera."""
+    folder = make_orb(tmp_path / "orb")
+    path = folder / "blender_LDR/cup_scene001/transforms_test.json"
+    path.write_text(path.read_text().replace("0.6", "0.8"))  # another field of view
+    said = {}
+    for degrees in (2.0, 60.0):
+        orb, console = StanfordOrb(folder, 32, degrees), Console(file=io.StringIO(), width=200)
+        rows = tuple(plugin_rows([Plugin(Ramp(), "test")]))
+        what = PublicRun(
+            orb, rows, tmp_path / f"out-{degrees}", None, (), Versions("test", {"model": "1", "lpips": "1"})
+        )
+        result = run(what, console)
+        assert isinstance(console.file, io.StringIO)
+        said[degrees] = (len(result.tables), console.file.getvalue())
+    line = (
+        "relighting: 0 of 2 photographs were taken from within 2 degrees of a photograph of the capture that is relit; "
+        "see --tolerance-deg\n"
+    )
+    assert (said[2.0][0], line in said[2.0][1]) == (1, True)
+    assert (said[60.0][0], "relighting: 0 of" in said[60.0][1]) == (2, False)
+    (folder / "blender_LDR/cup_scene001/transforms_novel.json").unlink()
+    assert StanfordOrb(folder, 32).why_absent("stanford-orb-relighting") is None  # nothing is asked of anybody
+
+
+def test_a_limit_is_a_watermark(tmp_path: Path) -> None:
+    iiw = Iiw(make_iiw(tmp_path / "iiw"))
+    result = done(iiw, trivial_rows(iiw), tmp_path / "out", limit=1)
+    assert {record.sample for record in result.records} == {"100"}
+    assert "--limit 1: a partial run" in (tmp_path / "out" / "tables.md").read_text()
+
+
+def test_a_killed_run_leaves_no_table_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    iiw, out = Iiw(make_iiw(tmp_path / "iiw")), tmp_path / "out"
+    rows, ask = trivial_rows(iiw), answers.asked
+
+    def killed(row: Row, sample, inputs):
+        if sample.key == "101":
+            raise KeyboardInterrupt
+        return ask(row, sample, inputs)
+
+    monkeypatch.setattr(public_run, "asked", killed)
+    with pytest.raises(KeyboardInterrupt):
+        done(iiw, rows, out)
+    assert [path.name for path in out.iterdir()] == ["records.jsonl"]
+    assert len(read_records(out / "records.jsonl")) == 2
+    monkeypatch.undo()
+    continued = done(iiw, rows, out)
+    assert continued.computed == 2
+    whole = done(iiw, rows, tmp_path / "whole")
+
+    def told(records: tuple[Record, ...]) -> list[tuple]:
+        return [(r.method, r.sample, r.key, dict(r.values)) for r in records]
+
+    assert told(continued.records) == told(whole.records)
+    assert (out / "tables.md").read_text() == (tmp_path / "whole" / "tables.md").read_text()
+
+
+def test_a_second_run_in_the_same_folder_waits_for_the_first(tmp_path: Path) -> None:
+    iiw, out = Iiw(make_iiw(tmp_path / "iiw")), tmp_path / "out"
+    with made_folder(out), locked(out):
+        with pytest.raises(UnirenderError, match="another run is writing here"):
+            done(iiw, trivial_rows(iiw), out)
+        assert [path.name for path in out.iterdir()] == [LOCK]
+    assert done(iiw, trivial_rows(iiw), out).computed == 4
+
+
+def test_orb_averages_each_capture_first(tmp_path: Path) -> None:
+    """The first capture has one photograph with maps, the second two."""
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32)
+    first = done(orb, plugin_rows([Plugin(Ramp(), "test")]), tmp_path / "out")
+    records = [
+        replace(r, values={"normal.angle": value}) for r, value in zip(first.records[:3], (1.0, 2.0, 6.0), strict=True)
+    ]
+    assert [r.sample for r in records] == ["cup_scene001_0000", "cup_scene002_0000", "cup_scene002_0001"]
+    units = averaged(orb, records)
+    assert [(r.sample, dict(r.values)) for r in units] == [
+        ("cup_scene001", {"normal.angle": 1.0}),
+        ("cup_scene002", {"normal.angle": 4.0}),
+    ]
+    iiw = Iiw(make_iiw(tmp_path / "iiw"))
+    assert averaged(iiw, records) == records
+    text = (tmp_path / "out" / "tables.md").read_text()
+    assert "3 samples of 1 objects or scenes; means over 2 captures, each the mean of its samples" in text
+
+
+def write_predictions(public: PublicSet, method: Ramp, folder: Path, leave_out: str = "") -> Path:
+    """What a method answers, as a folder of predictions has it."""
+    for sample in public.samples():
+        if not sample.one_picture or sample.key == leave_out:
+            continue
+        place = folder / sample.folder
+        place.mkdir(parents=True, exist_ok=True)
+        inputs = public.inputs(sample)
+        if sample.asks == "relight":
+            write_exr(place / f"{sample.answer}.exr", image_channels(method.relight(**inputs)), half=False)
+        else:
+            maps = method.decompose(**inputs)
+            depth = {"depth.Z": np.full((maps.height, maps.width), 2.5, np.float32)} if "orb" in public.name else {}
+            write_exr(place / "intrinsics.exr", intrinsics_channels(maps) | depth, half=False)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["stanford-orb", "iiw", "maw"])
+def test_plug_in_and_folder_have_the_same_numbers(name: str, tmp_path: Path) -> None:
+    makers = {
+        "stanford-orb": lambda path: StanfordOrb(make_orb(path), 32),
+        "iiw": lambda path: Iiw(make_iiw(path)),
+        "maw": lambda path: Maw(make_maw(path)),
+    }
+    public = makers[name](tmp_path / "set")
+    folder = write_predictions(public, Ramp(), tmp_path / "predictions")
+    rows = [*plugin_rows([Plugin(Ramp(), "source")]), *prediction_rows({"folder": folder})]
+    result = done(public, rows, tmp_path / "out")
+    plugin, read = of(result, "ramp"), of(result, "folder")
+    assert plugin.keys() == read.keys()
+    for sample, values in plugin.items():
+        both = {key: value for key, value in read[sample].items() if not key.startswith("depth.")}
+        assert both == pytest.approx(values), sample
+    assert plugin
+
+
+def test_a_folder_s_depth_is_scored(tmp_path: Path) -> None:
+    orb = StanfordOrb(make_orb(tmp_path / "set"), 32)
+    folder = write_predictions(orb, Ramp(), tmp_path / "predictions")
+    result = done(orb, prediction_rows({"mine": folder}), tmp_path / "out")
+    depths = [v["depth.si_mse"] for (table, _), v in of(result, "mine").items() if table == "stanford-orb"]
+    assert len(depths) == 3
+    assert min(depths) > 0  # a plane is no sphere
+    assert "Depth SI-MSE" in (tmp_path / "out" / "tables.md").read_text()
+    relit = of(result, "mine")["stanford-orb-relighting", "cup_scene001/relight_cup_scene002_0000"]
+    assert relit["relit.psnr_l@aligned_rgb"] > relit["relit.psnr_l@raw"]
+
+
+def test_what_a_folder_leaves_open_is_listed(tmp_path: Path) -> None:
+    orb = StanfordOrb(make_orb(tmp_path / "set"), 32)
+    folder = write_predictions(orb, Ramp(), tmp_path / "predictions", leave_out="cup_scene002_0001")
+    result = done(orb, prediction_rows({"mine": folder}), tmp_path / "out")
+    beside = "stanford-orb-relighting/cup_scene001/relight_cup_scene002_0001"
+    assert result.missing == {"mine": ["stanford-orb/cup_scene002_0001", beside]}
+    assert (tmp_path / "out" / "missing.txt").read_text() == f"mine: stanford-orb/cup_scene002_0001\nmine: {beside}\n"
+    assert "mine: no answer to 1: cup_scene002_0001." in (tmp_path / "out" / "tables.md").read_text()
+    done(orb, trivial_rows(orb)[:1], tmp_path / "out")
+    assert not (tmp_path / "out" / "missing.txt").exists(), "that of an earlier run says nothing of this one"
+
+
+def test_all_problems_of_a_folder_are_named_before_anything_runs(tmp_path: Path) -> None:
+    iiw, folder = Iiw(make_iiw(tmp_path / "set")), tmp_path / "predictions"
+    for name, size in (("100", (20, 30)), ("101", (10, 15)), ("no-such", (20, 30))):
+        (folder / name).mkdir(parents=True)
+        write_png(folder / name / "albedo.png", np.full((*size, 3), 0.5, np.float32))
+    with pytest.raises(PredictionError) as caught:
+        done(iiw, prediction_rows({"mine": folder}), tmp_path / "out")
+    said = "\n".join(caught.value.problems)
+    assert "101/albedo.png: albedo is 15 x 10 pixels, expected 30 x 20" in said
+    assert "no-such: the suite 'iiw' has no such picture" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_method_is_asked_what_one_picture_can_answer(tmp_path: Path) -> None:
+    orb = StanfordOrb(make_orb(tmp_path), 32)
+    (ramp,) = plugin_rows([Plugin(Ramp(), "source")])
+    (albedo,) = plugin_rows([Plugin(InputAsAlbedo(), "source")])
+    assert [takes_part(ramp, sample) for sample in orb.samples()] == [True, True, True, True, False]
+    assert [takes_part(albedo, sample) for sample in orb.samples()] == [True, True, True, False, False]
+
+
+def command(*words: str) -> int:
+    with pytest.raises(SystemExit) as end:
+        cli.main(["bench", "public", *words])
+    return int(end.value.code or 0)
+
+
+def test_the_command_scores_a_file_s_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, out = make_maw(tmp_path / "maw"), tmp_path / "out"
+    method = tmp_path / "naive.py"
+    method.write_text(
+        "import numpy as np\nfrom unirender import Intrinsics\n\n\nclass Grey:\n    name, config = 'grey', {}\n\n"
+        "    def decompose(self, image_srgb, mask, camera):\n"
+        "        return Intrinsics(albedo=np.full_like(image_srgb, 0.5), mask=mask, camera=camera)\n"
+    )
+    assert command("maw", str(folder), "--out", str(out), "--methods", "plugins", "--method", f"{method}:Grey") == 0
+    shown = json.loads((out / "tables.json").read_text())
+    assert {row["label"] for table in shown for row in table["rows"]} == {"grey", "input as albedo", "mean albedo"}
+    assert "MAW" in capsys.readouterr().out
+
+
+def test_the_command_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = make_iiw(tmp_path / "iiw")
+    (folder / "data" / "100.png").unlink()
+    (folder / "data" / "101.png").unlink()
+    assert command("iiw", str(folder), "--out", str(tmp_path / "out"), "--methods", "trivial") == 1
+    assert len([line for line in capsys.readouterr().err.splitlines() if "no such file" in line]) == 2
+    assert command("iiw", str(folder), "--tolerance-deg", "3") == 2
+    assert command("iiw", str(folder), "--resolution", "0") == 2
+    assert command("iiw", str(folder), "--methods", "paper") == 2
+    assert command("iiw", str(folder), "--methods", "plugins", "--predictions", "a") == 2
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_our_model_answers_every_question(tmp_path: Path) -> None:
+    folder, out = make_orb(tmp_path / "orb"), tmp_path / "out"
+    assert command("stanford-orb", str(folder), "--out", str(out), "--resolution", "32", "--methods", "ours") == 0
+    records = read_records(out / "records.jsonl")
+    maps = [r for r in records if r.table == "stanford-orb"]
+    relit = [r for r in records if r.table == "stanford-orb-relighting"]
+    assert {r.method for r in maps} == {"ours-mean"}
+    assert {r.method for r in relit} == {"ours-mean", "ours-mean-anchored"}
+    assert all(
+        {"normal.cosine_distance", "albedo.psnr_l@raw", "albedo.lpips_alex@aligned_rgb"} <= set(r.values) for r in maps
+    )
+    assert all(r.values["normal.cosine_distance"] < 0.5 for r in maps)  # a ball is seen as one; random normals have 1
