@@ -17,6 +17,7 @@ from unirender.pipelines.editing import (
     specular_for_roughness,
     too_coarse,
     trust,
+    under_light,
 )
 
 
@@ -91,6 +92,17 @@ def test_a_light_is_too_coarse_for_lobes_narrower_than_its_texels() -> None:
     assert not too_coarse(decomposition(0.5, 64), 0.28 * before.mask).any(), "a finer light says it"
     smooth = decomposition(0.1, 16)
     assert not too_coarse(smooth, smooth.require("roughness")["roughness"]).any(), "nothing was changed"
+
+
+def test_an_exposure_is_chosen_by_the_light_also_where_d_is_given() -> None:
+    """What is given stays; s and the light are scaled by what the whole d of that light would be."""
+    before = polished(0.5, lamp())
+    given = np.full_like(specular(before), 0.3)
+    plain, chosen = under_light(before, lamp(), "auto"), under_light(before, lamp(), "auto", diffuse=given)
+    assert np.array_equal(chosen.require("diffuse")["diffuse"], given)
+    for name in ("specular", "environment"):
+        np.testing.assert_allclose(getattr(chosen, name), getattr(plain, name), rtol=1e-6)
+    assert not np.allclose(specular(plain), specular(under_light(before, lamp(), "keep")), rtol=0.05)
 
 
 def test_a_mean_over_the_object_counts_pixels_by_their_coverage() -> None:
