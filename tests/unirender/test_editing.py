@@ -13,6 +13,7 @@ from unirender.pipelines.editing import (
     ANCHOR_GAIN,
     LOBE_RATIO,
     anchor,
+    constant_map,
     masked_mean,
     specular_for_roughness,
     too_coarse,
@@ -103,6 +104,12 @@ def test_an_exposure_is_chosen_by_the_light_also_where_d_is_given() -> None:
     for name in ("specular", "environment"):
         np.testing.assert_allclose(getattr(chosen, name), getattr(plain, name), rtol=1e-6)
     assert not np.allclose(specular(plain), specular(under_light(before, lamp(), "keep")), rtol=0.05)
+
+
+def test_a_number_as_a_map_is_not_weighed_by_coverage() -> None:
+    """Every pixel that is covered at all has it, as the contract's maps do; the background is 0."""
+    mask = np.array([[1, 0.3, 0]], np.float32)[..., None]
+    assert constant_map(0.5, mask).ravel().tolist() == [0.5, 0.5, 0]
 
 
 def test_a_mean_over_the_object_counts_pixels_by_their_coverage() -> None:
