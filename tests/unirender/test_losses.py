@@ -102,6 +102,11 @@ def test_background_counts_little() -> None:
     assert float(terms["environment"]) == pytest.approx(outside / (outside + inside), rel=1e-5)
 
 
+def test_a_pixel_counts_by_its_coverage() -> None:
+    weights = Errors(loss_function().conditioning, background=0.2).pixel_weights(torch.tensor([[[[0.0, 0.5, 1.0]]]]))
+    torch.testing.assert_close(weights.flatten(), torch.tensor([0.2, 0.6, 1.0]))
+
+
 def test_an_image_error_is_compressed_row_by_row() -> None:
     """E log(1 + e / E): a far larger error of one picture does not decide the gradient of all."""
     error = torch.tensor([1e-8, 1e-3, 10.0], dtype=torch.float64, requires_grad=True)
@@ -139,6 +144,24 @@ def test_albedo_and_light_are_compressed_picture_by_picture_and_nothing_else_is(
         assert float(terms[name]) == float(plain[name]) > 0.05
     floored, squared = (values(loss_function(colour_floor=floor), inverse()) for floor in (0.02, 0.0))
     assert floored["albedo"] < squared["albedo"]
+
+
+def test_compressed_errors_are_weighted_by_timestep_too() -> None:
+    errors = Errors(loss_function().conditioning, background=0.02)
+    mask, clean, rows = make_batch()["mask"], torch.zeros(4, 72, 16, 16), torch.tensor([1.0, 2.0, 0.0, 5.0])
+    predicted = clean + torch.linspace(0.1, 0.5, 4)[:, None, None, None]
+    for found, alone in (
+        (
+            errors.image(predicted[:, :12], clean[:, :12], mask, rows, 0.02),
+            lambda x, m: errors.image(x, 0 * x, m, None, 0.02),
+        ),
+        (
+            errors.attributes(predicted, clean, mask, rows, 0.02)["albedo"],
+            lambda x, m: errors.attributes(x.repeat(1, 6, 1, 1), 0 * x.repeat(1, 6, 1, 1), m, None, 0.02)["albedo"],
+        ),
+    ):
+        each = [float(alone(predicted[i : i + 1, :12], mask[i : i + 1])) for i in range(4)]
+        assert float(found) == pytest.approx(sum(w * e for w, e in zip(rows.tolist(), each, strict=True)) / 4, rel=1e-5)
 
 
 def test_total_is_the_weighted_sum() -> None:
@@ -222,12 +245,13 @@ def test_each_row_is_weighted_by_its_own_timestep(kind: Literal["v", "min_snr"])
         assert float(error(slice(0, 2), weights)) == pytest.approx(by_hand, rel=1e-5)
         assert float(error(slice(0, 2), weights.flip(0))) != pytest.approx(by_hand, rel=1e-3)
     without = loss_function(cycle=0.0)
-    one = Timesteps(t.attributes[2:3], t.image[2:3])
     batch = {name: value[:1] for name, value in make_batch().items()}
-    weight = timestep_weights(kind, 5.0, loss.scheduler, one.attributes)
-    assert weight is not None
-    expected = {name: float(weight) * value for name, value in values(without, one, batch).items()}
-    assert values(loss, one, batch) == pytest.approx(expected, rel=1e-5)
+    for row in (0, 2):  # one of each direction
+        one = Timesteps(t.attributes[row : row + 1], t.image[row : row + 1])
+        weight = timestep_weights(kind, 5.0, loss.scheduler, one.attributes + one.image)
+        assert weight is not None
+        expected = {name: float(weight) * value for name, value in values(without, one, batch).items()}
+        assert values(loss, one, batch) == pytest.approx(expected, rel=1e-5)
     assert values(loss, inverse()) == values(without, inverse())  # pure noise: bit for bit
 
 
@@ -376,6 +400,23 @@ def test_true_maps_of_a_closed_form_scene_have_no_composite_error(prior: str) ->
         error = float(each.composite(other, batch["image"], batch["mask"]))
         blind = prior == "composite" and name in ("roughness", "normal")
         assert (error > 1e-8) != blind, (name, error)
+
+
+def test_the_composite_is_compared_as_the_cycle_would_be() -> None:
+    """Its error is that of a network that renders the closed form, also where the object covers half of a pixel."""
+    each, batch = scene("composite")
+    mask = 0.5 * batch["mask"]
+    true, other = (
+        each.conditioning.encode_attributes(batch | {"mask": mask, "diffuse": k * batch["diffuse"]}) for k in (1, 0.5)
+    )
+    assert float(each.composite(true, 0.5 * batch["image"], mask)) < 1e-10
+    prior = each.conditioning.physics_prior
+    assert prior is not None
+    shown = prior.radiance(each.conditioning.decode_attributes(other), Camera()) * mask
+    rendered, seen = (each.conditioning.encode_image(image) for image in (shown, 0.5 * batch["image"]))
+    expected = float(each.errors.image(rendered, seen, mask))
+    assert float(each.composite(other, 0.5 * batch["image"], mask)) == pytest.approx(expected, rel=1e-4)
+    assert expected > 1e-3
 
 
 def test_composite_gradient_is_that_of_finite_differences() -> None:
