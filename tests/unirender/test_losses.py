@@ -11,6 +11,7 @@ from tiny_models import MODEL, make_batch, make_model
 from torch import Tensor
 
 from unirender.camera import Camera
+from unirender.diffusion import inference
 from unirender.diffusion.inference import infer_attributes
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
@@ -19,6 +20,7 @@ from unirender.models.codec import KLCodec
 from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
+from unirender.training import consistency as consistency_module
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, compressed, timestep_weights
 from unirender.training.losses import DROPPABLE, LossFunction
@@ -297,6 +299,30 @@ def consistency(loss: LossFunction) -> Consistency:
     return Consistency(loss.model, loss.conditioning, loss.scheduler, loss.config, errors)
 
 
+def test_the_cycle_asks_the_network_what_a_rendering_asks_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From pure noise at T, of clean attributes that are all known (paper Eq. 5); the noise itself is made zero."""
+    for module, name in ((consistency_module, "noise_like"), (inference, "draw_noise")):
+        monkeypatch.setattr(module, name, lambda x, *others: torch.zeros(x if isinstance(x, tuple) else x.shape))
+    loss, batch = loss_function(), make_batch()
+    attributes = loss.conditioning.encode_attributes(batch)
+    clean_i, given = loss.conditioning.encode_image(batch["image"]), torch.ones(4, len(TRIPLETS), dtype=torch.bool)
+    asked: list[list[Tensor]] = []
+    forward = loss.model.forward
+
+    def record(*args: Any, **kwargs: Any) -> DualStreamOutput:
+        asked.append([x for x in (*args, kwargs["image_prior"]) if isinstance(x, Tensor)])
+        return forward(*args, **kwargs)
+
+    monkeypatch.setattr(loss.model, "forward", record)
+    consistency(loss).cycle(attributes, clean_i, batch["mask"], generator())
+    maps = loss.conditioning.decode_attributes(attributes)
+    inference.infer_image(loss.model, loss.conditioning, loss.scheduler, maps, given)
+    in_training, in_use = asked
+    assert len(in_training) == len(in_use) == 7  # both streams and their timesteps, the extras of both, the prior
+    for one, other in zip(in_training, in_use, strict=True):
+        torch.testing.assert_close(one.detach(), other, rtol=0, atol=1e-4)
+
+
 def test_the_cycle_of_a_sample_is_that_of_a_sample() -> None:
     """Its attributes are those of inference with as many steps; the step's own prediction plays no part in it."""
     loss, batch = loss_function(cycle_steps=3), make_batch()
@@ -474,7 +500,8 @@ def test_composite_counts_inverse_rows_only_and_is_off_by_default() -> None:
 
 
 def test_dropped_maps_reach_the_network_as_noise_only() -> None:
-    """With every droppable map withheld, the rendering does not depend on them."""
+    """With every droppable map withheld, the rendering does not depend on them: of a shape and its material alone."""
+    assert set(TRIPLETS) - set(DROPPABLE) == {"normal", "material"}
     batch = make_batch()
     for changed in (DROPPABLE, ("normal",), ("roughness",)):
         other = batch | {name: make_batch(seed=9)[name] for name in changed}
