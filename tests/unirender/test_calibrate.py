@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import diffusers
 import numpy as np
@@ -244,7 +245,7 @@ def test_what_is_read_are_upright_pictures_of_natural_colours_as_they_are_shown(
         half = np.where(np.arange(SIZE) < SIZE / 2, np.float32(0.5), np.float32(1))[:, None, None]
         return maps | {"image": maps["image"] * half, "mask": maps["mask"] * half}
 
-    def watched(self: UniRenderPipeline, images: list, masks: list, **options: object) -> list:
+    def watched(self: UniRenderPipeline, images: list, masks: list, **options: Any) -> list:
         seen.extend(images)
         return decompose(self, images, masks, **options)
 

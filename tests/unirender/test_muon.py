@@ -109,7 +109,7 @@ def test_a_step_is_as_large_as_one_of_adamw() -> None:
     torch.manual_seed(0)
     gradients = list(torch.randn(60, 64, 64))
     muon = stepped(nn.Parameter(torch.zeros(64, 64)), gradients[-1:])
-    weight = nn.Parameter(torch.zeros(64, 64))
+    weight, before = nn.Parameter(torch.zeros(64, 64)), torch.zeros(64, 64)
     adamw = torch.optim.AdamW([weight], 1e-2, weight_decay=0.0)
     for gradient in gradients:
         weight.grad, before = gradient, weight.detach().clone()
