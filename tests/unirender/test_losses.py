@@ -287,6 +287,22 @@ def test_cycle_value_is_the_rerendering_error_of_the_prediction() -> None:
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
+def test_the_cycle_takes_its_gradient_at_the_scale_of_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In float16 small ones would be 0 there, before the loss's own scale reaches them."""
+    scales: list[float] = []
+    plain = consistency_module.gradients
+
+    def watched(loss: Tensor, inputs: list[Tensor], scale: float = 1.0) -> list[Tensor | None]:
+        scales.append(scale)
+        return plain(loss, inputs, scale)
+
+    monkeypatch.setattr(consistency_module, "gradients", watched)
+    loss = loss_function(cycle_into_renderer=False)
+    loss.scale = 64.0
+    values(loss, inverse())
+    assert scales == [64.0]
+
+
 def test_cycle_can_be_off() -> None:
     assert "cycle" not in values(loss_function(cycle=0.0), inverse())
     waiting = loss_function()
