@@ -21,6 +21,7 @@ from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
 from unirender.training import consistency as consistency_module
+from unirender.training import loss_terms
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, compressed, timestep_weights
 from unirender.training.losses import DROPPABLE, LossFunction
@@ -290,11 +291,10 @@ def test_cycle_value_is_the_rerendering_error_of_the_prediction() -> None:
 def test_the_cycle_takes_its_gradient_at_the_scale_of_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
     """In float16 small ones would be 0 there, before the loss's own scale reaches them."""
     scales: list[float] = []
-    plain = consistency_module.gradients
 
     def watched(loss: Tensor, inputs: list[Tensor], scale: float = 1.0) -> list[Tensor | None]:
         scales.append(scale)
-        return plain(loss, inputs, scale)
+        return loss_terms.gradients(loss, inputs, scale)
 
     monkeypatch.setattr(consistency_module, "gradients", watched)
     loss = loss_function(cycle_into_renderer=False)
