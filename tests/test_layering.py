@@ -101,6 +101,11 @@ def test_the_contracts_are_kept(checkout: Path) -> None:
         ("src/unirender/scene_export/card.py", "import mitsuba", "knows nothing of the ground truth"),
         ("src/unirender/pipelines/__init__.py", "import mitsuba", "knows nothing of the ground truth"),
         ("src/unirender/training/__init__.py", "import unirender_evaluation", "knows nothing of the ground truth"),
+        (
+            "src/unirender/models/build.py",
+            "import unirender.training.presets",
+            "training > pipelines > diffusion > models",
+        ),
         ("reference/unirender_reference/__init__.py", "import unirender.models", "independent of the model"),
         ("reference/unirender_reference/shade.py", "import unirender.scene_export", "independent of the model"),
         ("evaluation/unirender_evaluation/__init__.py", "import unirender.cli", "composition root"),

@@ -33,6 +33,8 @@ from unirender.surface_light import diffuse_light, specular_light
 from unirender_evaluation.training_statistics import training_statistics
 
 CAPABILITIES = ("decompose", "edit", "relight", "render")
+SEEN = ("image_srgb", "mask", "camera")
+ALWAYS_PASSED = {"decompose": SEEN, "edit": SEEN, "relight": SEEN, "render": ("intrinsics",)}  # by these names
 Image = Float[np.ndarray, "h w 3"]
 Mask = Float[np.ndarray, "h w 1"]
 
@@ -55,7 +57,8 @@ def check_method(method: Any) -> None:
     """Looks whether an object is a `Method`, without reading its name and config.
 
     Raises:
-        UnirenderError: it has none of the capabilities, or no name or config.
+        UnirenderError: it has none of the capabilities, or no name or config; or a function does not take what it is
+            passed.
     """
     absent = [f"no `{name}`" for name in ("name", "config") if not _has(method, name)]
     absent += [] if capabilities(method) else ["none of the functions"]
@@ -64,6 +67,18 @@ def check_method(method: Any) -> None:
             f"{type(method).__name__} is not a method: it has {' and '.join(absent)}; expected a `name`, a `config` "
             f"and at least one of the functions {', '.join(CAPABILITIES)}"
         )
+    for name in capabilities(method):
+        try:
+            taken = inspect.signature(getattr(method, name))
+        except (TypeError, ValueError):  # compiled code may not say
+            continue
+        try:
+            taken.bind_partial(**dict.fromkeys(ALWAYS_PASSED[name]))
+        except TypeError as error:
+            raise UnirenderError(
+                f"{type(method).__name__}.{name} takes {taken} ({error}), expected the arguments "
+                f"{', '.join(ALWAYS_PASSED[name])}, which are passed by name; rename its own"
+            ) from error
 
 
 def _has(method: Any, attribute: str) -> bool:

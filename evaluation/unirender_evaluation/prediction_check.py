@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.exr import MAP_CHANNELS
 from unirender_evaluation.conventions import FILE, Conventions
 from unirender_evaluation.methods import Mask
 from unirender_evaluation.predictions import LIGHT_FILES, MAP_FILES, SUFFIXES, PredictionFolder
@@ -49,8 +50,13 @@ class Question:
     light: bool = False
 
     @property
+    def pictures(self) -> list[str]:
+        """The names that a file of an answer may have."""
+        return [f"{name}{suffix}" for name in sorted(self.answers) for suffix in SUFFIXES]
+
+    @property
     def files(self) -> str:
-        """The names that a file may have."""
+        """The names that any file may have, in short."""
         names = [f"{name}.exr|png" for name in sorted(self.answers)]
         return ", ".join([*names, *(MAP_FILES if self.maps else ()), *(LIGHT_FILES if self.light else ())])
 
@@ -104,8 +110,7 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
             answered += len(readable)
             found += [problem for file in readable for problem in _file_problems(predictions, file, asked[path.name])]
         elif path.is_dir():
-            close = difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
-            found.append(f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}")
+            found.append(_unknown_picture(path, asked, suite))
         elif path.name != FILE and _is_settings(path):
             found.append(_unread_settings(path, predictions.folder))
         elif path.suffix.lower() in PICTURE_LIKE:
@@ -113,6 +118,19 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
     if not answered and not found:
         found.append(f"{predictions.folder}: no file answers any question of the suite {suite!r}")
     return found
+
+
+def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
+    """What is wrong with a folder that is no picture's; one that has pictures' folders is another method's, or packed
+    once more."""
+    inside = sum(inner.is_dir() and inner.name in asked for inner in _visible(path))
+    if inside:
+        return (
+            f"{path}: has folders of {inside} of the pictures itself, expected them in {path.parent}; score it by "
+            f"itself, with --predictions NAME={path}"
+        )
+    close = difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
+    return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}"
 
 
 def _visible(folder: Path) -> Iterator[Path]:
@@ -139,7 +157,7 @@ def _layout_problems(folder: Path, files: list[Path], question: Question) -> Ite
         elif path.is_dir():
             yield from _problems_in_an_answers_folder(path)
         elif path.is_file() and not expected and path.suffix.lower() in PICTURE_LIKE:
-            yield f"{path}: answers no question about this picture, expected {question.files}"
+            yield f"{path}: answers no question about this picture{_meant(path, question)}, expected {question.files}"
     names = {path.name for path in files}
     for answer in sorted(question.answers):
         if {f"{answer}{suffix}" for suffix in SUFFIXES} <= names:
@@ -148,6 +166,17 @@ def _layout_problems(folder: Path, files: list[Path], question: Question) -> Ite
         yield f"{folder / 'environment.png'}: display values are no light, expected {' or '.join(LIGHT_FILES)}"
     if question.light and set(LIGHT_FILES) <= names:
         yield f"{folder}: {' and '.join(LIGHT_FILES)} are both there, expected one of them"
+
+
+def _meant(path: Path, question: Question) -> str:
+    """Which name was probably meant: the same in small letters or of another format, or one like it."""
+    stem = path.stem.lower()
+    if question.maps and path.suffix.lower() == ".exr" and f"{stem}.png" in MAP_FILES:
+        return f" (did you mean {', '.join(MAP_CHANNELS[stem])} of intrinsics.exr?)"
+    names = [*question.pictures, *(MAP_FILES if question.maps else ()), *(LIGHT_FILES if question.light else ())]
+    same = [name for name in names if name == path.name.lower()] or [name for name in names if Path(name).stem == stem]
+    close = same or difflib.get_close_matches(path.name, names, 1, NEAR)
+    return f" (did you mean {close[0]}?)" if close else ""
 
 
 def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
@@ -210,12 +239,13 @@ def _file_problems(predictions: PredictionFolder, path: Path, question: Question
             predictions.read_picture(path, question.mask)
         else:
             normal = predictions.read_maps(path, question.mask, question.camera).get("normal")
-            if normal is not None and _is_grey(normal[question.mask[..., 0] > 0]):
+            inside = None if normal is None else normal[question.mask[..., 0] > 0]
+            if inside is not None and _is_grey(inside) and (inside.any() or path.suffix == ".png"):
                 yield f"{path}: the three channels of its normal are equal, expected x, y and z; write it in colour"
     except UnirenderError as error:
         yield str(error).removeprefix("predictions: ")
 
 
 def _is_grey(normals: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether directions were made from one channel."""
-    return bool(normals.any()) and float(np.ptp(np.abs(normals), axis=-1).max()) < SAME
+    """Whether directions were made from one channel, or are none at all."""
+    return float(np.ptp(np.abs(normals), axis=-1).max()) < SAME

@@ -31,7 +31,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, read_exr
+from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, on_pole_grid, read_exr
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
@@ -46,6 +46,7 @@ LIGHT_FILES = (f"{LIGHT_ANSWER}.exr", f"{LIGHT_ANSWER}.hdr")
 SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
+NO_NORMAL = (0.01, 1.5)  # lengths: 0 in 8 bits has up to 0.007, and black and white, behind an object, have 1.7
 BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
@@ -62,7 +63,8 @@ class PredictionFolder:
 
     def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
         if not folder.is_dir():
-            raise UnirenderError(f"predictions: {folder}: no such folder, expected one with a subfolder per picture")
+            found = "a file, unpack it if it is an archive" if folder.is_file() else "no such folder"
+            raise UnirenderError(f"predictions: {folder}: {found}; expected a folder with a subfolder per picture")
         if not any(p.is_dir() for p in folder.iterdir()):
             raise UnirenderError(
                 f"predictions: {folder} has no subfolders, expected one per picture, each named as in the inputs "
@@ -83,11 +85,11 @@ class PredictionFolder:
         return self._conventions
 
     def sha256(self) -> str:
-        """Over names and contents of all files that are read."""
+        """Over names and contents of all files that are read, also of those in folders that are links."""
         digest = hashlib.sha256()
-        named = (FILE, *LIGHT_FILES)
-        read = (p for p in self.folder.rglob("*") if (p.suffix in SUFFIXES or p.name in named) and p.is_file())
-        for path in sorted(read):
+        beside = [self.folder / FILE]
+        answers = (p for p in self.folder.glob("*/*") if p.suffix in SUFFIXES or p.name in LIGHT_FILES)
+        for path in sorted(p for p in (*beside, *answers) if p.is_file()):
             digest.update(str(path.relative_to(self.folder)).encode() + hashlib.sha256(path.read_bytes()).digest())
         return digest.hexdigest()
 
@@ -157,14 +159,21 @@ class PredictionFolder:
     def read_light(self, path: Path) -> Float[np.ndarray, "eh ew 3"]:
         """A light on the contract's grid: a map that unirender wrote as it is, another one's pixels taken as areas.
 
+        Coarse ones are brought to the 64 x 128 texels of the suites' lights: on a grid of their own rows, which lie
+        elsewhere, a lamp would be smeared over the texels beside it.
+
         Raises:
             UnirenderError: the file is broken, black, more negative than ringing is, not finite, beyond `BRIGHTEST` or
                 not twice as wide as high.
         """
         from unirender_reference.lights import load_light
+        from unirender_reference.lights.light import SHAPE
 
         with _named(path):
             light = load_light(path, photograph=False, normalise=False).environment
+            areas = path.suffix != ".exr" or not on_pole_grid(read_exr(path)[1])
+            if areas and len(light) < SHAPE[0]:
+                light = load_light(path, photograph=False, normalise=False, shape=SHAPE).environment
             _check_brightness("the light", light)
         return light
 
@@ -208,7 +217,8 @@ class PredictionFolder:
         if name == "normal":
             value = 2 * value - 1
             length = np.linalg.norm(value, axis=-1, keepdims=True)
-            value = np.divide(value, length, out=np.zeros_like(value), where=(length > 1e-3) & (mask > 0))
+            there = (length > NO_NORMAL[0]) & (length < NO_NORMAL[1]) & (mask > 0)
+            value = np.divide(value, length, out=np.zeros_like(value), where=there)
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
         return self._converted({name: value})

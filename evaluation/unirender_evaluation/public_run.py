@@ -3,7 +3,7 @@
     records.jsonl records.csv           every value, with its content key
     run.json                            the rows
     tables.md tables.tex tables.json    with the protocol line
-    missing.txt                         what a folder of predictions has no answer to, a line each, if the run has one
+    missing.txt                         what a stranger's row has no answer to, a line each, if the run has one
 
 Running the same command again reuses what is done: a record depends on the content of its sample's files, the row's
 configuration, the resolution and the code that measures.
@@ -121,14 +121,19 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     say_missing(what.out, counted, say)
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    contents, computed = [], 0
+    before, contents = set(store.known), []
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
         bar = progress.add_task(what.public.name, total=len(samples))
         for sample in samples:
             contents.append(sample.sha256())
-            computed += _work(what, sample, contents[-1], store)
+            _work(what, sample, contents[-1], store)
             progress.update(bar, advance=1, description=f"{what.public.name}: {sample.key}")
     records = [record for record in store.close() if record.values]
+    computed = len({record.key for record in records} - before)
+    by_plugins = _unanswered(what.rows, samples, records)
+    write_missing(what.out, counted | by_plugins)
+    say_missing(what.out, by_plugins, say)
+    missing |= {label: names for label, (names, _) in by_plugins.items()}
     info = _info(what, records, contents)
     write_run(what.out / "run.json", info)
     write_csv(what.out / "records.csv", records)
@@ -146,6 +151,16 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     return PublicResult(tuple(records), tuple(tables), missing, computed)
 
 
+def _unanswered(
+    rows: Sequence[Row], samples: Sequence[Sample], records: Sequence[Record]
+) -> dict[str, tuple[list[str], int]]:
+    """Of each row that is a plug-in, by its label: the questions without a value, and how many one picture answers."""
+    plugins = [row.info for row in rows if row.info.kind == "external" and row.predictions is None]
+    every = [f"{sample.table}/{sample.key}" for sample in samples if sample.one_picture]
+    found = {(record.method, f"{record.table}/{record.sample}") for record in records}
+    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in plugins}
+
+
 def check_folders(what: PublicRun) -> None:
     """Reads every file of the rows that are folders.
 
@@ -159,8 +174,8 @@ def check_folders(what: PublicRun) -> None:
         raise PredictionError(problems)
 
 
-def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> int:
-    """Scores the rows that have no record of the sample; returns how many."""
+def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> None:
+    """Scores the rows that have no record of the sample."""
     rows = {what.key(row, content): row for row in what.rows if takes_part(row, sample)}
     due = {key: row for key, row in rows.items() if not store.has(key)}
     inputs = what.public.inputs(sample) if any(row.predictions is None for row in due.values()) else {}
@@ -173,7 +188,6 @@ def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> int:
         values = what.public.score(sample, answer, networks)
         name = row.info.key
         store.add(Record(sample.table, sample.protocol, name, sample.key, sample.object, values, key, seconds=seconds))
-    return len(due)
 
 
 def _info(what: PublicRun, records: Sequence[Record], contents: Sequence[str]) -> RunInfo:

@@ -13,7 +13,7 @@ from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import CONFIDENCE, METHOD
 from unirender_evaluation.tables import Table, build_table
 
-SHOWN = 5  # names of photographs without a prediction, in a note; `missing.txt` has all
+SHOWN = 5  # names of photographs without an answer, in a note; `missing.txt` has all
 
 
 def public_tables(
@@ -25,7 +25,7 @@ def public_tables(
         public: the set.
         records: of the run.
         run: its rows.
-        missing: label of a row of predictions -> "table/sample" that it has no answer to.
+        missing: label of a stranger's row -> "table/sample" that it has no answer to.
     """
     tables = []
     for spec in public.tables:
@@ -35,7 +35,7 @@ def public_tables(
             here = replace(spec, columns=tuple(c for c in spec.columns if _backbone(c) in (None, *run.lpips)))
             table = build_table(here, averaged(public, chosen), run, protocol=protocol, variant=public.variant)
             line = protocol_line(public, spec, chosen, run)
-            notes = (*table.notes, *_floors(chosen, run), *_gaps(spec, missing))
+            notes = (*table.notes, *_floors(chosen, run), *_gaps(chosen, run, missing))
             tables.append(replace(table, protocol_label=table.title, protocol=line, notes=notes))
     return tables
 
@@ -101,12 +101,12 @@ def _floors(records: Sequence[Record], run: RunInfo) -> list[str]:
     return found
 
 
-def _gaps(spec: TableSpec, missing: Mapping[str, Sequence[str]]) -> list[str]:
-    """Which questions a row of predictions left open."""
-    found = []
-    for label, names in missing.items():
-        here = [name.removeprefix(f"{spec.name}/") for name in names if name.startswith(f"{spec.name}/")]
+def _gaps(records: Sequence[Record], run: RunInfo, missing: Mapping[str, Sequence[str]]) -> list[str]:
+    """Which questions of a table its rows left open."""
+    table, found = f"{records[0].table}/", []
+    for label in dict.fromkeys(run.method(record.method).label for record in records):
+        here = [name.removeprefix(table) for name in missing.get(label, ()) if name.startswith(table)]
         if here:
             more = f" and {len(here) - SHOWN} more (missing.txt)" if len(here) > SHOWN else ""
-            found.append(f"{label}: no prediction for {len(here)}: {', '.join(here[:SHOWN])}{more}.")
+            found.append(f"{label}: no answer to {len(here)}: {', '.join(here[:SHOWN])}{more}.")
     return found

@@ -7,6 +7,7 @@ This module turns results into view models; `templates/` lays them out.
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from unirender.whole_files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
@@ -87,6 +88,7 @@ def write_report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["code"] = _with_code
     most = shown_width(gallery)
     samples = sample_sections(tables, records, run, sheets or {})
     page = environment.get_template("report.html.j2").render(
@@ -109,6 +111,11 @@ def write_report(
         json=_inline(to_json(tables)),
     )
     return replace_file(path, page)
+
+
+def _with_code(text: str) -> Markup:
+    """Text whose commands stand between backticks."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _inline(data: str) -> Markup:

@@ -11,8 +11,7 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.sampling_study import DECOMPOSE, MEAN, RENDER, Setting
 from unirender_evaluation.sampling_study_calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE as INTERVAL
-from unirender_evaluation.statistics import Estimate, mean_estimate
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate
 from unirender_evaluation.table_formats import MISSING, format_estimate, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 
@@ -35,8 +34,7 @@ COLUMNS = (
 QUALITY_NOTE = (
     "Albedo, normal, roughness, metallic: `decompose` of the picture, the network's own maps (not closed). Render: "
     "`render` of the true maps of one of the suite's edits, s and d among them. The mean of the samples is scored, "
-    "inside the true mask, weighted by coverage. Mean over pictures ± half of the "
-    f"{INTERVAL:.0%} interval over objects."
+    f"inside the true mask, weighted by coverage. Mean over pictures ± half of the {INTERVAL}."
 )
 CALIBRATION_NOTE = (
     "s: standard deviation of a pixel's N samples (N - 1 in the denominator). Ratio: RMS error of their mean over the "

@@ -19,7 +19,7 @@ from unirender.training.same_objects import object_of
 from unirender_evaluation.methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
-from unirender_evaluation.statistics import mean_estimate
+from unirender_evaluation.statistics import INTERVAL, mean_estimate
 from unirender_evaluation.table_text import TextTable
 
 COLUMNS = {  # header -> metric of `score_maps`, decimals
@@ -124,7 +124,7 @@ def shard_tables(found: Sequence[Scored], what: str, titled: str = "") -> list[T
         what: was scored, and how, for the notes.
         titled: ends the titles.
     """
-    read = f"{what} Masked, sRGB, raw; ± half of the 95% interval over objects."
+    read = f"{what} Masked, sRGB, raw; ± half of the {INTERVAL}."
     maps = f"{read} Pictures are seen at 8 bits. Roughness and metallic: mean over the object against its number."
     tables = [TextTable(f"Pictures of data sets{titled}", *_cells(found, COLUMNS), (maps,))]
     if any(key in one.scores for one in found for key, _ in RENDERS.values()):

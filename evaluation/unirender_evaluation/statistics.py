@@ -25,6 +25,7 @@ RESAMPLES = 2000
 SEED = 0
 FEW = 20  # objects below which the interval is Student's
 METHOD = f"bootstrap, {RESAMPLES} draws, seed {SEED}, or Student's t below {FEW}"  # as protocol lines say it
+INTERVAL = f"{CONFIDENCE:.0%} interval over objects ({METHOD})"  # as notes do
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,13 @@ Notation: m, r are metallic and (perceptual) roughness; a material is the pair (
 from collections import Counter
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 
 Material = tuple[float, float]
+EVEN = 0.002  # by which the MSE of the constant may differ from that on the whole grid
+DRAWS = 4096  # of a remainder, where the first is not even
 
 
 def material_key(material: Material) -> str:
@@ -27,8 +30,9 @@ def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) 
 
     Every cell of the grid is used equally often but for a remainder. The remainder of 240 over 121 cells is 2 x 121 -
     2: the two cells left out are (0.3, 0.9) and (0.9, 0.3), whose squared distances from 0.5 average 0.100, so that the
-    constant 0.5 scores an MSE of exactly 0.100 for both. For other sizes the remainder is drawn at random. Scenes are
-    blocks over metallic: each gets one value from each fifth (for `per_scene` 5) of its range.
+    constant 0.5 scores an MSE of exactly 0.100 for both. For other sizes the remainder is drawn at random, again where
+    with it the constant would score much else than on the whole grid. Scenes are blocks over metallic: each gets one
+    value from each fifth (for `per_scene` 5) of its range.
 
     Args:
         n_scenes: number of scenes.
@@ -47,7 +51,7 @@ def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) 
     if levels == 11 and remainder == len(cells) - 2:
         pool += [cell for cell in cells if cell not in ((3, 9), (9, 3))]
     else:
-        pool += [cells[i] for i in rng.permutation(len(cells))[:remainder]]
+        pool += [cells[i] for i in _even_remainder(np.array(cells) / step, repeats, remainder, rng)]
     for _ in range(1000):
         noise = rng.random(total)
         order = np.lexsort((noise, np.array([m for m, _ in pool])))
@@ -59,6 +63,26 @@ def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) 
         f"no assignment of {per_scene} different materials to each of {n_scenes} scenes on {levels} levels: "
         "use more levels"
     )
+
+
+def _even_remainder(
+    cells: Float[np.ndarray, "n 2"], repeats: int, remainder: int, rng: np.random.Generator
+) -> Int[np.ndarray, " k"]:
+    """Indices of `remainder` cells: the first draw that is even enough, else the most even of `DRAWS`.
+
+    A draw is even where, with `repeats` of every cell beside it, the constant 0.5 scores what it scores on the grid.
+    """
+    squares = np.square(cells - 0.5)
+    share = remainder / max(repeats * len(cells) + remainder, 1)
+
+    def off(draws: Int[np.ndarray, "d k"]) -> Float[np.ndarray, " d"]:
+        return share * np.abs(squares[draws].mean(axis=1) - squares.mean(axis=0)).max(axis=-1)
+
+    first = rng.permutation(len(cells))[:remainder]
+    if not remainder or off(first[None])[0] <= EVEN:
+        return first
+    draws = rng.permuted(np.tile(np.arange(len(cells)), (DRAWS, 1)), axis=1)[:, :remainder]
+    return draws[np.argmin(off(draws))]
 
 
 def constant_mse(materials: list[list[Material]], value: float = 0.5) -> tuple[float, float]:

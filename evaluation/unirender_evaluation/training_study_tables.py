@@ -11,7 +11,7 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
 from unirender_evaluation.optimiser_study_tables import Cell, cell_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, paired_difference
+from unirender_evaluation.statistics import INTERVAL, paired_difference
 from unirender_evaluation.table_formats import header
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.training_study import PLAIN, QUESTIONS, Choice
@@ -32,8 +32,8 @@ COLUMNS = (
     _column("own maps, Mitsuba", "again_mitsuba", "psnr"),
 )
 NOTE = (
-    f"Mean over scenes; in brackets the paired difference from the first row, ± half of its {CONFIDENCE:.0%} "
-    "interval over objects; **bold** where the interval excludes 0, each number by itself: of equal rows one in twenty "
+    f"Mean over scenes; in brackets the paired difference from the first row, ± half of its "
+    f"{INTERVAL}; **bold** where the interval excludes 0, each number by itself: of equal rows one in twenty "
     "or more does by chance. Masked, sRGB. Own maps: the network's decomposition (not closed), rendered by the network "
     "and shaded by Mitsuba, against the picture. The networks are far from fully trained: the table says what helps "
     "early, at this size."

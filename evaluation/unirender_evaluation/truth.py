@@ -25,9 +25,10 @@ from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import Pool, SuiteLight, assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import ObjectSource, broken_meshes, suite_sources
-from unirender_evaluation.suite_spec import SuiteSpec, read_spec
+from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_file import Kind, Stored, light_member, list_tar, member_kind, write_tar
+from unirender_evaluation.truth_files import check_files
 from unirender_evaluation.truth_object import PART, ObjectJob, render_object
 from unirender_reference.processes import start_worker
 
@@ -72,9 +73,9 @@ def make_truth(
     spec, text = target(suite, out, objects, lights)
     with_sha256(text, spec.path, "")  # before hours of rendering: can the hash be written?
     sources, pool = suite_sources(spec), light_sources(spec)
-    _keep_truth(spec, sources)
     assigned = assign_lights(spec, list(pool), len(sources))
     used = _checked(spec, sources, [name for name, _ in assigned], pool)
+    check_files(spec, sources, used)
     folder = work / _fingerprint(spec, text, used)
     for needed in (folder, spec.path.parent):
         try:
@@ -99,30 +100,6 @@ def make_truth(
             "and are rendered anew):\n" + "\n".join(f"  {line}" for line in sorted(failures))
         )
     pack_truth(spec, text, [parts[number] for number in range(len(jobs))], used)
-
-
-def _keep_truth(spec: SuiteSpec, sources: Sequence[ObjectSource]) -> None:
-    """Looks whether the truth that is there was made from the same mesh files.
-
-    Raises:
-        UnirenderError: it was not: results on it would be results on nothing that is left.
-    """
-    if not (spec.truth_sha256 and spec.truth_path.is_file() and spec.path.is_file()):
-        return
-    try:
-        made = Suite(read_spec(spec.path)).provenance["objects"].values()
-    except UnirenderError:
-        return  # no results can be had on it
-    before = {entry["file"]: entry["file_sha256"] for entry in made if "file" in entry}
-    now = [source.provenance() for source in sources]
-    changed = [
-        str(e["file"]) for e in now if "file" in e and before.get(e["file"], e["file_sha256"]) != e["file_sha256"]
-    ]
-    if changed:
-        raise UnirenderError(
-            f"{spec.truth_path}: was made from other contents of {', '.join(changed)}; results on it and on a new "
-            "truth do not belong together. Pass another --out, or remove it to make the truth anew"
-        )
 
 
 def _checked(

@@ -2,6 +2,7 @@
 
 import json
 import secrets
+import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,8 +75,18 @@ class BenchTruth:
         at_least(1, workers=self.workers)
 
     def run(self) -> int:
-        """Renders what is missing."""
+        """Renders what is missing; 1 where files cannot be used, with a line for each."""
         self.check()
+        try:
+            self._make()
+        except UnirenderError as error:
+            if "\n" not in str(error):
+                raise
+            print(f"unirender: error: {error}", file=sys.stderr)
+            return 1
+        return 0
+
+    def _make(self) -> None:
         from rich.console import Console
         from rich.progress import Progress
 
@@ -97,4 +108,3 @@ class BenchTruth:
             below = f", {row['share_below_target']:.1%} below the target" if row["share_below_target"] else ""
             text = f"{kind}: noise ceiling {row['mean_db']:.1f} dB in the mean, least {row['min_db']:.1f} dB"
             print(f"{text}{below} (n {row['n']}, {row['mean_spp']:.0f} samples a pixel)")
-        return 0

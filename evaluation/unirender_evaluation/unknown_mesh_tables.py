@@ -10,7 +10,7 @@ from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, mean_estimate
+from unirender_evaluation.statistics import INTERVAL, mean_estimate
 from unirender_evaluation.table_formats import format_estimate, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.unknown_mesh_scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
@@ -120,7 +120,7 @@ def shape_notes(settings: MultiviewSettings) -> tuple[str, ...]:
         f"{min(elevations):g}° to {max(elevations):g}°. Scored from {settings.held_out} cameras midway between them; "
         "the steep ones stand where no picture was taken.",
         "; ".join(f"{metric.label}: {metric.formula}" for metric in columns) + ".",
-        f"Means: ± half of the {CONFIDENCE:.0%} interval over objects.",
+        f"Means: ± half of the {INTERVAL}.",
     )
 
 

@@ -76,6 +76,7 @@ COMMANDS = (
     "suite_lights",
     "throughput*",
     "truth",
+    "truth_files",
     "validation",
     "workers",
 )

@@ -11,7 +11,7 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, Metric
 from unirender_evaluation.multiview_tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, Estimate, mean_estimate, paired_difference
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference
 from unirender_evaluation.table_formats import format_estimate, format_number, header
 from unirender_evaluation.table_text import TextTable
 from unirender_evaluation.warm_start import COLD, PICTURE, PREDICTION, STEPS, WARM
@@ -79,7 +79,7 @@ def tables(records: Sequence[Record], geometries: Sequence[str]) -> list[TextTab
 
 
 NOTES = (
-    f"Differences are paired by picture: mean [{CONFIDENCE:.0%} interval over objects]. Inside the true "
+    f"Differences are paired by picture: mean [{INTERVAL}]. Inside the true "
     "mask, weighted by coverage. Fit and relit: `shade` of the result under its own light, against the picture, and "
     "under the object's other light, against Mitsuba's path tracing of the truth. Aligned: one "
     "least-squares factor in linear light, for albedo of the object, for relit of each picture.",

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.errors import UnirenderError
 
 ELEVATIONS_DEG = (0.0, 25.0, -15.0, 35.0, -25.0, 15.0, -35.0, 20.0)  # of an orbit, in turn
 
@@ -19,8 +20,16 @@ def pose_towards(azimuth_deg: float, elevation_deg: float, camera: Camera) -> Fl
 
     Args:
         azimuth_deg: about +y, from +z (0) towards +x (90).
-        elevation_deg: above the horizon, within (-90, 90).
+        elevation_deg: above the horizon, within [-90, 90].
+
+    Raises:
+        UnirenderError: an angle is not finite, or the elevation is out of its range.
     """
+    if not (math.isfinite(azimuth_deg) and -90 <= elevation_deg <= 90):
+        raise UnirenderError(
+            f"pose: got azimuth {azimuth_deg:g} and elevation {elevation_deg:g} degrees, expected a finite azimuth and "
+            "an elevation from -90 to 90"
+        )
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     back = np.array(
         [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]

@@ -54,6 +54,7 @@ __all__ = [
 
 IMAGE_DEPTH = 4
 DIRECT_DEPTH = 2
+UNLIMITED = -1  # as Mitsuba counts bounces
 GEOMETRY_SPP = 256
 LARGE = 128  # pixels along a side; above, edges are a small part of the picture
 LARGE_GEOMETRY_SPP = 25  # one jittered 5 x 5 grid: coverage to about 1/25
@@ -121,13 +122,17 @@ class Renderer:
             roughness, metallic: None: the object's own map.
             spp: samples per pixel.
             seed: equal seeds give equal images.
-            depth: 2 is direct light, 4 three bounces.
+            depth: 2 is direct light, 4 three bounces; -1: as many as there are, as in Mitsuba.
             batches: passes that the variance is taken from.
             pose: camera to world (`multiview`); None: the contract's camera.
 
         Raises:
             UnirenderError: an argument is of another type or out of range, or a pixel stays NaN.
         """
+        if not isinstance(depth, Integral) or (depth < DIRECT_DEPTH and depth != UNLIMITED):
+            raise UnirenderError(
+                f"depth: got {depth!r:.40}, expected {DIRECT_DEPTH} (one bounce) or more, or {UNLIMITED} (no end)"
+            )
         scene = self.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
         sensor = None if pose is None else sensor_at(pose, self.camera, self.resolution, self.resolution)
         own = derive_seed(seed, "image")

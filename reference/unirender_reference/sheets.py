@@ -82,17 +82,17 @@ def table_sheet(
 def captioned_sheet(
     tiles: Sequence[Float[np.ndarray, "h w 3"]], captions: Sequence[str], columns: int, style: Style = LIGHT
 ) -> Image.Image:
-    """Tiles of one size, row by row, each over its caption (of up to two lines; longer lines are cut)."""
+    """Tiles of one size, row by row, each over its caption, whose lines are broken between words at a tile's width."""
     font = ImageFont.load_default(style.font)
     height, width = tiles[0].shape[:2]
-    cell = (width + style.gap, height + 2 * style.line + style.gap)
+    broken = [[part for line in caption.splitlines() for part in _broken(line, width, font)] for caption in captions]
+    cell = (width + style.gap, height + max(map(len, broken)) * style.line + style.gap)
     columns = min(columns, len(tiles))
     size = (columns * cell[0] + style.gap, -(-len(tiles) // columns) * cell[1] + style.gap)
     sheet, draw = _blank(size, style)
-    for k, (tile, caption) in enumerate(zip(tiles, captions, strict=True)):
+    for k, (tile, lines) in enumerate(zip(tiles, broken, strict=True)):
         x, y = style.gap + (k % columns) * cell[0], style.gap + (k // columns) * cell[1]
         sheet.paste(Image.fromarray(pixels(tile)), (x, y))
-        lines = [_cut(line, width, font) for line in caption.splitlines()[:2]]
         draw.multiline_text((x, y + height + 2), "\n".join(lines), (round(255 * style.text),) * 3, font)
     return sheet
 
@@ -102,7 +102,19 @@ def _blank(size: tuple[int, int], style: Style) -> tuple[Image.Image, ImageDraw.
     return sheet, ImageDraw.Draw(sheet)
 
 
-def _cut(line: str, width: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
-    while line and font.getlength(line) > width:
-        line = line[:-1]
-    return line
+def _broken(line: str, width: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
+    """A line's words in as many lines as they need; a word that is too long for one is cut."""
+    lines = [""]
+    for word in line.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if font.getlength(longer) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(_cut(word, width, font))
+    return [part for part in lines if part]
+
+
+def _cut(word: str, width: int, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> str:
+    while word and font.getlength(word) > width:
+        word = word[:-1]
+    return word

@@ -46,6 +46,31 @@ class Camera:
         if len(self.principal) != 2 or not all(math.isfinite(p) for p in self.principal):
             raise UnirenderError(f"principal point: got {self.principal}, expected two finite fractions of the frame")
 
+    @classmethod
+    def from_focal(cls, focal: float, height: int, width: int, center: tuple[float, float] | None = None) -> "Camera":
+        """The camera of a calibration, with square pixels and a straight lens.
+
+        Args:
+            focal: focal length in pixels, the same across and down.
+            height: of the picture in whose pixels it counts.
+            width: of this picture.
+            center: principal point (x, y) in pixels from the picture's top-left corner, as COLMAP counts: the middle of
+                the first pixel is (0.5, 0.5). OpenCV counts from there: add 0.5 to each. None: the picture's middle.
+
+        Raises:
+            UnirenderError: the focal length or a side is not above 0, or the point is not finite.
+        """
+        if not (focal > 0 and math.isfinite(focal) and height > 0 and width > 0):
+            raise UnirenderError(
+                f"focal length: got {focal:g} pixels in a picture of {width} x {height}, expected numbers above 0"
+            )
+        x, y = (width / 2, height / 2) if center is None else center
+        return cls(math.degrees(2 * math.atan(height / (2 * focal))), (x / width, y / height))
+
+    def focal(self, height: int) -> float:
+        """Focal length in pixels of a picture of this height; `from_focal` takes it back."""
+        return height / (2 * math.tan(math.radians(self.fov_deg) / 2))
+
     def describe(self) -> str:
         """`fov_deg=36 principal=0.5,0.5`: as it stands in the header attribute `unirender:camera` of a file."""
         x, y = (_number(p) for p in self.principal)
@@ -77,6 +102,21 @@ class Camera:
     def view_directions(self, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
         """Unit directions from each pixel's surface point towards the viewer: `-rays`."""
         return -self.rays(height, width)
+
+    def of_square(self, top: int, left: int, side: int, height: int, width: int) -> "Camera":
+        """The camera of a square part of a picture: the same rays through the same pixels.
+
+        Args:
+            top: its first row; it may reach beyond the picture.
+            left: its first column.
+            side: of the square, pixels.
+            height: of the picture, pixels.
+            width: of the picture, pixels.
+        """
+        half = math.tan(math.radians(self.fov_deg) / 2) * side / height
+        x = (self.principal[0] * width - left) / side
+        y = (self.principal[1] * height - top) / side
+        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
 
     def distance(self, radius: float = 1.0, fill: float = DEFAULT_FILL) -> float:
         """Distance at which a sphere's silhouette fills `fill` of the frame height.

@@ -1,28 +1,33 @@
 """Picture files of Pillow's and PIL pictures as display values in [0, 1]: colours in sRGB, data as it is stored."""
 
+import struct
 import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
 from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
+RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
+SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
-def open_picture(path: str | Path) -> Image.Image:
-    """A picture file in a format of Pillow's, decoded and turned as its EXIF orientation says.
+def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
+    """A picture file in a format of Pillow's, decoded and, if `upright`, turned as its EXIF orientation says.
 
     Raises:
-        UnirenderError: no readable picture, or one of more than `MAX_PIXELS`.
+        UnirenderError: no readable picture, a camera's raw file, or one of more than `MAX_PIXELS`.
     """
+    if Path(path).suffix.lower() in RAW_SUFFIXES:
+        raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -38,21 +43,25 @@ def open_picture(path: str | Path) -> Image.Image:
                         "cannot be read; save it as PNG, or with interleaved channels"
                     )
                 file.load()
-                return ImageOps.exif_transpose(file)
+                return ImageOps.exif_transpose(file) if upright else file.copy()
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
 
 
-def stored_values(path: str | Path) -> Float[np.ndarray, "h w c"]:
+def stored_values(path: str | Path, *, upright: bool = True) -> Float[np.ndarray, "h w c"]:
     """Display values in [0, 1] of a file of Pillow's, of data and not of colours: RGB, or RGBA, with all their bits.
+
+    Args:
+        path: of the file.
+        upright: turn it as its EXIF orientation says.
 
     Raises:
         UnirenderError: as `open_picture` and `display_values`.
     """
-    image = open_picture(path)
-    full = sixteen_bit_values(Path(path), upright=True)
+    image = open_picture(path, upright=upright)
+    full = sixteen_bit_values(Path(path), upright=upright)
     return display_values(image, str(path)) if full is None else full
 
 
@@ -69,16 +78,28 @@ def srgb_values(path: str | Path, name: str | None = None) -> Float[np.ndarray, 
     return srgb_values_and_remarks(Path(path), name or str(path))[0]
 
 
-def srgb_values_and_remarks(path: Path, name: str) -> tuple[Float[np.ndarray, "h w c"], dict[str, str]]:
-    """The same, and remarks by kind on what was lost in reading it."""
-    image = open_picture(path)
+def srgb_values_and_remarks(
+    path: Path, name: str, *, upright: bool = True
+) -> tuple[Float[np.ndarray, "h w c"], dict[str, str]]:
+    """The same, and remarks by kind on what was lost in reading it; `upright` as of `stored_values`."""
+    image = open_picture(path, upright=upright)
     srgb = in_srgb(image, name)
-    full = sixteen_bit_values(path, upright=True) if srgb is image else None
+    remarks = _gamma_remarks(image)
+    full = sixteen_bit_values(path, upright=upright) if srgb is image else None
     if full is not None:
-        return full, {}
+        return full, remarks
     with opened(path) as file:
         cut = has_sixteen_bits(file)
-    return display_values(srgb, name), {"depth": SIXTEEN_BITS} if cut else {}
+    return display_values(srgb, name), remarks | ({"depth": SIXTEEN_BITS} if cut else {})
+
+
+def _gamma_remarks(image: Image.Image) -> dict[str, str]:
+    """What is due on a PNG that states another gamma and nothing that counts more (an sRGB chunk, an ICC profile)."""
+    gamma, more = image.info.get("gamma"), {"srgb", "icc_profile"} & image.info.keys()
+    if gamma is None or more or abs(gamma - SRGB_GAMMA) <= SAME_GAMMA:
+        return {}
+    said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), and its values are taken as sRGB"
+    return {"gamma": f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said}
 
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
@@ -117,6 +138,15 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
 def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`unirender.icc`)."""
     return display_values(in_srgb(image, name), name)
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the file has an EXIF orientation that is not that of its pixels; a damaged one is none."""
+    try:
+        with opened(path) as file:
+            return file.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
+    except (OSError, ValueError, SyntaxError, struct.error):
+        return False
 
 
 def picture_count(path: Path) -> int:

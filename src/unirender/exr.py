@@ -24,6 +24,7 @@ from unirender.whole_files import replace_file
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
 HALF_MAX = 65504.0
+HALF_FULL = 2.0**-10  # half precision has all its digits down to 2^-14: of radiance that ends below, too few are left
 ATTRIBUTE_PREFIX = "unirender:"
 CAMERA_ATTRIBUTE = "camera"  # as `unirender.camera.Camera.describe` has it
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
@@ -66,6 +67,22 @@ def write_environment(
     """
     marked = {**(attributes or {}), GRID_ATTRIBUTE: POLE_GRID}
     write_exr(path, image_channels(environment), half=False, attributes=marked)
+
+
+def header_camera(attributes: Mapping[str, str]) -> Camera | None:
+    """The camera that a file's header states as ours do; None where it states none, or what others call a camera."""
+    try:
+        return Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
+    except UnirenderError:
+        return None
+
+
+def radiance_fits_half(channels: Mapping[str, np.ndarray]) -> bool:
+    """Whether half precision holds the image, s and d among some channels: none is too bright for it, or dim in all."""
+    names = [*"RGB", *MAP_CHANNELS["specular"], *MAP_CHANNELS["diffuse"]]
+    peaks = [float(np.max(channels[name], initial=0)) for name in names if name in channels]
+    peak = max(peaks, default=0.0)
+    return peak == 0 or HALF_FULL <= peak <= HALF_MAX
 
 
 def on_pole_grid(attributes: Mapping[str, str]) -> bool:

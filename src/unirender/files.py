@@ -31,6 +31,7 @@ from unirender.exr import (
     intrinsics_channels,
     intrinsics_from_channels,
     on_pole_grid,
+    radiance_fits_half,
     read_exr,
     write_environment,
     write_exr,
@@ -49,10 +50,14 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
+def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
 
     Only a result folder (one with `meta.json`) is ever replaced, and none that others were written into.
+
+    Args:
+        path: where it is to be.
+        overwrite: whether a result that is there is replaced; None: it is not, and nobody can ask for it.
 
     Raises:
         UsageError: `path` is the working directory or lies around it.
@@ -66,7 +71,8 @@ def new_folder(path: str | Path, *, overwrite: bool = False) -> Iterator[Path]:
         raise UnirenderError(f"{shown}: is a file, expected a folder to write to")
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            raise UnirenderError(f"{shown}: exists and is not empty; choose another folder or pass --overwrite")
+            option = "" if overwrite is None else " or pass --overwrite"
+            raise UnirenderError(f"{shown}: exists and is not empty; choose another folder{option}")
         if (path / SUMMARY_FILE).is_file():
             raise UnirenderError(
                 f"{shown}: has a {SUMMARY_FILE}, so that it holds the results of a folder of pictures, expected one "
@@ -144,6 +150,8 @@ def write_result(
 ) -> None:
     """Writes maps, pictures and `meta.json` into an existing (temporary) folder; see `new_folder`.
 
+    EXR files have half precision, or float32 where radiance does not fit into half (`exr.radiance_fits_half`).
+
     Args:
         folder: where.
         intrinsics: maps to write, or None.
@@ -158,7 +166,9 @@ def write_result(
             of_maps = attributes
             if intrinsics.environment is not None and _is_lit(intrinsics):
                 of_maps = attributes | {LIGHT_ATTRIBUTE: _light_sha256(intrinsics.environment)}
-            write_exr(folder / INTRINSICS_FILE, intrinsics_channels(intrinsics), attributes=of_maps)
+            channels = intrinsics_channels(intrinsics)
+            half = radiance_fits_half(channels)
+            write_exr(folder / INTRINSICS_FILE, channels, half=half, attributes=of_maps)
         if intrinsics.environment is not None:
             write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
@@ -166,7 +176,8 @@ def write_result(
     if image_linear is not None:
         mask = None if intrinsics is None else intrinsics.mask
         rgba = image_linear if mask is None else np.concatenate([image_linear, mask], axis=-1)
-        write_exr(folder / IMAGE_FILE, image_channels(rgba), attributes=attributes)
+        channels = image_channels(rgba)
+        write_exr(folder / IMAGE_FILE, channels, half=radiance_fits_half(channels), attributes=attributes)
         picture = image_srgb(image_linear if mask is None else unpremultiply(image_linear, mask))
         write_png(folder / "image.png", picture if mask is None else np.concatenate([picture, mask], axis=-1))
     write_meta(folder, meta, None if intrinsics is None else intrinsics.camera)

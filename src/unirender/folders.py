@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unirender.display_files import RAW_SUFFIXES
 from unirender.errors import UnirenderError, UsageError
 from unirender.files import (
     ENVIRONMENT_FILE,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".bmp", ".exr", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 RARE_SUFFIXES = (".avif", ".gif", ".j2k", ".jfif", ".jp2", ".mpo", ".pbm", ".pgm", ".pnm", ".ppm", ".qoi", ".tga")
+FOREIGN_SUFFIXES = (".heic", ".heif", *RAW_SUFFIXES)  # listed, so that their failure is
 FIGURES = ("roughness_mean", "metallic_mean", "clipped", "remarks", "std_max")  # of `meta.json`, for the summary
 INPUT_SHA256 = "input_sha256"
 ELSEWHERE = ("device", "input", "mask")  # of `meta.json`: another machine or another path to a file is no other setting
@@ -61,7 +63,7 @@ class FolderResult:
 def list_pictures(folder: Path) -> list[Path]:
     """The pictures that lie in a folder, not in folders inside it, in natural order: `f2.png` before `f10.png`.
 
-    Links that lead nowhere are among them, so that they are listed as failed.
+    Links that lead nowhere and a camera's files that cannot be read are among them, so that they are listed as failed.
 
     Raises:
         UnirenderError: there is none, or the folder is a result.
@@ -78,7 +80,7 @@ def list_pictures(folder: Path) -> list[Path]:
 
 def _is_picture(path: Path) -> bool:
     """By its name."""
-    return path.suffix.lower() in SUFFIXES + RARE_SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES + RARE_SUFFIXES + FOREIGN_SUFFIXES and not path.name.startswith(".")
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:

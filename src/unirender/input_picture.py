@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 DARK = 0.35  # display value that an object reaches at the exposures of the training data, unless it is dark itself
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
+FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
 
 
@@ -42,9 +43,16 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     elif picture.mask.min() >= OPAQUE:
         remarks["mask"] = f"the alpha channel covers the whole frame, which is taken as the object{option}"
     assert picture.mask is not None, "the whole frame at least"
+    covered = picture.mask[..., 0] > 0.5
+    if covered[[0, 0, -1, -1], [0, -1, 0, -1]].all() and not covered.all():
+        remarks["inverted"] = (
+            "the mask holds all four corners of the frame, expected white on the object: is it inverted?"
+        )
+    if (pixels := int(covered.sum())) < FEW_PIXELS:
+        remarks["small"] = f"the object covers {'1 pixel' if pixels == 1 else f'{pixels} pixels'}: its maps mean little"
     if (most := picture.mask.max()) < FULL_COVERAGE:
         remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
-    if (bright := float(np.percentile(picture.image_srgb[picture.mask[..., 0] > 0.5].max(axis=-1), 99))) < DARK:
+    if (bright := float(np.percentile(picture.image_srgb[covered].max(axis=-1), 99))) < DARK:
         remarks["dark"] = (
             f"the object is dark, 99% of it below {bright:.2f} of display white: the network was taught exposures at "
             "which white is bright, and a darker one goes into the albedo"

@@ -1,6 +1,5 @@
 """Pictures and masks from files: PNG, JPG and whatever else Pillow knows, and linear OpenEXR."""
 
-import contextlib
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +12,7 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
-from unirender.exr import CAMERA_ATTRIBUTE, channels_rgb, read_exr
+from unirender.exr import channels_rgb, header_camera, read_exr
 
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 OPAQUE = DISPLAY_WHITE  # a coverage from which it is whole: no alpha of 8 bits lies between
@@ -51,18 +50,23 @@ class Picture:
         return float(np.average(white, weights=None if self.mask is None else self.mask[..., 0]))
 
 
-def read_picture(path: str | Path) -> Picture:
+def read_picture(path: str | Path, *, upright: bool = True) -> Picture:
     """Reads PNG, JPG and whatever else Pillow knows, or a linear OpenEXR image `R,G,B[,A]` (premultiplied; `mask.Y`
     counts where there is no `A`).
 
     Colours come in sRGB's primaries, whatever the file's ICC profile or chromaticities say.
+
+    Args:
+        path: of the file.
+        upright: turn it as its EXIF orientation says; False: pixels as they are stored, in which cameras that were
+            found from them count.
 
     Raises:
         UnirenderError: the file is missing, no picture, broken, too large, or an EXR with NaN or infinite values or
             with more negative radiance than `NEGATIVE_MOST`.
     """
     path = checked_file(path)
-    return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path)
+    return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path, upright)
 
 
 def checked_file(path: str | Path) -> Path:
@@ -79,22 +83,25 @@ def checked_file(path: str | Path) -> Path:
     return path
 
 
-def read_mask(path: str | Path, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
+def read_mask(path: str | Path, size: tuple[int, int], *, upright: bool = True) -> Float[np.ndarray, "h w 1"]:
     """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours, as they are stored.
 
-    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone. What is lost in reading it is logged.
+    An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone. What is lost in reading it is logged. `upright` as
+    of `read_picture`.
 
     Raises:
         UnirenderError: as `read_picture`, or the size differs from `size` (height, width), or the mask is empty, or
             values are more than `MASK_BEYOND` outside [0, 1].
     """
-    mask, remarks = read_mask_file(path, size)
+    mask, remarks = read_mask_file(path, size, upright=upright)
     for remark in remarks.values():
         logger.warning("%s: %s", path, remark)
     return mask
 
 
-def read_mask_file(path: str | Path, size: tuple[int, int]) -> tuple[Float[np.ndarray, "h w 1"], dict[str, str]]:
+def read_mask_file(
+    path: str | Path, size: tuple[int, int], *, upright: bool = True
+) -> tuple[Float[np.ndarray, "h w 1"], dict[str, str]]:
     """The same, and by kind what is lost, of which nothing is logged.
 
     Raises:
@@ -102,11 +109,12 @@ def read_mask_file(path: str | Path, size: tuple[int, int]) -> tuple[Float[np.nd
     """
     path = checked_file(path)
     exr = path.suffix.lower() == ".exr"
-    mask = _read_exr_mask(path) if exr else coverage(stored_values(path))
+    mask = _read_exr_mask(path) if exr else coverage(stored_values(path, upright=upright))
     if mask.shape[:2] != size:
+        on_its_side = " as its EXIF orientation turns it; turn the mask likewise" if mask.shape[1::-1] == size else ""
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
-            "like the picture"
+            f"like the picture{on_its_side}"
         )
     low, high = float(mask.min()), float(mask.max())
     if low < -MASK_BEYOND or high > 1 + MASK_BEYOND:
@@ -131,7 +139,7 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
     if not (mask > 0.5).any():
         raise UnirenderError(
             f"{name}: the mask is empty: no pixel is covered by more than half, and the most by {mask.max():.3g}, "
-            "expected white (or opaque) pixels on the object"
+            "expected white (255 of 8 bits) or opaque pixels on the object"
         )
     return np.clip(mask, 0, 1).astype(np.float32)
 
@@ -174,8 +182,8 @@ def negative_share(radiance: Float[np.ndarray, "h w 3"], name: str) -> float:
     return negative
 
 
-def _read_display_picture(path: Path) -> Picture:
-    pixels, remarks = srgb_values_and_remarks(path, str(path))
+def _read_display_picture(path: Path, upright: bool) -> Picture:
+    pixels, remarks = srgb_values_and_remarks(path, str(path), upright=upright)
     mask = check_mask(pixels[..., 3:], f"{path} (alpha)") if pixels.shape[-1] == 4 else None
     if (count := picture_count(path)) > 1:
         remarks["frames"] = f"the file holds {count} pictures, of which the first is taken"
@@ -215,7 +223,4 @@ def _read_exr_picture(path: Path) -> Picture:
         if np.abs(alpha - mask[..., 0]).max() > ALPHA_TOLERANCE:
             remarks["alpha"] = f"{name} has values in [{alpha.min():.3g}, {alpha.max():.3g}], clipped to [0, 1]"
         rgb = unpremultiply(rgb, mask)
-    camera = None
-    with contextlib.suppress(UnirenderError):  # other programs may write what they call a camera
-        camera = Camera.parse(attributes.get(CAMERA_ATTRIBUTE, ""))
-    return Picture(image_srgb(rgb), mask, path.name, negative, camera, remarks)
+    return Picture(image_srgb(rgb), mask, path.name, negative, header_camera(attributes), remarks)

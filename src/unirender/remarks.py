@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MAX_STOPS = 32
 MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
+MANY_TILES = 500  # from which a notice is due
 IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
 
 
@@ -60,12 +61,18 @@ def frame_remarks(mask: "np.ndarray", side: int, tile: bool) -> dict[str, str]:
         tile: whether the detail of tiles is asked for.
     """
     from unirender.pipelines.framing import Frame
+    from unirender.pipelines.tiling import tiles_of
 
     found = parts_left_out(mask, side)
     if tile and (seen := Frame.around(mask, side).side) <= side:
         found["tile"] = (
             f"--tile adds nothing: the part of the picture that the network looks at has {seen} pixels along a side, "
             f"no more than its own {side}"
+        )
+    elif tile and (count := len(tiles_of(mask, side))) > MANY_TILES:
+        found["tile"] = (
+            f"--tile: {count} tiles of {side} pixels, each of which takes about as long as a picture of that size; a "
+            "smaller picture or a larger --size has fewer"
         )
     return found
 

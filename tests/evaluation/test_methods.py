@@ -158,6 +158,30 @@ def test_capabilities_are_checked() -> None:
         methods.check_method(Empty())
 
 
+def test_arguments_of_other_names_are_refused_before_a_run() -> None:
+    """They are passed by name: a run failed at its first question, after the truth check."""
+
+    class Renamed:
+        name = "renamed"
+        config: dict[str, Any] = {}  # noqa: RUF012 - a constant of the test
+
+        def render(self, maps: Intrinsics) -> np.ndarray | None:
+            return None
+
+    class Loose:
+        name = "loose"
+        config: dict[str, Any] = {}  # noqa: RUF012 - a constant of the test
+
+        def render(self, **given: Any) -> np.ndarray | None:
+            return None
+
+    with pytest.raises(UnirenderError, match=r"Renamed.render takes \(maps: .*, expected the arguments intrinsics,"):
+        methods.check_method(Renamed())
+    methods.check_method(Loose())
+    for trivial in (methods.UneditedInput(), methods.InputAsAlbedo(), methods.Composite()):
+        methods.check_method(trivial)
+
+
 class Careless:
     """A stranger's method whose properties fail, or are slow: what they say is read once, and a failure named."""
 

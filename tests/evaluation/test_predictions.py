@@ -239,6 +239,25 @@ def test_grey_normals_are_a_problem(suite: Suite, tmp_path: Path) -> None:
     assert problem.startswith(f"{path}: the three channels of its normal are equal, expected x, y and z")
 
 
+@pytest.mark.parametrize("level", [0, 127, 128, 255])
+def test_a_picture_s_background_is_no_normal(suite: Suite, tmp_path: Path, level: int) -> None:
+    """Along the outline, where a method's mask is smaller: of length 0, as in an EXR, and no direction."""
+    task = first(suite, "inverse", "single-image")
+    path = tmp_path / task.folder / "normal.png"
+    path.parent.mkdir()
+    found = suite.intrinsics(task.scene, task.scene.materials[0]).require("normal")["normal"].copy()
+    found[:, 14:16] = 0
+    levels = np.where(found.any(axis=-1, keepdims=True), np.round((found + 1) / 2 * 255), level)
+    Image.fromarray(levels.astype(np.uint8)).save(path)
+    assert problems_of(suite, tmp_path) == ()
+    read = engine.answer(prediction_rows({"mine": tmp_path})[0], task).maps
+    assert read is not None
+    np.testing.assert_allclose(read.require("normal")["normal"], found, rtol=0, atol=0.01)
+    Image.new("RGB", levels.shape[1::-1], (level, level, level)).save(path)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: the three channels of its normal are equal")
+
+
 @pytest.mark.parametrize("colour", ["linear", "srgb"])
 def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, colour: str) -> None:
     """What the check lets through is scored with numbers."""
@@ -391,6 +410,47 @@ def test_conventions_are_the_contract_by_default(tmp_path: Path) -> None:
     (tmp_path / "conventions.toml").write_text("premultiplied = ")
     with pytest.raises(UnirenderError, match="not a readable TOML file"):
         read_conventions(tmp_path)
+
+
+def test_an_edit_behind_a_link_to_a_folder_is_part_of_the_key(suite: Suite, tmp_path: Path) -> None:
+    """The answers are kept elsewhere: those of an edited one were taken for scored."""
+    answer_all(suite, tmp_path / "kept")
+    (tmp_path / "mine").mkdir()
+    for folder in (tmp_path / "kept").iterdir():
+        (tmp_path / "mine" / folder.name).symlink_to(folder)
+    before = prediction_rows({"mine": tmp_path / "mine"})[0].config
+    assert before == prediction_rows({"mine": tmp_path / "kept"})[0].config
+    next((tmp_path / "kept").glob("*/*.exr")).unlink()
+    assert prediction_rows({"mine": tmp_path / "mine"})[0].config != before
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("intrinsics.EXR", "intrinsics.exr"),
+        ("Albedo.png", "albedo.png"),
+        ("albedo.jpg", "albedo.png"),
+        ("albedo.exr", "albedo.R, albedo.G, albedo.B of intrinsics.exr"),
+        ("roughness.EXR", "roughness.Y of intrinsics.exr"),
+        ("edit_m1_r05.exr", "edit_m100_r050.exr"),
+    ],
+)
+def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, name: str, meant: str) -> None:
+    answer_all(suite, tmp_path)
+    path = tmp_path / first(suite, "rendering", "from-image").folder / name
+    path.write_bytes(b"")
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: answers no question about this picture (did you mean {meant}?), expected edit_")
+
+
+def test_another_methods_folder_and_an_archive_are_named_as_such(suite: Suite, tmp_path: Path) -> None:
+    answer_all(suite, tmp_path / "all" / "other")
+    (problem,) = problems_of(suite, tmp_path / "all")
+    assert problem.startswith(f"{tmp_path / 'all' / 'other'}: has folders of ")
+    assert problem.endswith(f"score it by itself, with --predictions NAME={tmp_path / 'all' / 'other'}")
+    (tmp_path / "mine.zip").write_bytes(b"PK")
+    with pytest.raises(UnirenderError, match=r"mine\.zip: a file, unpack it if it is an archive; expected a folder"):
+        prediction_rows({"mine": tmp_path / "mine.zip"})
 
 
 def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -> None:

@@ -129,8 +129,28 @@ def test_none_is_no_answer(tmp_path: Path) -> None:
     orb = StanfordOrb(make_orb(tmp_path / "orb"), 32, 60.0)
     result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp)]), tmp_path / "out")
     assert {record.method for record in result.records} == {"ramp"}
+    assert result.computed == len(result.records), "of the records that the run has"
     asked = [record.method for record in read_records(tmp_path / "out" / "records.jsonl")]
     assert asked.count("silent") == asked.count("ramp") > 0
+
+
+def test_what_a_plug_in_leaves_open_is_listed(tmp_path: Path) -> None:
+    """None for one photograph, no `relight`; what no single picture answers is nobody's gap."""
+
+    class Half:
+        name, config = "half", Ramp.config
+
+        def decompose(self, image_srgb, mask, camera):
+            return None if np.array_equal(image_srgb, left_out) else Ramp().decompose(image_srgb, mask, camera)
+
+    orb, out = StanfordOrb(make_orb(tmp_path / "orb"), 32), tmp_path / "out"
+    samples = [sample for sample in orb.samples() if sample.one_picture]
+    left_out = orb.inputs(samples[0])["image_srgb"]
+    result = done(orb, plugin_rows([Plugin(Half(), "test")]), out)
+    open_ = [f"{sample.table}/{sample.key}" for sample in (samples[0], *samples[3:])]
+    assert result.missing == {"half": open_}
+    assert (out / "missing.txt").read_text() == "".join(f"half: {name}\n" for name in open_)
+    assert f"half: no answer to 1: {samples[0].key}." in (out / "tables.md").read_text()
 
 
 def test_a_table_that_nothing_can_be_asked_for_is_explained(tmp_path: Path) -> None:
@@ -274,7 +294,7 @@ def test_what_a_folder_leaves_open_is_listed(tmp_path: Path) -> None:
     beside = "stanford-orb-relighting/cup_scene001/relight_cup_scene002_0001"
     assert result.missing == {"mine": ["stanford-orb/cup_scene002_0001", beside]}
     assert (tmp_path / "out" / "missing.txt").read_text() == f"mine: stanford-orb/cup_scene002_0001\nmine: {beside}\n"
-    assert "mine: no prediction for 1: cup_scene002_0001." in (tmp_path / "out" / "tables.md").read_text()
+    assert "mine: no answer to 1: cup_scene002_0001." in (tmp_path / "out" / "tables.md").read_text()
     done(orb, trivial_rows(orb)[:1], tmp_path / "out")
     assert not (tmp_path / "out" / "missing.txt").exists(), "that of an earlier run says nothing of this one"
 

@@ -91,6 +91,12 @@ def test_labels_are_escaped(page: str) -> None:
     assert "Ours <mean>" not in page.split('id="tables-json"')[0]
 
 
+def test_commands_in_notes_are_set_as_code(tmp_path: Path) -> None:
+    tables = [replace(table, notes=("<x>: `make x` fetches it",)) for table in build_tables(records(), RUN)]
+    page = write_report(tmp_path / "r.html", tables, [], RUN).read_text(encoding="utf-8")
+    assert "<li>&lt;x&gt;: <code>make x</code> fetches it</li>" in page
+
+
 def test_failures_come_first_and_are_named_with_their_figures_and_questions(page: str) -> None:
     cards = re.findall(r'<h4><span class="rank">(.*?)</span>(.*?)</h4>', page)
     assert cards == [("worst of 6: PSNR 1 dB", "question bad"), ("best of 6: PSNR 6 dB", "question good")]

@@ -1,4 +1,4 @@
-"""Rows by name and by group, for the studies of the optimiser and of the training."""
+"""Rows by name and by group, for the studies of the optimiser and of the training; what notes of studies say alike."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,9 +6,13 @@ from dataclasses import dataclass
 import pytest
 
 from unirender.errors import UsageError
+from unirender_evaluation import sampling_study_tables, training_study_tables, warm_start_tables
+from unirender_evaluation.multiview_settings import MultiviewSettings
 from unirender_evaluation.optimiser_study_ingredients import GROUPS, ingredients
+from unirender_evaluation.statistics import METHOD
 from unirender_evaluation.study_rows import StudyRow, chosen
 from unirender_evaluation.training_study import QUESTIONS, training_choices
+from unirender_evaluation.unknown_mesh_tables import shape_notes
 
 
 @dataclass(frozen=True)
@@ -52,3 +56,14 @@ def test_the_rows_of_a_study_have_names_of_their_own_and_the_groups_that_have_a_
 ) -> None:
     assert len({*groups, *(row.name for row in rows)}) == len(groups) + len(rows)
     assert {row.group for row in rows} == {"", *groups}
+
+
+def test_notes_say_how_intervals_are_made() -> None:
+    """A bootstrap of a few objects would be too narrow, and nothing else tells which it was."""
+    notes = (
+        sampling_study_tables.QUALITY_NOTE,
+        training_study_tables.NOTE,
+        warm_start_tables.NOTES[0],
+        shape_notes(MultiviewSettings())[-1],
+    )
+    assert [note for note in notes if METHOD not in note] == []

@@ -24,12 +24,13 @@ from unirender_evaluation.suite_check import LEAST
 from unirender_evaluation.suite_definition import DEFINITION, check_definition
 from unirender_evaluation.suite_definition import recorded as recorded_values
 from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
-from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
+from unirender_evaluation.suite_lights import SuiteLight, assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import broken_meshes, scene_object, suite_sources
 from unirender_evaluation.suite_spec import SuiteSpec, parse_spec, read_spec, suite_path
 from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import make_truth
 from unirender_evaluation.truth_file import list_tar, write_tar
+from unirender_evaluation.truth_files import check_files
 from unirender_reference.mesh_folder import MeshFile, mesh_folder
 from unirender_reference.recipe import read_recipe
 
@@ -252,6 +253,61 @@ def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) 
     assert light.provenance["file"] == "0.png"
     assert light.provenance["file_sha256"] == file_sha256(tmp_path / "lights" / "0.png")
     assert light.provenance["rule"].startswith("photograph")
+
+
+def checked(spec: SuiteSpec) -> None:
+    pool = light_sources(spec)
+    check_files(spec, suite_sources(spec), load_lights(spec, list(pool), pool))
+
+
+def test_links_to_folders_are_refused_and_files_of_one_thing_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """What is behind a link would be left out without a word; a copy counts as another object or light."""
+    write_meshes(tmp_path / "models", ["chairs/a.obj", "chairs/b.obj", "tables/c.obj"])
+    write_pictures(tmp_path / "lights", 3)
+    more = '[folders]\nobjects = "models"\nlights = "lights"\n[[meshes]]\nfiles = "chairs/*"\n[light_files]\n'
+    spec = spec_with(tmp_path, more, objects="[]", ceiling_scenes="[]", bundled_lights="0", procedural_lights="[]")
+    (tmp_path / "models" / "tables" / "more").symlink_to(tmp_path / "models" / "chairs")
+    (tmp_path / "models" / ".hidden").mkdir()
+    (tmp_path / "models" / ".hidden" / "more").symlink_to(tmp_path)
+    checked(spec)  # no link where files of the pattern are
+    assert not caplog.messages
+    trimesh.load(tmp_path / "models" / "chairs" / "b.obj").export(tmp_path / "models" / "chairs" / "b.ply")
+    (tmp_path / "models" / "chairs" / "d.obj").write_bytes((tmp_path / "models" / "chairs" / "a.obj").read_bytes())
+    (tmp_path / "lights" / "copy.png").write_bytes((tmp_path / "lights" / "1.png").read_bytes())
+    checked(spec)
+    assert [message.partition(", and count as ")[::2] for message in caplog.messages] == [
+        (
+            f"suite 'tiny': {names}",
+            f"2 {kind}; leave all but one out (`without`)",
+        )
+        for names, kind in (
+            ("chairs/a.obj, chairs/d.obj: have the same content", "objects"),
+            ("chairs/b.obj, chairs/b.ply: look like one in several formats", "objects"),
+            ("1.png, copy.png: have the same content", "lights"),
+        )
+    ]
+    links = [tmp_path / "models" / "chairs" / "more", tmp_path / "lights" / "more"]
+    for link in links:
+        link.symlink_to(tmp_path / "models" / "tables")
+    with pytest.raises(UnirenderError) as refused:
+        checked(spec)
+    assert str(refused.value).splitlines()[1:] == [f"  {link}: copy the folder, or remove the link" for link in links]
+
+
+def test_a_truth_of_other_lights_is_kept(tmp_path: Path) -> None:
+    """As one of other meshes is: a light's file has the name of one that the truth was made under."""
+    path = write_suite(tmp_path)
+    repacked(path, {**load_suite(path).provenance, "lights": {"sun": {"file": "sun.exr", "file_sha256": "a"}}})
+    spec = read_spec(path)
+    for name, sha256 in (("sun.exr", "a"), ("moon.exr", "b")):
+        check_files(
+            spec, (), {"sun": SuiteLight(np.ones((8, 16, 3), np.float32), {"file": name, "file_sha256": sha256})}
+        )
+    changed = SuiteLight(np.ones((8, 16, 3), np.float32), {"file": "sun.exr", "file_sha256": "b"})
+    with pytest.raises(UnirenderError, match=r"ball\.tar: was made from other contents of sun\.exr; results on it"):
+        check_files(spec, (), {"sun": changed})
 
 
 @pytest.mark.parametrize(
@@ -483,3 +539,17 @@ def test_the_command_refuses_in_a_line(
         assert said in error
         assert "Traceback" not in error
     assert not list(tmp_path.iterdir())
+
+
+def test_every_file_that_cannot_be_used_has_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
+    for name in ("a.obj", "b.obj"):
+        (tmp_path / "models" / name).write_text("v 0 0 0\n")
+    path = spec_with(tmp_path, MESHES).path
+    path.write_text(suite_path("tiny").read_text() + MESHES)
+    with pytest.raises(SystemExit) as stopped:
+        main(["bench", "truth", str(path), "--work", str(tmp_path / "work")])
+    assert stopped.value.code == 1
+    error = capsys.readouterr().err.splitlines()
+    assert error[0].startswith("unirender: error: suite 'tiny': 2 of its meshes cannot be used")
+    assert [line.split(":")[0] for line in error[1:]] == ["  a.obj", "  b.obj"]

@@ -10,7 +10,7 @@ from tiny_models import SIZE, TRAIN
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.training.presets import ModelConfig
+from unirender.models.config import ModelConfig
 from unirender_evaluation import training_study_run
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record

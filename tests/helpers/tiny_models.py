@@ -8,9 +8,10 @@ from torch import Tensor
 from unirender.diffusion.schedule import make_scheduler
 from unirender.models.build import build_model
 from unirender.models.conditioning import Conditioning
+from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training.presets import LossConfig, ModelConfig, OptimizerConfig, TrainConfig
+from unirender.training.presets import LossConfig, OptimizerConfig, TrainConfig
 
 SIZE = 32
 

@@ -200,6 +200,15 @@ def test_sheets_hold_their_tiles_and_labels() -> None:
     assert (table[:, 10:30] < 100).any()  # the row's label
 
 
+def test_captions_are_broken_between_words_not_cut() -> None:
+    tile, line = np.ones((10, 80, 3), np.float32), LIGHT.line
+    low, high = (captioned_sheet([tile, tile], [words, "a"], 2) for words in ("twins", "train, CC0, twins studio"))
+    assert high.height == low.height + line  # two lines instead of one
+    under = np.asarray(high)[-line:, : 80 + LIGHT.gap]
+    assert (under < 100).any()  # the last words stand there
+    assert captioned_sheet([tile], ["w" * 99], 1).height == low.height  # one word has one line
+
+
 def test_tails_of_a_picture() -> None:
     """8 covered pixels: 2 above white (one only in blue), 1 black, the others 0.5; edges do not count."""
     image = np.zeros((3, 4, 4), np.float32)

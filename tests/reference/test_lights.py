@@ -460,8 +460,10 @@ def bad_file(tmp_path, name: str, data: bytes):
 
 
 def test_errors_say_what_to_do(tmp_path):
-    with pytest.raises(UnirenderError, match="no such file"):
+    with pytest.raises(UnirenderError, match=r"no such file, .*unirender lights --export FOLDER"):
         lights.load_light(tmp_path / "absent.hdr")
+    with pytest.raises(UnirenderError, match="is a folder, expected an HDR"):
+        lights.load_light(tmp_path)
     with pytest.raises(UnirenderError, match="not a readable picture"):
         lights.load_light(bad_file(tmp_path, "text.png", b"hello"))
     with pytest.raises(UnirenderError, match="not a readable"):

@@ -351,6 +351,7 @@ def test_obj_reasons(tmp_path, content, message):
         ("map_Kd C:/pictures/wood.jpg", "is an absolute path"),
         ("map_Kd http://example.org/a.png", "is a http address"),
         ("map_Pr nowhere.png", "texture 'nowhere.png' is missing"),
+        ("map_Kd skin.<UDIM>.png", "texture 'skin.<UDIM>.png' is a set of tiles, not read here"),
     ],
 )
 def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):

@@ -55,4 +55,6 @@ def test_command_line_is_checked(tmp_path: Path) -> None:
         small(tmp_path, roughness=None).run()
     with pytest.raises(UnirenderError, match=r"missing\.glb"):
         small(tmp_path, mesh=tmp_path / "missing.glb").run()
+    with pytest.raises(UsageError, match="--maps: of the procedural object, but --mesh"):
+        small(tmp_path, mesh=tmp_path / "missing.glb", maps=True).run()
     assert not list(tmp_path.iterdir())

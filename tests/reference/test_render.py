@@ -14,6 +14,7 @@ from unirender.errors import UnirenderError
 from unirender_reference import backend, materials, passes, scene
 from unirender_reference.adaptive import render_sample_to_floor
 from unirender_reference.lights import Light
+from unirender_reference.multiview import pose_towards
 from unirender_reference.render import (
     DIRECT_DEPTH,
     IMAGE_DEPTH,
@@ -326,15 +327,25 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.diag([-1.0, 1, 1, 1])),
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.full((4, 4), np.nan)),
         lambda r: SceneSpec(r.obj, Light("a", scenes.environment()), 0.5, 0.5, exposure_seed=-1),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, depth=1),  # black: light has to bounce once
+        lambda r: pose_towards(0, 100, r.camera),  # the picture would stand on its head
+        lambda r: pose_towards(float("nan"), 0, r.camera),
     ],
     ids=[
         *("roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"),
         *("scaled pose", "mirroring pose", "nan pose", "exposure seed"),
+        *("no bounce", "above the zenith", "nan azimuth"),
     ],
 )
 def test_bad_arguments_are_refused(renderer: Renderer, call: object) -> None:
     with pytest.raises(UnirenderError, match="expected"):
         call(renderer)  # type: ignore[operator] - a lambda of the list above
+
+
+def test_paths_without_an_end_are_mitsubas(renderer: Renderer) -> None:
+    """On a ball light bounces once."""
+    direct, endless = (renderer.image(scenes.environment(), 0.5, 0.0, 256, depth=depth).mean for depth in (2, -1))
+    np.testing.assert_allclose(direct.mean(), endless.mean(), rtol=0.01)
 
 
 def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(renderer: Renderer) -> None:

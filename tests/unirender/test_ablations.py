@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model
+from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.export import export_pipeline
 from unirender.training.losses import LossFunction
-from unirender.training.presets import PRESETS, LossConfig, ModelConfig
+from unirender.training.presets import PRESETS, LossConfig
 from unirender.training.source import ShardSource
 from unirender.training.trainer import RunConfig, Trainer
 

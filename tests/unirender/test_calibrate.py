@@ -18,7 +18,7 @@ from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.calibration import calibrated, check_lines
-from unirender.pipelines.editing import masked_mean
+from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.augment import Draw

@@ -27,6 +27,24 @@ def test_rays_go_through_the_centres_of_square_pixels() -> None:
     np.testing.assert_allclose(rays[..., 1] / -rays[..., 2], np.broadcast_to(y[:, None], (6, 10)), atol=1e-6)
 
 
+def test_a_calibration_projects_to_its_pixels() -> None:
+    """Points before the camera by the matrix K of COLMAP, and by the rays through those pixels."""
+    focal, height, width, center = 210.0, 120, 200, (93.5, 66.0)
+    camera = Camera.from_focal(focal, height, width, center)
+    points = np.random.default_rng(0).uniform([-0.4, -0.25, 1], [0.4, 0.25, 1.2], (50, 3))  # x right, y down, z forward
+    x, y = (focal * points[:, :2] / points[:, 2:] + center).T
+    rays = camera.rays(height, width).astype(np.float64)
+    for point, row, column in zip(points, y.astype(int), x.astype(int), strict=True):
+        across, up, back = rays[row, column]
+        middle = np.array([across, -up, -back]) * point[2] / -back
+        assert np.abs(middle - point).max() <= 0.5 / focal * point[2] + 1e-6  # half a pixel
+    assert camera.focal(height) == pytest.approx(focal, rel=1e-12)
+    assert Camera.from_focal(focal, height, width).principal == (0.5, 0.5)
+    for bad in (0.0, -3.0, math.nan, math.inf):
+        with pytest.raises(UnirenderError, match="expected numbers above 0"):
+            Camera.from_focal(bad, height, width)
+
+
 @pytest.mark.parametrize(("fov", "fill"), [(36, 0.9), (60, 0.5), (20, 1.0)])
 def test_sphere_fills_the_stated_share_of_the_frame(fov: float, fill: float) -> None:
     """Brute force: share of a dense column of rays that hits the sphere."""

@@ -1,6 +1,7 @@
 """Files that state another colour space than ours: pictures by an ICC profile, EXRs by chromaticities."""
 
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import OpenEXR
 import pytest
 from icc_profiles import P3_D50, SRGB_D50, grey_profile, matrix_profile
 from PIL import Image, ImageCms
+from PIL.PngImagePlugin import PngInfo
 
 from unirender.color import srgb_decode, srgb_encode
 from unirender.errors import UnirenderError
@@ -45,6 +47,26 @@ def test_a_picture_of_another_profile_is_converted(tmp_path: Path, primaries: np
 def test_a_picture_in_srgb_keeps_its_values(tmp_path: Path, profile: bytes | None) -> None:
     Image.fromarray(PIXELS).save(tmp_path / "a.png", icc_profile=profile)
     np.testing.assert_array_equal(np.round(read_picture(tmp_path / "a.png").image_srgb * 255), PIXELS)
+
+
+@pytest.mark.parametrize(
+    ("chunks", "told"),
+    [
+        ({b"gAMA": 100_000}, "gamma of 1 .*if they are linear, save the picture as EXR"),
+        ({b"gAMA": 55_556}, r"gamma of 0\.556 \(gAMA; sRGB: 0\.455\), and its values are taken as sRGB$"),
+        ({b"gAMA": 45_455}, None),
+        ({b"gAMA": 100_000, b"sRGB": 0}, None),  # which counts more
+    ],
+)
+def test_a_png_of_another_gamma_is_told(tmp_path: Path, chunks: dict[bytes, int], told: str | None) -> None:
+    more = PngInfo()
+    for name, value in chunks.items():
+        more.add(name, value.to_bytes(4 if name == b"gAMA" else 1, "big"))
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", pnginfo=more)
+    picture = read_picture(tmp_path / "a.png")
+    np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=1e-6)
+    assert told is None or re.search(told, picture.remarks["gamma"])
+    assert ("gamma" in picture.remarks) == (told is not None)
 
 
 def test_alpha_and_palettes_go_through_a_profile(tmp_path: Path) -> None:

@@ -13,7 +13,8 @@ from tiny_models import make_model
 from torch import Tensor
 
 from unirender.models.build import build_model
-from unirender.models.dual_stream import DualStreamModel, Encoded, pyramid_channels
+from unirender.models.dual_stream import DualStreamModel, Encoded
+from unirender.models.unet import pyramid_channels
 from unirender.training.presets import PRESETS
 
 
@@ -106,6 +107,17 @@ def test_rows_are_decoded_where_asked_for() -> None:
     torch.testing.assert_close(part.attributes, whole.attributes[1:], rtol=0, atol=1e-5)
     torch.testing.assert_close(part.image, whole.image[:2], rtol=0, atol=1e-5)
     assert model(a, i, t, t, extra_a, extra_i, image_rows=None).image is None
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("unified", [True, False])
+def test_an_output_is_a_mapping_of_what_was_predicted(unified: bool) -> None:
+    """As diffusers has it, for whom an output without entries is empty."""
+    model, _ = make_model(unified=unified, physics_prior="none")
+    extra, t = torch.zeros(2, 12, 16, 16), torch.tensor([500, 0])
+    out = model(torch.zeros(2, 72, 16, 16), torch.zeros(2, 12, 16, 16), t, t.flip(0), extra, extra, image_rows=None)
+    assert list(out.keys()) == ["attributes", "encoded_image"]
+    assert out[0] is out.attributes
 
 
 @torch.no_grad()

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -60,6 +61,19 @@ def test_pictures_of_a_result_are_for_the_eye(tmp_path: Path) -> None:
         np.testing.assert_allclose(pixels, expected, rtol=0, atol=0.501 / 255, err_msg=name)
 
 
+@pytest.mark.parametrize(("scale", "half"), [(1.0, True), (0.0, True), (1e6, False), (1e-7, False)])
+def test_radiance_of_any_scale_is_stored(tmp_path: Path, scale: float, half: bool) -> None:
+    """In half precision, 1e6 is infinite, and of 1e-7 one digit is left."""
+    light = np.random.default_rng(4).uniform(0.2, 1, (8, 8, 3)).astype(np.float32) * np.float32(scale)
+    write_result(tmp_path / "out", Intrinsics(specular=light, mask=np.ones((8, 8, 1), np.float32)), {}, light)
+    stored = read_result(tmp_path / "out").require("specular")["specular"]
+    np.testing.assert_allclose(stored, light, rtol=1e-3 if half else 0, atol=0)
+    channels = OpenEXR.File(str(tmp_path / "out/intrinsics.exr"), separate_channels=True).channels()
+    assert channels["specular.R"].pixels.dtype == (np.float16 if half else np.float32)
+    image, _ = read_exr(tmp_path / "out/image.exr")
+    np.testing.assert_allclose(image["R"], light[..., 0], rtol=1e-3 if half else 0, atol=0)
+
+
 def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with new_folder(out) as folder:
@@ -75,12 +89,14 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
         fail_half_way()
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    with pytest.raises(UnirenderError, match="--overwrite"), new_folder(out):
+    with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
         pass
     (out / "meta.json").unlink()
     with pytest.raises(UnirenderError, match=r"no meta\.json"), new_folder(out, overwrite=True):
         pass  # a folder that is no result is never replaced
     (tmp_path / "file").write_text("")
+    with pytest.raises(UnirenderError, match=r"choose another folder$"), new_folder(out):  # of a command without it
+        pass
     with pytest.raises(UnirenderError, match="is a file"), new_folder(tmp_path / "file"):
         pass
 

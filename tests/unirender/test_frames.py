@@ -74,6 +74,16 @@ def test_pictures_in_natural_order(tmp_path: Path) -> None:
         list_pictures(tmp_path / "out" / "a.gif")
 
 
+def test_a_cameras_files_are_listed_as_failed(tmp_path: Path) -> None:
+    Image.new("RGB", (12, 10)).save(tmp_path / "thumbnail.tiff")
+    for name in ("a.DNG", "b.cr2", "c.heic"):
+        (tmp_path / name).write_bytes((tmp_path / "thumbnail.tiff").read_bytes() if name != "c.heic" else b"ftypheic")
+    found = list_pictures(tmp_path)
+    failed = run(found, tmp_path / "out").failed
+    assert set(failed) == {"a.DNG", "b.cr2", "c.heic"}
+    assert all("a camera's raw file, expected PNG" in failed[name] for name in ("a.DNG", "b.cr2"))
+
+
 def test_one_bad_picture_is_listed_and_the_others_are_done(tmp_path: Path) -> None:
     good = [save(tmp_path / name) for name in ("a.png", "a.jpg", "c.png")]
     (tmp_path / "b.png").write_text("no picture")

@@ -12,7 +12,7 @@ from torch import Tensor
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.added import Answers
 from unirender.models.conditioning import coverage_of
-from unirender.models.dual_stream import DualStreamModel, pyramid_channels, pyramid_strides
+from unirender.models.dual_stream import DualStreamModel
 from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import (
     CELLS_WEIGHT,
@@ -23,6 +23,7 @@ from unirender.models.picture_encoder import (
     over_object,
     truth_of,
 )
+from unirender.models.unet import pyramid_channels, pyramid_strides
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
 from unirender.training.config_check import check_config

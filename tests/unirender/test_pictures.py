@@ -234,6 +234,41 @@ def test_what_a_picture_cannot_show_is_told(tmp_path: Path) -> None:
         read_input(tmp_path / "a.png", tmp_path / "mask.png")
 
 
+@pytest.mark.parametrize(
+    ("rows", "columns", "inverted", "told"),
+    [
+        ((3, 9), (3, 9), False, {}),
+        ((3, 9), (3, 9), True, {"inverted": "the mask holds all four corners of the frame, expected"}),
+        ((0, 10), (0, 6), True, {}),  # half of the frame
+        ((3, 6), (3, 8), False, {"small": "the object covers 15 pixels:"}),
+        ((3, 7), (3, 7), False, {}),
+        ((3, 4), (3, 4), False, {"small": "the object covers 1 pixel:"}),
+    ],
+)
+def test_a_mask_that_is_inverted_or_of_a_few_pixels_is_told(
+    rows: tuple[int, int], columns: tuple[int, int], inverted: bool, told: dict[str, str], tmp_path: Path
+) -> None:
+    Image.new("RGB", (12, 10), "grey").save(tmp_path / "a.png")
+    mask = np.zeros((10, 12), np.uint8)
+    mask[slice(*rows), slice(*columns)] = 255
+    Image.fromarray(255 - mask if inverted else mask).save(tmp_path / "m.png")
+    remarks = read_input(tmp_path / "a.png", tmp_path / "m.png")[1]
+    assert remarks.keys() == told.keys()
+    assert all(remarks[kind].startswith(text) for kind, text in told.items())
+
+
+def test_a_mask_on_its_side_is_told_of_the_exif_orientation(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (12, 10)).save(tmp_path / "a.jpg", exif=exif)
+    Image.new("L", (12, 10), 255).save(tmp_path / "m.png")
+    with pytest.raises(UnirenderError, match=r"12 x 10 pixels, expected 10 x 12 like the picture as its EXIF"):
+        read_input(tmp_path / "a.jpg", tmp_path / "m.png")
+    Image.new("L", (6, 5), 255).save(tmp_path / "m.png")
+    with pytest.raises(UnirenderError, match=r"6 x 5 pixels, expected 10 x 12 like the picture$"):
+        read_input(tmp_path / "a.jpg", tmp_path / "m.png")
+
+
 def test_lost_highlights_and_an_underexposed_object_are_told(tmp_path: Path) -> None:
     """By shares of the object, whatever lies behind it; a highlight of three percent shows the exposure."""
     clipped = {"clipped": "8% of the object's pixels are clipped"}

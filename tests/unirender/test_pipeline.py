@@ -1,5 +1,6 @@
 """The pipeline with an untrained model: shapes, sizes, seeds, anchoring, errors. Scores are the benchmark's task."""
 
+import inspect
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from accelerate import cpu_offload
+from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from PIL import Image
 from tiny_models import SIZE, make_pipeline
 
@@ -17,7 +20,7 @@ from unirender.diffusion import sampling
 from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.models.dual_stream import DualStreamModel
+from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.options import MOST_STEPS
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
@@ -26,13 +29,13 @@ from unirender.pipelines.editing import (
     SMALL_CHANGE,
     TRUST_WIDER,
     anchor,
-    constant_map,
     specular_for_roughness,
     specular_share,
     trust,
     under_light,
 )
 from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 
@@ -493,6 +496,22 @@ def test_diffusers_conventions(pipeline: UniRenderPipeline, tmp_path: Path) -> N
     assert np.abs(get(rough, "albedo") - get(first, "albedo")).mean() < 0.05
     with pytest.raises(UnirenderError, match="no pipeline folder"):
         UniRenderPipeline.from_pretrained(tmp_path / "missing")
+    with pytest.raises(AttributeError, match="no attribute UniRenderPipeline"):  # docs/model.md says so
+        DiffusionPipeline.from_pretrained(tmp_path)
+    part = DualStreamModel.from_pretrained(tmp_path, subfolder="dual_stream")
+    assert all(torch.equal(p, q) for p, q in zip(part.parameters(), pipeline.dual_stream.parameters(), strict=True))
+
+
+def test_offloaded_weights_give_the_same(pipeline: UniRenderPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
+    # accelerate makes an output anew, from a dict
+    monkeypatch.setattr(DualStreamOutput, "__init__", inspect.unwrap(DualStreamOutput.__init__))
+    offloaded = make_pipeline()
+    cpu_offload(offloaded.dual_stream, torch.device("cpu"))  # what `enable_sequential_cpu_offload` does
+    assert offloaded.device.type == "meta"
+    image, mask = picture()
+    first, second = (p.edit(image, mask, roughness=0.8) for p in (pipeline, offloaded))
+    np.testing.assert_array_equal(second.image_linear, first.image_linear)
+    np.testing.assert_array_equal(pipeline.render(scene()), offloaded.render(scene()))
 
 
 def test_the_folder_of_a_run_names_its_pipeline(tmp_path: Path) -> None:

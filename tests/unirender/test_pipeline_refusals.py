@@ -13,12 +13,13 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+from PIL import Image, ImageOps
 from tiny_models import SIZE, make_pipeline
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.inputs import as_picture
+from unirender.pipelines.inputs import as_list, as_picture
 from unirender.pipelines.settings import Sampling
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
@@ -81,10 +82,46 @@ def test_several_pictures_are_not_one(pipeline: UniRenderPipeline) -> None:
 def test_what_is_no_array_is_refused() -> None:
     with pytest.raises(UnirenderError, match="image: got str, expected a numpy array"):
         as_picture("mug.png", None)
+    with pytest.raises(UnirenderError, match=r"got Tensor, .*permute\(1, 2, 0\)"):
+        as_picture(torch.zeros(3, SIZE, SIZE), None)
     with pytest.raises(UnirenderError, match="mask: got str, expected a numpy array"):
         as_picture(picture()[0], "mask.png")
     with pytest.raises(UnirenderError, match=r"mask: .*divide an 8-bit mask by 255"):
         as_picture(picture()[0], 255 * picture()[1])
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((2, SIZE, SIZE, 3), "decompose_batch"),
+        ((3, SIZE, SIZE), "channels come last"),
+        ((SIZE, SIZE), "repeat grey"),
+        ((SIZE, SIZE, 1), "repeat grey"),
+        ((SIZE, SIZE, 4), "pass alpha as the mask"),
+    ],
+)
+def test_a_picture_of_another_shape_is_told_how_to_fit(shape: tuple[int, ...], words: str) -> None:
+    with pytest.raises(UnirenderError, match=rf"image: got shape .* expected \[height, width, 3\]; .*{words}"):
+        as_picture(np.zeros(shape, np.float32))
+
+
+def test_one_picture_is_no_batch() -> None:
+    one = Image.new("RGB", (SIZE, SIZE), "grey")
+    with pytest.raises(UnirenderError, match="masks: got one Image, expected a list, one for each picture"):
+        as_list("masks", one)
+    assert as_list("masks", (one, None)) == [one, None]
+
+
+def test_a_turned_photograph_is_said_to_be_so(caplog: pytest.LogCaptureFixture) -> None:
+    photograph = Image.new("RGB", (2 * SIZE, SIZE), "grey")
+    as_picture(photograph)
+    assert not caplog.records
+    photograph.getexif()[0x0112] = 6
+    as_picture(photograph)
+    assert "EXIF orientation (6) is not applied" in caplog.text
+    caplog.clear()
+    assert as_picture(ImageOps.exif_transpose(photograph))[0].shape == (2 * SIZE, SIZE, 3)
+    assert not caplog.records
 
 
 def test_a_number_of_samples_and_generators_must_fit() -> None:

@@ -24,12 +24,13 @@ from transformers import CLIPTextModel, CLIPTokenizer
 from unirender import cli
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.build import build_model
+from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
 from unirender.training.memory import readable, training_bytes
-from unirender.training.presets import PRESETS, LossConfig, ModelConfig, TrainConfig
+from unirender.training.presets import PRESETS, LossConfig, TrainConfig
+from unirender.training.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.training.start import begin_with_diffusion
 from unirender.training.trainer import RunConfig, Trainer
 

@@ -12,8 +12,10 @@ from tiny_models import SIZE, make_pipeline
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
-from unirender.pipelines.framing import Frame, divide, unit_normal
-from unirender.pipelines.tiling import TILED, add_detail, blend_tiles, tiles, window
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import divide, unit_normal
+from unirender.pipelines.tiling import TILED, add_detail, blend_tiles, tiles, tiles_of, window
+from unirender.remarks import frame_remarks
 
 TILE = 16
 SIZES = [(37, 91), (75, 50), (64, 64), (9, 40)]
@@ -187,3 +189,13 @@ def test_tiles_without_the_object_are_not_asked_for(monkeypatch: pytest.MonkeyPa
     mask[:SIZE, :SIZE] = 1
     pipeline.decompose(image, mask, tile=True, closed=False)
     assert rows == [1, 4]  # the whole picture; and of 49 tiles those that see the corner
+
+
+def test_many_tiles_are_told() -> None:
+    mask = np.zeros((800, 1000, 1), np.float32)
+    mask[:, :500] = 1
+    count = len(tiles_of(mask, 32))
+    assert count == len([tile for tile in tiles(800, 1000, 32) if tile.left < 500])
+    assert frame_remarks(mask, 32, tile=True)["tile"].startswith(f"--tile: {count} tiles of 32 pixels")
+    assert not frame_remarks(mask, 32, tile=False)
+    assert not frame_remarks(mask[:200], 32, tile=True)

@@ -78,7 +78,11 @@ def load_light(
     """
     path = Path(path)
     if not path.is_file():
-        raise UnirenderError(f"light {path}: no such file; expected an HDR, EXR, PFM, PNG or JPG file")
+        missing = "is a folder" if path.is_dir() else "no such file"
+        raise UnirenderError(
+            f"light {path}: {missing}, expected an HDR, EXR, PFM, PNG or JPG file (`unirender lights --export FOLDER` "
+            "writes the bundled ones)"
+        )
     if shape is not None:
         check_shape(shape)
     hdr = path.suffix.lower() in HDR_SUFFIXES

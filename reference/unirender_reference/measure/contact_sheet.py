@@ -27,7 +27,7 @@ class Sheet:
     objects: int = 8
     """Procedural objects; every second one has roughness, metallic and normal maps, the others one value each."""
     mesh: tuple[Path, ...] = ()
-    """Mesh files (GLB, glTF, OBJ, PLY) for more rows, with their own materials where they have some."""
+    """Mesh files (GLB, glTF, OBJ, PLY, STL, OFF) for more rows, with their own materials where they have some."""
     background: Literal["light", "dark"] = "light"
     """Neutral grey of the page, which the image is composited over."""
     resolution: int = 112
@@ -51,10 +51,13 @@ class Sheet:
             )
         if not self.out.absolute().parent.is_dir():
             raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into")
+        if self.out.suffix.lower() != ".png":
+            raise UsageError(f"--out {self.out}: expected the name of a PNG file, like {self.out.with_suffix('.png')}")
         check_file("--out", self.out)
+        specs = list(self.specs())  # a mesh that cannot be read is told before anything is rendered
         style = LIGHT if self.background == "light" else DARK
         rows, labels = [], []
-        for spec in self.specs():
+        for spec in specs:
             rows.append(buffer_tiles(render_sample(spec, self.spp), style.background))
             labels.append(_label(spec))
         write_file("--out", self.out, png_bytes(table_sheet(rows, labels, COLUMNS, style)))

@@ -38,7 +38,7 @@ class Passes:
     maps: bool = False
     """The procedural object with roughness, metallic and normal maps."""
     mesh: Path | None = None
-    """A mesh file (GLB, glTF, OBJ, PLY) in place of the procedural object."""
+    """A mesh file (GLB, glTF, OBJ, PLY, STL, OFF) in place of the procedural object."""
     light: Path | None = None
     """A lat-long EXR or HDR file, or a photograph, in place of the procedural light."""
     roughness: float | None = 0.3
@@ -66,6 +66,11 @@ class Passes:
         for name, value in (("roughness", self.roughness), ("metallic", self.metallic)):
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a value in [0, 1], or None for the object's own map")
+        if self.maps and self.mesh is not None:
+            raise UsageError(
+                "--maps: of the procedural object, but --mesh takes its place; for maps of its own: --roughness None "
+                "--metallic None"
+            )
         if self.out.is_dir() and any(self.out.iterdir()):
             raise UnirenderError(f"{self.out}: exists and is not empty, expected a new folder; choose another --out")
         with new_folder(self.out) as folder:

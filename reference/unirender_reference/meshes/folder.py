@@ -9,6 +9,8 @@ from trimesh.resolvers import Resolver
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.limits import check_bytes
 
+TILE_SETS = ("<UDIM>", "<UVTILE>")  # names of one picture for each square of texture coordinates
+
 
 class ModelFolder:
     """Reads the files that a model names, as long as they lie in its folder or in that of all meshes.
@@ -47,6 +49,8 @@ class ModelFolder:
             raise UnirenderError(f"{what} {shown!r} is a {scheme} address, expected a file in {self._where}")
         if spelled.startswith("/") or len(scheme) == 1:
             raise UnirenderError(f"{what} {shown!r} is an absolute path, expected a file in {self._where}")
+        if any(tiles in spelled.upper() for tiles in TILE_SETS):
+            raise UnirenderError(f"{what} {shown!r} is a set of tiles, not read here; bake them into one picture")
         try:
             path = (self.folder / spelled).resolve()
             if not any(path.is_relative_to(root) for root in self._roots):

@@ -63,7 +63,8 @@ class Optimize:
     mask: Path | None = None
     """Of one picture: its coverage (white: object). None: the alpha channel, else the whole frame."""
     fov: float | None = None
-    """Of one picture: vertical field of view in degrees. None: 36."""
+    """Of one picture: vertical field of view in degrees. None: as the header of an EXR of ours or the maps of --normal
+    say, else 36."""
     normal: Path | None = None
     """Of one picture: normals in camera axes: the output of `unirender decompose`, an EXR with normal.X/Y/Z, or a
     picture of (n + 1) / 2. None: those of --mesh, of --init, or a guess from the silhouette."""
@@ -112,6 +113,8 @@ class Optimize:
         """
         if not self.input.exists():
             raise UnirenderError(f"{self.input}: no such file or folder, expected posed pictures or one picture")
+        if self.input.suffix.lower() == ".json" and self.input.is_file():
+            raise UsageError(f"{self.input}: is a file of poses, expected its folder, {self.input.parent}")
         self.check()
         if self.init == "unirender" and predict is None:
             raise UnirenderError("--init unirender: no model at hand, expected the command line to bring one")

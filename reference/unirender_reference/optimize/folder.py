@@ -11,22 +11,27 @@ import json
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.camera import Camera
 from unirender.color import srgb_decode, srgb_encode, unpremultiply
+from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
+from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
 from unirender.files import new_folder, write_png
-from unirender.pictures import check_mask, read_mask, read_picture
+from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender_reference.meshes.images import area_means
 from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
 from unirender_reference.optimize.views import SATURATED, View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
+UNTURNED = "EXIF orientations of the pictures are not followed: poses count in the pixels as they are stored"
 LEAST_SHARE = 1e-6  # of a new pixel: less is rounding
 
 _log = logging.getLogger("unirender.optimize")
@@ -43,7 +48,8 @@ def read_views(
     """Reads a folder of posed pictures; poses stay in its units (`placement.placed` moves them).
 
     A picture needs a mask: the file that its `mask_path` names (white: object), else its alpha channel. PNG is straight
-    colour; EXR is linear and premultiplied by its own alpha channel.
+    colour; EXR is linear and premultiplied by its own alpha channel. EXIF orientations are not followed: poses count in
+    the pixels as they are stored.
 
     Args:
         folder: with `transforms.json` (or `transforms_train.json`).
@@ -53,8 +59,9 @@ def read_views(
         longest_side: larger pictures are reduced to this many pixels, by means of area in linear light.
 
     Raises:
-        UnirenderError: one sentence that names the file and what is wrong with it.
+        UnirenderError: one sentence that names the file, or the argument, and what is wrong with it.
     """
+    _check_arguments(up, hold_out, most_views, longest_side)
     folder = Path(folder)
     main = next((folder / name for name in SEEN_FILES if (folder / name).is_file()), None)
     if main is None:
@@ -80,20 +87,30 @@ def read_views(
     if len(hdr) > 1:
         raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
     linear = hdr.pop()
-    sizes: set[str] = set()
+    notices: set[str] = set()
     views = Views(
-        seen=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in seen),
-        held_out=tuple(_view(frame, folder, linear, up, longest_side, sizes) for frame in held_out),
+        seen=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in seen),
+        held_out=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in held_out),
         hdr=linear,
     )
-    for size in sorted(sizes):
-        _log.warning("%s: %s", main, size)
+    for notice in sorted(notices):
+        _log.warning("%s: %s", main, notice)
     try:
         views.require_light()
     except UnirenderError as error:
         raise UnirenderError(f"{folder}: {error}") from error
     _warn(views, [*seen, *held_out])
     return views
+
+
+def _check_arguments(up: Up, hold_out: int, most_views: int | None, longest_side: int | None) -> None:
+    if up not in get_args(Up):
+        raise UnirenderError(f"up: got {up!r}, expected one of {', '.join(get_args(Up))}")
+    if hold_out < 0 or hold_out == 1:
+        raise UnirenderError(f"hold_out: got {hold_out}, expected 2 or more, or 0 (those that the folder holds out)")
+    for name, value in (("most_views", most_views), ("longest_side", longest_side)):
+        if value is not None and value < 1:
+            raise UnirenderError(f"{name}: got {value}, expected 1 or more, or None (no limit)")
 
 
 def _warn(views: Views, frames: Sequence[Frame]) -> None:
@@ -115,17 +132,20 @@ def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
     return [frames[index * len(frames) // most] for index in range(most)]
 
 
-def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, sizes: set[str]) -> View:
-    """Reads one picture with its mask; a lens in pixels of another size is noted among `sizes`."""
-    image, mask, _ = read_picture_file(frame.file)
-    sizes |= frame.other_size(*image.shape[:2])
+def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, notices: set[str]) -> View:
+    """Reads one picture with its mask; what is due on the set as a whole goes to `notices`."""
+    picture = read_picture_file(frame.file, upright=False)
+    image, mask = picture.image, picture.mask
+    notices |= frame.other_size(*image.shape[:2])
+    if not linear and is_turned(frame.file):
+        notices.add(UNTURNED)
     if frame.mask is not None:
-        mask = read_mask(frame.mask, image.shape[:2])
+        mask = read_mask(frame.mask, image.shape[:2], upright=False)
     if mask is None:
         raise UnirenderError(
             f"{frame.file}: has no alpha channel, and its frame no mask_path; expected one of them (white: object)"
         )
-    pose = (Y_UP @ frame.pose if up == "z" else frame.pose).astype(np.float32)
+    pose = Y_UP @ frame.pose if up == "z" else frame.pose
     camera = frame.camera(*image.shape[:2])
     try:
         view = View(image, mask, camera, pose, name=Path(frame.values["file_path"]).as_posix())
@@ -134,37 +154,52 @@ def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | 
     return view if longest_side is None else reduced(view, longest_side, linear)
 
 
-def read_picture_file(
-    path: Path,
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None, bool]:
-    """Straight colour, the alpha channel, and whether it is linear radiance (EXR).
+@dataclass(frozen=True)
+class PictureFile:
+    """A picture as its file has it.
+
+    Attributes:
+        image: straight colour: display values in [0, 1], or linear radiance where `linear`.
+        mask: the alpha channel, or None.
+        linear: whether it is an EXR.
+        camera: that its header states (EXR files of ours do), or None.
+    """
+
+    image: Float[np.ndarray, "h w 3"]
+    mask: Float[np.ndarray, "h w 1"] | None
+    linear: bool
+    camera: Camera | None
+
+
+def read_picture_file(path: Path, *, upright: bool = True) -> PictureFile:
+    """Reads a picture; what is lost in it is logged. `upright` as of `read_picture`.
 
     Raises:
         UnirenderError: the file is missing, broken, or no picture.
     """
     if path.suffix.lower() == ".exr":
-        return *_linear_picture(path), True
-    picture = read_picture(path)
+        return _linear_picture(path)
+    picture = read_picture(path, upright=upright)
     for remark in picture.remarks.values():
         _log.warning("%s: %s", path, remark)
-    return picture.image_srgb, picture.mask, False
+    return PictureFile(picture.image_srgb, picture.mask, False, picture.camera)
 
 
-def _linear_picture(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"] | None]:
-    """Straight linear radiance and the alpha channel of an EXR."""
-    channels, _ = read_exr(path)
+def _linear_picture(path: Path) -> PictureFile:
+    """An EXR's straight linear radiance; what `negative_share` lets pass is 0."""
+    channels, attributes = read_exr(path)
     try:
         rgb = channels_rgb(channels)
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}; expected a picture") from error
-    alpha = channels.get("A")
-    values = rgb if alpha is None else np.concatenate([rgb, alpha[..., None]], axis=-1)
-    if not np.isfinite(values).all() or rgb.min() < 0:
-        raise UnirenderError(f"{path}: has negative, infinite or NaN values, expected radiance >= 0; repair them first")
-    if alpha is None:
-        return rgb, None
-    mask = check_mask(alpha[..., None], f"{path} (A)")
-    return unpremultiply(rgb, mask), mask
+    name = "A" if "A" in channels else "mask.Y"
+    alpha = channels.get(name)
+    check_finite(rgb if alpha is None else np.dstack([rgb, alpha]), str(path))
+    if negative := negative_share(rgb, str(path)):
+        _log.warning("%s: %.1g%% of the radiance is negative and was set to 0", path, 100 * negative)
+        rgb = np.maximum(rgb, 0)
+    mask = None if alpha is None else check_mask(alpha[..., None], f"{path} ({name})")
+    return PictureFile(rgb if mask is None else unpremultiply(rgb, mask), mask, True, header_camera(attributes))
 
 
 def reduced(view: View, longest_side: int, linear: bool) -> View:
@@ -234,7 +269,7 @@ def _written(view: View, folder: Path, index: int, linear: bool) -> dict[str, ob
         write_exr(folder / file, image_channels(rgba), half=False)
     else:
         write_png(folder / file, np.concatenate([view.image, view.mask], axis=-1))
-    focal = height / (2 * math.tan(math.radians(view.camera.fov_deg) / 2))
+    focal = view.camera.focal(height)
     x, y = view.camera.principal
     return {
         "file_path": file,

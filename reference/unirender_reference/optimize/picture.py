@@ -14,7 +14,7 @@ from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.display_files import stored_values
 from unirender.errors import UnirenderError
 from unirender.files import read_result
-from unirender.pictures import read_mask
+from unirender.pictures import checked_file, read_mask
 from unirender_reference.optimize.folder import read_picture_file, reduced
 from unirender_reference.optimize.state import rounded
 from unirender_reference.optimize.views import Step, View, Views
@@ -35,7 +35,7 @@ class PictureInput:
     Attributes:
         image: straight colour: display values in [0, 1], or linear radiance where `hdr`.
         mask: coverage.
-        camera: field of view; the principal point is the picture's middle.
+        camera: field of view and principal point.
         normal: unit vectors in camera axes, 0 outside the mask, or None.
         hdr: whether the picture is linear.
     """
@@ -59,7 +59,8 @@ def read_picture_input(
     Args:
         path: PNG, JPG, ... (display values) or EXR (linear, premultiplied).
         mask: picture of the coverage; None: the alpha channel, else the whole frame.
-        fov_deg: vertical; None: the contract's.
+        fov_deg: vertical; None: that of the camera that the picture's header states, or else of the one that the
+            normals were found with, or else the contract's.
         normal: a file for `read_normals`.
         longest_side: a larger picture is reduced to this many pixels, and normals of its size along with it; they may
             also have the reduced size.
@@ -68,25 +69,51 @@ def read_picture_input(
         UnirenderError: a file is unreadable or does not fit, or the picture is black or saturated where the mask covers
             it.
     """
-    image, alpha, hdr = read_picture_file(path)
+    picture = read_picture_file(path)
+    image, alpha, hdr = picture.image, picture.mask, picture.linear
     if mask is not None:
         alpha = read_mask(mask, (image.shape[0], image.shape[1]))
     if alpha is None:
         _log.warning("no mask and no alpha channel: the whole frame is taken as the object (--mask)")
         alpha = np.ones((*image.shape[:2], 1), np.float32)
-    if fov_deg is None:
-        _log.warning("field of view not given: %g degrees assumed (--fov)", DEFAULT_FOV_DEG)
-    full = View(image, alpha, Camera(DEFAULT_FOV_DEG if fov_deg is None else fov_deg), np.eye(4), path.name)
+    full = View(image, alpha, _camera(picture.camera, fov_deg, normal), np.eye(4), path.name)
     _require_light(full, hdr, path)
     view = full
     if longest_side is not None:
         view = reduced(full, longest_side, hdr)
-        view = dataclasses.replace(view, camera=dataclasses.replace(view.camera, principal=(0.5, 0.5)))
+        if full.camera.principal == Camera().principal:  # the middle stays the middle, without rounding
+            view = dataclasses.replace(view, camera=dataclasses.replace(view.camera, principal=full.camera.principal))
     normals = None
     if normal is not None:
         normals = _fitting_normals(normal, full, view, longest_side)
         check_axes(normals, view.mask, view.camera, normal)
     return PictureInput(view.image, view.mask, view.camera, normals, hdr)
+
+
+def _camera(stated: Camera | None, fov_deg: float | None, normal: Path | None) -> Camera:
+    """The picture's camera; what it was taken from is logged.
+
+    Args:
+        stated: by the picture's header, or None.
+        fov_deg: instead of the field of view that is stated, or None.
+        normal: where the normals come from, or None.
+    """
+    if fov_deg is not None:
+        return dataclasses.replace(stated or Camera(), fov_deg=fov_deg)
+    if stated is not None:
+        _log.warning("field of view of %g degrees, as the picture's header says (--fov)", stated.fov_deg)
+        return stated
+    if normal is not None and _has_maps(normal):
+        camera = read_result(normal, light=False).camera
+        _log.warning("field of view of %g degrees, as %s has it (--fov)", camera.fov_deg, normal)
+        return camera
+    _log.warning("field of view not given: %g degrees assumed (--fov)", DEFAULT_FOV_DEG)
+    return Camera()
+
+
+def _has_maps(normal: Path) -> bool:
+    """Whether normals are among the maps of a result folder or an EXR, which state a camera, or a picture."""
+    return normal.is_dir() or normal.suffix.lower() == ".exr"
 
 
 def _require_light(view: View, hdr: bool, path: Path) -> None:
@@ -161,12 +188,12 @@ def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
     Raises:
         UnirenderError: the file is unreadable or has no normals.
     """
-    if path.is_dir() or path.suffix.lower() == ".exr":
+    if _has_maps(path):
         normal = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False).normal
         if normal is None:
             raise UnirenderError(f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z")
         return normal
-    return 2 * stored_values(path)[..., :3] - 1
+    return 2 * stored_values(checked_file(path))[..., :3] - 1
 
 
 def unit_normals(

@@ -35,7 +35,7 @@ def optimize(
     views: Views,
     obj: MeshObject | None,
     config: OptimizeConfig,
-    out: Path | None = None,
+    out: str | Path | None = None,
     init: Solution | None = None,
     progress: Progress | None = None,
     place: Sphere | None = None,
@@ -64,6 +64,7 @@ def optimize(
         UnirenderError: the folder holds another run, all pictures are black, the masks do not bound an object that has
             no mesh, or what a stage says.
     """
+    out = None if out is None else Path(out)
     config.check()
     if init is not None and obj is not None:
         raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")

@@ -4,7 +4,8 @@
 
 Poses are camera to world with +x right, +y up and +z towards the viewer, as everywhere here. The field of view is
 `camera_angle_x` (radians, across the width) or the focal length `fl_x`, `fl_y` in pixels with `cx`, `cy`; each of them
-stands at the top or, for one picture, in its frame. Pixels count in a picture of `w` x `h`, where these are given.
+stands at the top or, for one picture, in its frame: a frame with a focal length or an angle of its own takes none from
+the top. Pixels count in a picture of `w` x `h`, where these are given.
 
 A frame is held out where it says `"held_out": true`, and where the file has nerfstudio's lists of a split: those of
 `val_filenames` and `test_filenames`, and with `train_filenames` all that these do not name.
@@ -12,6 +13,7 @@ A frame is held out where it says `"held_out": true`, and where the file has ner
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +31,11 @@ Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], np.fl
 SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp")  # tried where a path of a picture has none
 PINHOLE = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+DISTORTIONS = "distortion_params"  # nerfstudio's list of the same
+FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")  # each of them says how wide the lens is
 ASPECT_TOLERANCE = 0.01  # of the proportions: whole pixels
+ANGLE_TOLERANCE = 0.02  # of a focal length beside an angle, which may count a pixel more or less
 FOCAL_TOLERANCE = 0.002  # of fl_x and fl_y: less than a pixel at the edge of 800
 
 
@@ -71,10 +76,9 @@ class Frame:
         focal = self._focal(stated[1], stated[0]) * scale
         center = (self._number("cx", stated[1] / 2) * scale, self._number("cy", stated[0] / 2) * scale)
         try:
-            fov_deg = math.degrees(2 * math.atan(height / (2 * focal)))
-            return Camera(fov_deg, (center[0] / width, center[1] / height))
-        except (UnirenderError, ZeroDivisionError) as error:
-            raise UnirenderError(f"{self.name}: focal length {focal:g} pixels, expected more than 0") from error
+            return Camera.from_focal(focal, height, width, center)
+        except UnirenderError as error:
+            raise UnirenderError(f"{self.name}: {error}") from error
 
     def other_size(self, height: int, width: int) -> set[str]:
         """A sentence, if focal length or centre count in pixels of another size than the picture has."""
@@ -88,6 +92,8 @@ class Frame:
 
     def _focal(self, width: float, height: float) -> float:
         """In pixels of the stated size."""
+        sides = {"camera_angle_x": width, "camera_angle_y": height}
+        found = {key: self._focal_of_angle(key, side) for key, side in sides.items() if key in self.values}
         if "fl_x" in self.values or "fl_y" in self.values:
             focal_y = self._number("fl_y", self._number("fl_x", 0.0))
             focal_x = self._number("fl_x", focal_y)
@@ -96,17 +102,23 @@ class Frame:
                     f"{self.name}: fl_x {focal_x:g} and fl_y {focal_y:g}, expected one positive focal length (square "
                     "pixels); resample the picture"
                 )
+            for key, other in found.items():
+                if abs(other / focal_y - 1) > ANGLE_TOLERANCE:
+                    raise UnirenderError(
+                        f"{self.name}: focal length {focal_y:g} (fl_x, fl_y) and {key}, which makes it {other:g} "
+                        f"pixels in a picture of {width:g} x {height:g}, expected the same; leave the wrong one out "
+                        "(w and h are the size that fl_x counts in)"
+                    )
             return focal_y
-        sides = {"camera_angle_x": width, "camera_angle_y": height}
-        found = [self._focal_of_angle(key, side) for key, side in sides.items() if key in self.values]
         if not found:
             raise UnirenderError(f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y)")
-        if abs(found[0] / found[-1] - 1) > FOCAL_TOLERANCE:
+        of_x, of_y = next(iter(found.values())), list(found.values())[-1]
+        if abs(of_x / of_y - 1) > FOCAL_TOLERANCE:
             raise UnirenderError(
-                f"{self.name}: camera_angle_x and camera_angle_y make focal lengths of {found[0]:g} and {found[1]:g} "
+                f"{self.name}: camera_angle_x and camera_angle_y make focal lengths of {of_x:g} and {of_y:g} "
                 f"pixels in a picture of {width:g} x {height:g}, expected one (square pixels); leave one of them out"
             )
-        return found[0]
+        return of_x
 
     def _focal_of_angle(self, key: str, side: float) -> float:
         angle = self._number(key, 0.0)
@@ -115,15 +127,21 @@ class Frame:
         return side / (2 * math.tan(angle / 2))
 
     def _check_lens(self) -> None:
-        model = self.values.get("camera_model", "PINHOLE")
-        if model not in PINHOLE:
-            raise UnirenderError(f"{self.name}: camera_model {model!r}, expected a pinhole; undistort the pictures")
+        model = self.values.get("camera_model", PINHOLE[0])
+        if not isinstance(model, str) or model.upper() not in PINHOLE:
+            raise UnirenderError(
+                f"{self.name}: camera_model {model!r}, expected a pinhole ({', '.join(PINHOLE)}); undistort the "
+                "pictures, and say PINHOLE"
+            )
         fisheye = self.values.get("is_fisheye", False)
         if not isinstance(fisheye, bool):
             raise UnirenderError(f"{self.name}: is_fisheye is {fisheye!r}, expected true or false")
         if fisheye:
             raise UnirenderError(f"{self.name}: is_fisheye is true, expected a pinhole; undistort the pictures")
         bent = [key for key in DISTORTION if self._number(key, 0.0) != 0]
+        listed = self.values.get(DISTORTIONS, [])
+        if not isinstance(listed, list) or any(value != 0 for value in listed):
+            bent.append(DISTORTIONS)
         if bent:
             raise UnirenderError(
                 f"{self.name}: the lens is distorted ({', '.join(bent)} not 0), expected a pinhole camera; undistort "
@@ -177,13 +195,24 @@ def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits
     if mask is not None and not isinstance(mask, str):
         raise UnirenderError(f"{where}: mask_path is {mask!r}, expected the path of a picture")
     return Frame(
-        file=_picture_file(path.parent, entry["file_path"], where),
-        mask=None if mask is None else path.parent / mask,
+        file=_picture_file(path.parent, _written(entry["file_path"]), where),
+        mask=None if mask is None else path.parent / _written(mask),
         pose=_pose(entry, where),
         held_out=held_out,
-        values={**shared, **entry},
+        values=_lens(shared, entry),
         name=f"{where} ({entry['file_path']})",
     )
+
+
+def _lens(shared: Mapping[str, Any], own: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A frame's own keys over the shared ones; how wide the lens is, is said by one of both, never by half of each."""
+    said = FOCAL if any(key in own for key in FOCAL) else ()
+    return {**{key: value for key, value in shared.items() if key not in said}, **own}
+
+
+def _written(name: str) -> str:
+    """The path of a picture as this machine writes it: tools on Windows leave backslashes."""
+    return name if os.sep == "\\" else name.replace("\\", "/")
 
 
 def _picture_file(folder: Path, name: str, where: str) -> Path:

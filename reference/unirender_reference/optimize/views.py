@@ -25,7 +25,8 @@ class View:
             0): display values in [0, 1], or linear radiance of any scale if the views are `hdr`.
         mask: (h, w, 1) coverage, [0, 1].
         camera: vertical field of view and principal point.
-        pose: (4, 4) camera to world: columns are the camera's right, up, towards the viewer, and its position.
+        pose: (4, 4) camera to world: columns are the camera's right, up, towards the viewer, and its position. Stays
+            float64 if it is given so: a place far from the world's origin needs the digits.
         name: for messages and files.
         clipped: (h, w, 3) where a display value is only a lower bound; None: where it is 1. (Of a picture that was
             reduced: where any of the values was that a pixel is the mean of.)
@@ -42,7 +43,10 @@ class View:
         if not isinstance(self.camera, Camera):
             raise UnirenderError(f"{self.name}: got camera {self.camera!r:.40}, expected a unirender.camera.Camera")
         for label in ("image", "mask", "pose"):
-            object.__setattr__(self, label, as_numbers(f"{self.name}: {label}", getattr(self, label)))
+            numbers = as_numbers(f"{self.name}: {label}", getattr(self, label))
+            if label == "pose" and np.asarray(self.pose).dtype == np.float64:
+                numbers = np.asarray(self.pose)
+            object.__setattr__(self, label, numbers)
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.mask.shape != (*self.image.shape[:2], 1):
             raise UnirenderError(
                 f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
@@ -73,6 +77,9 @@ class Views:
     def __post_init__(self) -> None:
         if not self.seen:
             raise UnirenderError("views: got none, expected at least one picture with its camera")
+        for view in (*self.seen, *self.held_out):
+            if not isinstance(view, View):
+                raise UnirenderError(f"views: got a {type(view).__name__} among them, expected a View each")
         sizes = {view.image.shape: view.name for view in (*self.seen, *self.held_out)}
         if len(sizes) > 1:
             named = ", ".join(f"{width} x {height} ({name})" for (height, width, _), name in sorted(sizes.items()))

@@ -37,6 +37,9 @@ def infer_attributes(
     """Inverse rendering: p(attributes | image).
 
     Args:
+        model: the two streams.
+        conditioning: maps <-> latents, the model's own.
+        scheduler: of diffusers, as for `denoise`.
         image_linear: premultiplied, linear; clipped to [0, 1] as a camera does.
         mask: coverage.
         steps: of the scheduler.
@@ -89,6 +92,9 @@ def infer_image(
     """Rendering: p(image | attributes).
 
     Args:
+        model: the two streams.
+        conditioning: maps <-> latents, the model's own.
+        scheduler: of diffusers, as for `denoise`.
         maps: all maps; those not `given` may hold anything and are replaced by noise.
         given: which of the six pictures are known; the mask in `maps` always is.
         steps: of the scheduler.

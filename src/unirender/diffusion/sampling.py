@@ -14,7 +14,7 @@ apart than that, and what is amiss adds up over the steps: such steps are made h
 
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
@@ -24,7 +24,6 @@ from torch import Tensor
 from unirender.diffusion.schedule import last_timestep
 from unirender.errors import UnirenderError
 
-Mode = Literal["mean", "sample"]
 SAMPLE_STEPS = 20  # the paper's
 NUM_SAMPLES = 5
 MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timestep 0, where nothing is left to do

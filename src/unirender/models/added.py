@@ -25,7 +25,7 @@ class Answers:
     light: Float[Tensor, "b 3 eh ew"]
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Answers":
-        """The same of the rows, or in the form, that `change` makes of a tensor."""
+        """The answers with `change` made of each of their tensors: other rows, or another form."""
         return Answers(change(self.whole), change(self.cells), change(self.light))
 
 

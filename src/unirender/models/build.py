@@ -4,10 +4,10 @@ from torch import nn
 
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
+from unirender.models.config import ENVIRONMENT_SIZE, ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.packing import HDR_CURVES
 from unirender.models.split_streams import SplitDualStreamModel
-from unirender.training.presets import ENVIRONMENT_SIZE, ModelConfig
 
 
 def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[DualStreamModel, Conditioning]:

@@ -4,7 +4,10 @@ One stream denoises the intrinsic attributes, the other the RGB image. Every ski
 encoder is added, through a zero-initialised 1x1 convolution, to the other stream's decoder; both ways, and exchanged
 before either is fused. Each stream has its own timestep, so that one of them can be the clean condition of the other.
 
-Notation: `a` attribute stream, `i` image stream; a *feature pyramid* is the tuple of skips with the mid feature last.
+    x_0^a, x_0^i = f(x_t^a, x_t^i, t_a, t_i),    h_l^a <- h_l^a + Z_l h_l^i,    h_l^i <- h_l^i + Z'_l h_l^a
+
+Notation: a attribute stream, i image stream; h_l entry l of the *feature pyramid* (`unirender.models.unet`), which goes
+into the stream's decoder; Z, Z' zero convolutions.
 The path of this module is recorded by saved checkpoints: it never moves.
 """
 
@@ -27,6 +30,7 @@ from unirender.models.conditioning import coverage_of
 from unirender.models.light_encoder import LightEncoder
 from unirender.models.picture_encoder import PictureEncoder
 from unirender.models.picture_features import PictureFeatures
+from unirender.models.unet import pyramid_channels, pyramid_strides, unet_config
 
 ALL_ROWS = slice(None)
 FEATURES = ("none", "vgg16", "encoder")  # what a clean image enters through besides the image stream's own encoder
@@ -89,24 +93,6 @@ def zero_conv(in_channels: int, out_channels: int, kernel: int = 1) -> nn.Conv2d
     return conv
 
 
-def pyramid_channels(unet: UNet2DConditionModel) -> list[int]:
-    """Channels of the feature pyramid of a U-Net, in the order in which its encoder makes them; the mid is last."""
-    widths, layers = tuple(unet.config["block_out_channels"]), unet.config["layers_per_block"]
-    channels = [widths[0]]
-    for level, width in enumerate(widths):
-        channels += [width] * (layers + (level < len(widths) - 1))
-    return [*channels, widths[-1]]
-
-
-def pyramid_strides(unet: UNet2DConditionModel, patch: int) -> list[int]:
-    """Pixels of the picture, one way, for each pixel of the entries of the feature pyramid."""
-    levels, layers = len(tuple(unet.config["block_out_channels"])), unet.config["layers_per_block"]
-    strides = [patch]
-    for level in range(levels):
-        strides += [patch << level] * layers + [patch << level + 1] * (level < levels - 1)
-    return [*strides, patch << levels - 1]
-
-
 class DualStreamModel(ModelMixin, ConfigMixin):
     """Two `UNet2DConditionModel`s with zero-convolution cross connections.
 
@@ -116,6 +102,8 @@ class DualStreamModel(ModelMixin, ConfigMixin):
 
     _supports_gradient_checkpointing = True
     _no_split_modules: ClassVar[list[str]] = ["BasicTransformerBlock", "ResnetBlock2D"]
+    _repeated_blocks: ClassVar[list[str]] = ["BasicTransformerBlock"]
+    _skip_layerwise_casting_patterns: ClassVar[list[str]] = ["norm"]
 
     @register_to_config
     def __init__(
@@ -217,18 +205,18 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         if isinstance(i, Tensor):
             added = self.features_of(i, image_timestep, image_extra)
             i = self.encode(self.image_unet, i, image_timestep, context, image_extra, self.image_extra, added)
-        output = DualStreamOutput()
+        predicted = rendered = seen_attributes = seen_image = answers = None
         if attribute_rows is not None:
-            seen = output.encoded_image = i[attribute_rows]
-            output.attributes = self.decode(self.attribute_unet, a[attribute_rows], seen, self.image_to_attributes)
+            seen_image = i[attribute_rows]
+            predicted = self.decode(self.attribute_unet, a[attribute_rows], seen_image, self.image_to_attributes)
             if added and added.answers:
-                output.answers = added.answers.each(lambda x: x[attribute_rows])
+                answers = added.answers.each(lambda x: x[attribute_rows])
         if image_rows is not None:
-            seen = output.encoded_attributes = a[image_rows]
-            output.image = self.decode(self.image_unet, i[image_rows], seen, self.attributes_to_image)
+            seen_attributes = a[image_rows]
+            rendered = self.decode(self.image_unet, i[image_rows], seen_attributes, self.attributes_to_image)
             if image_prior is not None:
-                output.image = output.image + image_prior[image_rows]
-        return output
+                rendered = rendered + image_prior[image_rows]
+        return DualStreamOutput(predicted, rendered, seen_attributes, seen_image, answers)
 
     def context(
         self, attributes: Tensor | Encoded, image: Tensor | Encoded, light: Float[Tensor, "b 4 eh ew"] | None
@@ -315,36 +303,3 @@ class DualStreamModel(ModelMixin, ConfigMixin):
         if unet.conv_norm_out is not None and unet.conv_act is not None:
             hidden = unet.conv_act(unet.conv_norm_out(hidden))
         return unet.conv_out(hidden)
-
-
-def unet_config(widths: Sequence[int], layers: int, attention: Sequence[int], head_dim: int | Sequence[int]) -> dict:
-    """The part of a `UNet2DConditionModel` config that both streams share.
-
-    The mid block is diffusers' default, which attends over all its pixels: the environment, which is not aligned with
-    the picture's, reaches every one of them there, whichever levels have attention besides.
-
-    Args:
-        widths: channels of each level, the finest first.
-        layers: of each level.
-        attention: numbers of the levels that attend.
-        head_dim: channels of an attention head; or for each level how many heads it has.
-
-    Raises:
-        ValueError: a level that attends, or the lowest, has a width that is no multiple of `head_dim`.
-    """
-    levels = range(len(widths))
-    attending = {*attention, len(widths) - 1}  # the mid block has the lowest level's width and heads
-    heads = [width // head_dim for width in widths] if isinstance(head_dim, int) else list(head_dim)
-    if isinstance(head_dim, int) and any(width % head_dim for level, width in enumerate(widths) if level in attending):
-        raise ValueError(
-            f"block_out_channels {tuple(widths)}: levels with attention, and the lowest, whose width is the mid "
-            f"block's, must be multiples of head size {head_dim}"
-        )
-    return {
-        "block_out_channels": tuple(widths),
-        "layers_per_block": layers,
-        "down_block_types": tuple("CrossAttnDownBlock2D" if n in attention else "DownBlock2D" for n in levels),
-        "up_block_types": tuple("CrossAttnUpBlock2D" if n in attention else "UpBlock2D" for n in reversed(levels)),
-        # diffusers reads `attention_head_dim` as the number of heads (its own long-standing misnomer)
-        "attention_head_dim": tuple(max(1, count) for count in heads),
-    }

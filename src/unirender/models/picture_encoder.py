@@ -28,9 +28,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from unirender.models.added import Added, Answers
-from unirender.training.presets import ENCODER_SIDE
+from unirender.models.config import ENCODER_SIDE
 
-SIDE = ENCODER_SIDE  # pixels along each side of the picture that it sees
 WIDTHS, BLOCKS = (32, 64, 128, 256), (1, 2, 2, 2)  # channels and residual blocks of each stage, finest first
 GROUP = 16  # channels of a group of the normalisation
 HIDDEN = 384
@@ -152,7 +151,7 @@ class PictureEncoder(nn.Module):
 
 def shrink_of(resolution: int) -> int:
     """Pixels of a picture, one way, for each that the encoder sees."""
-    return max(1, resolution // SIDE)
+    return max(1, resolution // ENCODER_SIDE)
 
 
 def over_object(x: Float[Tensor, "n c h w"], coverage: Float[Tensor, "n 1 H W"]) -> Float[Tensor, "n moments"]:

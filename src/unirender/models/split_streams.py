@@ -10,11 +10,11 @@ import functools
 from typing import Any
 
 from diffusers.models.modeling_utils import ModelMixin  # noqa: F401 - by it diffusers knows that this module has models
-from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from unirender.models.dual_stream import ALL_ROWS, DualStreamModel, DualStreamOutput, Encoded
+from unirender.models.unet import remove_decoder
 
 
 class SplitDualStreamModel(DualStreamModel):
@@ -53,20 +53,12 @@ class SplitDualStreamModel(DualStreamModel):
         def rows_of(rows: slice) -> list[Any]:
             return [x if x is None else x[rows] for x in inputs]
 
-        found = DualStreamOutput()
+        inverse = rendered = DualStreamOutput()
         if attribute_rows is not None:
             inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
-            found.attributes, found.encoded_image = inverse.attributes, inverse.encoded_image
-            found.answers = inverse.answers
         if image_rows is not None:
             lit = None if light is None else light[image_rows]
             rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)
-            found.image, found.encoded_attributes = rendered.image, rendered.encoded_attributes
-        return found
-
-
-def remove_decoder(unet: UNet2DConditionModel) -> None:
-    """Takes the layers behind the mid block out of a U-Net."""
-    unet.up_blocks = nn.ModuleList()
-    unet.conv_norm_out, unet.conv_act = None, None
-    del unet.conv_out
+        return DualStreamOutput(
+            inverse.attributes, rendered.image, rendered.encoded_attributes, inverse.encoded_image, inverse.answers
+        )

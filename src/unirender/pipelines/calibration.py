@@ -12,7 +12,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.editing import constant_map, masked_mean
+from unirender.pipelines.masked_maps import constant_map, masked_mean
 
 NAMES = ("roughness", "metallic")
 

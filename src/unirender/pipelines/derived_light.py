@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import unit_normal
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
 

@@ -41,7 +41,7 @@ class DualStreamPipeline(DiffusionPipeline):
         calibration: lines by which predicted roughness and metallic are read (`unirender.pipelines.calibration`).
     """
 
-    model_cpu_offload_seq = "dual_stream"
+    model_cpu_offload_seq = "dual_stream->vae"
     _optional_components: ClassVar[list[str]] = ["vae"]
 
     def __init__(
@@ -118,7 +118,8 @@ class DualStreamPipeline(DiffusionPipeline):
         scheduler = copy.deepcopy(self.scheduler) if sampler is None else make_sampler(sampler, self.scheduler)
         if mode == "sample":
             check_scheduler(scheduler)
-        return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, self._progress)
+        device = self._execution_device  # not that of the weights, which an offloading pipeline keeps elsewhere
+        return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, device, self._progress)
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:
         return self.progress_bar(steps)  # pyright: ignore[reportAttributeAccessIssue] - diffusers' own

@@ -1,6 +1,7 @@
-"""The picture operations of an edit: the specular light of a new roughness, and anchoring to the input.
+"""The picture operations of an edit: s of a new roughness, s and d of another light, and anchoring to the input.
 
-Notation: s specular light, I the input, R_0 and R_1 the renders of the decomposition before and after the edit.
+Notation: s specular and d diffuse light, I the input, R_0 and R_1 the renders of the decomposition before and after the
+edit.
 """
 
 import numpy as np
@@ -151,13 +152,3 @@ def check_exposure(exposure: str) -> None:
     """
     if exposure not in ("auto", "keep"):
         raise UnirenderError(f"exposure: got {exposure!r}, expected 'auto' or 'keep'")
-
-
-def constant_map(value: Float[np.ndarray, "..."] | float, mask: Float[np.ndarray, "h w 1"]) -> np.ndarray:
-    """A number or a map as a map, 0 outside the mask."""
-    return (np.broadcast_to(np.asarray(value, dtype=np.float32), mask.shape) * (mask > 0)).astype(np.float32)
-
-
-def masked_mean(value: Float[np.ndarray, "h w 1"], mask: Float[np.ndarray, "h w 1"]) -> float:
-    """Coverage-weighted mean of a map."""
-    return float((value * mask).sum() / mask.sum())

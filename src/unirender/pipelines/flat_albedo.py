@@ -26,7 +26,8 @@ from unirender.color import srgb_decode, srgb_encode
 from unirender.composite import composite
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.closure import FLOOR, MAX_GAIN
-from unirender.pipelines.framing import Frame, divide
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import divide
 
 WEIGHT = 0.08 / 128  # w for each pixel along the square
 NEIGHBOURHOOD = 2 / 128  # of v: standard deviation of its Gaussian, in sides of the square

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
 from unirender.camera import Camera
-from unirender.intrinsics import SHORTEST_NORMAL, Intrinsics
+from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
+from unirender.pipelines.masked_maps import divide, unit_normal
 
-MIN_COVERAGE = 1e-3  # below it a resampled pixel carries no colour
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
@@ -107,11 +107,7 @@ class Frame:
 
     def camera(self, camera: Camera) -> Camera:
         """The same camera for the square."""
-        half = math.tan(math.radians(camera.fov_deg) / 2) * self.side / self.height
-        top, left = self.corner
-        x = (camera.principal[0] * self.width - left) / self.side
-        y = (camera.principal[1] * self.height - top) / self.side
-        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
+        return camera.of_square(*self.corner, self.side, self.height, self.width)
 
     def enter(self, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "s s c"]:
         """Picture -> square; for premultiplied pictures and coverage."""
@@ -217,14 +213,3 @@ def thumbnail(picture: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 
     """The display values of what is covered, at most `THUMBNAIL_SIDE` pixels a side."""
     height, width = (min(length, THUMBNAIL_SIDE) for length in mask.shape[:2])
     return resize(picture * mask, (height, width))
-
-
-def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
-    """Undoes a premultiplication; 0 where there is no coverage."""
-    return np.where(mask > MIN_COVERAGE, premultiplied / np.maximum(mask, MIN_COVERAGE), 0).astype(np.float32)
-
-
-def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Normals of length 1, also of those that `unirender.intrinsics.unit_normals` takes for unit ones; 0 stays 0."""
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.where(length > SHORTEST_NORMAL, normal / np.maximum(length, SHORTEST_NORMAL), 0).astype(np.float32)

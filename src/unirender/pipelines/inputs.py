@@ -1,6 +1,7 @@
 """What a user hands to the pipeline, checked: pictures, masks and intrinsics. Each error says what to do about it."""
 
-from collections.abc import Collection, Mapping
+import logging
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,23 +10,36 @@ from PIL import Image
 
 from unirender.display_files import display_colors, display_values
 from unirender.errors import UnirenderError
-from unirender.intrinsics import Intrinsics, as_numbers
+from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.lighting import as_light
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import bounced_light
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.editing import constant_map
 from unirender.pipelines.framing import thumbnail
+from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.results import Decomposition
+from unirender.pipelines.settings import TAKING_APART
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
-RANGE_TOLERANCE = 1e-3
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
-# of `decompose` alone, and their defaults
-TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
+RANGE_ADVICE = "divide 8 bits by 255 and 16 bits by 65535; tone-map or clip radiance"
+ORIENTATION, UPRIGHT = 0x0112, 1  # of EXIF: the tag, and its value for a picture that is not turned
+
+logger = logging.getLogger(__name__)
+
+
+def as_list(name: str, several: Any) -> list[Any]:
+    """What is handed in for several pictures, one by one.
+
+    Raises:
+        UnirenderError: a PIL picture, or something else that is one.
+    """
+    if not isinstance(several, Iterable):
+        raise UnirenderError(f"{name}: got one {type(several).__name__}, expected a list, one for each picture")
+    return list(several)
 
 
 def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
@@ -35,19 +49,28 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         UnirenderError: wrong type, shape or range, NaN, or an empty mask.
     """
     if isinstance(image, Image.Image):
+        if (turned := image.getexif().get(ORIENTATION, UPRIGHT)) != UPRIGHT:
+            logger.warning(
+                "image: its EXIF orientation (%s) is not applied; PIL.ImageOps.exif_transpose(image) turns it", turned
+            )
         values = display_colors(image, "image")
         picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):
         picture, alpha = image, None
     else:
-        raise UnirenderError(f"image: got {type(image).__name__}, expected a numpy array [h w 3] or a PIL picture")
+        raise UnirenderError(
+            f"image: got {type(image).__name__}, expected a numpy array [h w 3] or a PIL picture; a file is read by "
+            "unirender.pictures.read_picture(path), a tensor [3 h w] becomes an array by .permute(1, 2, 0).numpy()"
+        )
     if picture.ndim != 3 or picture.shape[-1] != 3:
-        raise UnirenderError(f"image: got shape {picture.shape}, expected [height, width, 3]; pass alpha as the mask")
+        raise UnirenderError(
+            f"image: got shape {picture.shape}, expected [height, width, 3]; {_shape_advice(picture.shape)}"
+        )
     if picture.dtype == np.uint8:
         raise UnirenderError("image: got uint8 values, expected floats in [0, 1]; divide by 255, or pass a PIL picture")
     if min(picture.shape[:2]) < MIN_SIDE:
         raise UnirenderError(f"image: got {picture.shape[:2]} pixels, expected at least {MIN_SIDE} along each side")
-    picture = _checked("image", picture, "tone-map it to display values, or clip it")
+    picture = _checked("image", picture, RANGE_ADVICE)
     if mask is None:
         mask = np.ones((*picture.shape[:2], 1), dtype=np.float32) if alpha is None else alpha
     return picture, as_mask(mask, (picture.shape[0], picture.shape[1]))
@@ -236,6 +259,16 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
         )
     given = _checked(name, given, "roughness and metallic are fractions")
     return constant_map(given.reshape(mask.shape if given.size != 1 else ()), mask)
+
+
+def _shape_advice(shape: tuple[int, ...]) -> str:
+    if len(shape) == 4:
+        return "several pictures go to `decompose_batch`"
+    if len(shape) == 2 or shape[-1] == 1:
+        return "repeat grey in three channels"
+    if len(shape) == 3 and shape[0] in (1, 3, 4):
+        return "channels come last: np.moveaxis(image, 0, -1)"
+    return "pass alpha as the mask"
 
 
 def _checked(name: str, value: np.ndarray, advice: str) -> Float[np.ndarray, "..."]:

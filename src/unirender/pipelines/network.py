@@ -47,6 +47,7 @@ class Network:
         conditioning: maps <-> latents.
         scheduler: of diffusers, with `prediction_type="sample"`.
         size: s, pixels along each side: the model's own, or another multiple of what it needs.
+        device: that computes; the weights may wait elsewhere (diffusers' offloading).
         progress: wraps the iteration over timesteps.
     """
 
@@ -54,6 +55,7 @@ class Network:
     conditioning: Conditioning
     scheduler: Any
     size: int
+    device: torch.device
     progress: Callable[[Iterable[Any]], Iterable[Any]]
 
     def attributes(
@@ -68,7 +70,6 @@ class Network:
         Returns:
             For each image the maps of each sample, or the mean of its looks, in physical units.
         """
-        device = self.model.device  # asked once: diffusers searches all modules for it, milliseconds
         looks = LOOKS[: how.looks]
         pictures = [{"image": image, "mask": mask} for image, mask in zip(images, masks, strict=True)]
         seen = [look.of(picture) for picture in pictures for look in looks]
@@ -76,8 +77,8 @@ class Network:
             self.model,
             self.conditioning,
             self.scheduler,
-            _batch([own["image"] for own in seen], how.count, device),
-            _batch([own["mask"] for own in seen], how.count, device),
+            _batch([own["image"] for own in seen], how.count, self.device),
+            _batch([own["mask"] for own in seen], how.count, self.device),
             steps=how.steps,
             generator=how.generators(len(images)),
             camera=_repeat([look.camera(camera) for camera in cameras for look in looks], how.count),
@@ -99,19 +100,18 @@ class Network:
             how: steps, samples and noise.
             derived: for each scene, which of its maps were derived from its light, without shadows; None: none.
         """
-        device = self.model.device
         flags = [[name in own for name in TRIPLETS] for own in derived or [()] * len(scenes)]
         image = infer_image(
             self.model,
             self.conditioning,
             self.scheduler,
-            {name: _batch([self._map(scene, name) for scene in scenes], how.count, device) for name in MAPS},
-            torch.tensor(_repeat([_given(scene) for scene in scenes], how.count), device=device),
+            {name: _batch([self._map(scene, name) for scene in scenes], how.count, self.device) for name in MAPS},
+            torch.tensor(_repeat([_given(scene) for scene in scenes], how.count), device=self.device),
             steps=how.steps,
             generator=how.generators(len(scenes)),
             camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
-            derived=torch.tensor(_repeat(flags, how.count), device=device),
+            derived=torch.tensor(_repeat(flags, how.count), device=self.device),
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
         return list(means.permute(0, 2, 3, 1).float().cpu().numpy())

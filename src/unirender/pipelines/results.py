@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.editing import constant_map, masked_mean
-from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import constant_map, masked_mean, unit_normal
 from unirender.pipelines.revealed_light import agreeing_light
 
 PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")

@@ -12,10 +12,9 @@ from unirender.diffusion.sampling import NUM_SAMPLES, Generators, is_whole, step
 from unirender.errors import UnirenderError
 from unirender.pipelines.looks import check_looks
 
-SETTINGS = (  # of `decompose`
-    *("camera", "mode", "num_inference_steps", "num_samples", "generator"),
-    *("sampler", "size", "looks", "tile", "material", "closed", "flat"),
-)
+# of `decompose`: how a picture is taken apart, and its default; and all
+TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
+SETTINGS = ("camera", "mode", "num_inference_steps", "num_samples", "generator", "sampler", "size", *TAKING_APART)
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
 

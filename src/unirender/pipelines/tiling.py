@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.framing import Frame, unit_normal
+from unirender.pipelines.framing import Frame
+from unirender.pipelines.masked_maps import unit_normal
 
 TILED = ("albedo", "normal")  # not s and d: a crop shows too little of what is lit to say how (docs/model.md)
 TILES_AT_ONCE = 16
@@ -53,11 +54,8 @@ class Tile:
         return np.pad(part, missing)
 
     def camera(self, camera: Camera, height: int, width: int) -> Camera:
-        """The camera of a picture of `height` x `width`, for the tile: the same rays through the same pixels."""
-        half = math.tan(math.radians(camera.fov_deg) / 2) * self.size / height
-        x = (camera.principal[0] * width - self.left) / self.size
-        y = (camera.principal[1] * height - self.top) / self.size
-        return Camera(fov_deg=math.degrees(2 * math.atan(half)), principal=(x, y))
+        """The camera of a picture of `height` x `width`, for the tile."""
+        return camera.of_square(self.top, self.left, self.size, height, width)
 
 
 def tiles(height: int, width: int, size: int) -> Iterator[Tile]:
@@ -65,6 +63,12 @@ def tiles(height: int, width: int, size: int) -> Iterator[Tile]:
     for top in _starts(height, size):
         for left in _starts(width, size):
             yield Tile(top, left, size)
+
+
+def tiles_of(mask: Float[np.ndarray, "h w 1"], size: int) -> list[Tile]:
+    """Those that show something of an object."""
+    height, width = mask.shape[:2]
+    return [tile for tile in tiles(height, width, size) if mask[tile.slices].any()]
 
 
 def _starts(length: int, size: int) -> list[int]:
@@ -97,7 +101,7 @@ def blend_tiles(
         predict: the network.
     """
     height, width = mask.shape[:2]
-    seen = [tile for tile in tiles(height, width, size) if mask[tile.slices].any()]
+    seen = tiles_of(mask, size)
     weight, total = window(size), np.zeros_like(mask)
     sums: list[dict[str, np.ndarray]] = []
     for first in range(0, len(seen), TILES_AT_ONCE):

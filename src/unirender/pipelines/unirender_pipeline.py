@@ -27,6 +27,7 @@ from unirender.pipelines.editing import anchor, check_exposure, specular_for_rou
 from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.inputs import (
     as_environment,
+    as_list,
     as_material,
     as_picture,
     check_decomposition,
@@ -82,8 +83,8 @@ class UniRenderPipeline(DualStreamPipeline):
         """Takes a picture apart into maps and light (inverse rendering).
 
         Args:
-            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (its EXIF orientation is
-                not looked at).
+            image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (an EXIF orientation is
+                not applied, and logged).
             mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
@@ -171,8 +172,8 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
         check_switches(tile=tile, closed=closed, flat=flat)
-        images_srgb = list(images_srgb)
-        masks = [None] * len(images_srgb) if masks is None else list(masks)
+        images_srgb = as_list("images_srgb", images_srgb)
+        masks = [None] * len(images_srgb) if masks is None else as_list("masks", masks)
         cameras = list_cameras(cameras, len(images_srgb))
         if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
             raise UnirenderError(
@@ -193,6 +194,7 @@ class UniRenderPipeline(DualStreamPipeline):
         found = decompose_views(
             network, views, how, material=material, closed=closed, flat=flat, tile=tile, calibration=lines
         )
+        self.maybe_free_model_hooks()
         made_with = {"looks": how.looks, "tile": bool(tile), "material": material}
         made_with |= {"closed": bool(closed), "flat": bool(flat)}
         return [
@@ -241,7 +243,9 @@ class UniRenderPipeline(DualStreamPipeline):
         check_switches(shadows=shadows)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator)
         network = self._network(mode, sampler, size)
-        return render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)[0]
+        (image,) = render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)
+        self.maybe_free_model_hooks()
+        return image
 
     def overflow(self, intrinsics: Intrinsics, *, shadows: bool = True) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
@@ -393,7 +397,9 @@ class UniRenderPipeline(DualStreamPipeline):
         # Both renders see the same noise, so that it cancels in what changes.
         seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
         first, second = (Sampling.of(**settings, generator=own) for own in same_noise(seed, 2))
-        (after,) = render_any_size(network, [edited], first, self._report_overflow, derived)
-        if not anchored:
-            return after
-        return anchor(srgb_decode(picture) * cover, render_any_size(network, [before], second)[0], after)
+        (image,) = render_any_size(network, [edited], first, self._report_overflow, derived)
+        if anchored:
+            (unedited,) = render_any_size(network, [before], second)
+            image = anchor(srgb_decode(picture) * cover, unedited, image)
+        self.maybe_free_model_hooks()
+        return image

@@ -195,7 +195,7 @@ def readings(
 
     from unirender.color import image_srgb, unpremultiply
     from unirender.pipelines.calibration import NAMES
-    from unirender.pipelines.editing import masked_mean
+    from unirender.pipelines.masked_maps import masked_mean
     from unirender.training.augment import from_maps
     from unirender.training.presets import Augmentation
 

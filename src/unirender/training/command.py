@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.models.config import ENVIRONMENT_SIZE
 from unirender.option_checks import check_seed, usage
 from unirender.options import Device, DType
 from unirender.paths import cache_dir
 from unirender.training.config_check import check_config
-from unirender.training.presets import ENVIRONMENT_SIZE, TrainConfig, get_preset
+from unirender.training.presets import TrainConfig, get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:

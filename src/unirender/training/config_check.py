@@ -5,7 +5,8 @@ import operator
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender.training.presets import ENCODER_SIDE, TrainConfig
+from unirender.models.config import ENCODER_SIDE
+from unirender.training.presets import TrainConfig
 
 
 @dataclass(frozen=True)

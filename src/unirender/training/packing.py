@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
+from unirender.models.config import ENVIRONMENT_SIZE
 from unirender.training.environments import turned_environments
 from unirender.training.members import (
     ADVICE,
@@ -20,7 +21,6 @@ from unirender.training.members import (
     vary_of,
 )
 
-ENVIRONMENT_SIZE = (16, 32)  # the environment that the model predicts
 SCALAR_CHANNELS = 7  # of shared maps without roughness and metallic
 
 _INTERPOLATED = "interpolated"  # attribute of pictures whose noise may be below 0

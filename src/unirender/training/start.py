@@ -13,16 +13,16 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 
 from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
+from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.picture_features import PictureFeatures, read_vgg
 from unirender.models.split_streams import SplitDualStreamModel
-from unirender.models.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.notices import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.beginning import Beginning, beginning
 from unirender.training.export import read_history
-from unirender.training.presets import ModelConfig
+from unirender.training.stable_diffusion import StableDiffusion, load_stable_diffusion
 from unirender.training.trainer import Trainer
 from unirender.training.widening import can_widen, widened
 

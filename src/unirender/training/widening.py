@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
+from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
-from unirender.training.presets import ModelConfig
 
 REPEATED_NOISE = 0.02  # of the deviation of a weight: on what a new channel repeats
 LEAVING_NOISE = 0.1  # of the deviation of a weight: what leaves a new channel

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 from posed_views import painted_view, painted_views
 
 from unirender.camera import Camera
@@ -19,8 +19,10 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender_reference.optimize.folder import read_views, reduced, write_views
 from unirender_reference.optimize.losses import ImageLoss
+from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.state import fingerprint
 from unirender_reference.optimize.views import View, Views
+from unirender_reference.shapes import Sphere
 
 
 def same_views(a: Views, b: Views, tolerance: float) -> None:
@@ -90,6 +92,62 @@ def test_focal_length_counts_in_pixels_of_the_stated_size(folder: Path, caplog: 
         caplog.text.count("pictures are 16 x 12, w and h say 32 x 24: focal lengths and cx, cy are multiplied by 0.5")
         == 1
     )
+
+
+def test_a_frame_with_an_angle_of_its_own_takes_no_focal_length_from_the_top(folder: Path):
+    views = read_views(folder)
+
+    def other_at_the_top(content: dict) -> None:
+        content.update(fl_x=99.0, camera_angle_y=1.5)
+        for frame in content["frames"]:
+            focal = frame.pop("fl_x")
+            del frame["fl_y"]
+            frame["camera_angle_x"] = 2 * math.atan(16 / (2 * focal))
+
+    same_views(views, read_views(edited(folder, other_at_the_top)), 0.0)
+
+
+def test_a_focal_length_beside_its_angle_is_the_same_camera(folder: Path):
+    """instant-ngp's converter writes both."""
+    views = read_views(folder)
+
+    def both(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["camera_angle_x"] = 2 * math.atan(16 / (2 * frame["fl_x"]))
+
+    same_views(views, read_views(edited(folder, both)), 0.0)
+
+
+def test_what_nerfstudio_says_of_a_straight_lens_is_taken(folder: Path):
+    views = read_views(folder)
+    straight = {"camera_model": "pinhole", "distortion_params": [0, 0.0, 0, 0, 0, 0]}
+    same_views(views, read_views(edited(folder, lambda content: content.update(straight))), 0.0)
+
+
+def test_paths_with_the_backslashes_of_windows_are_found(folder: Path):
+    views = read_views(folder)
+
+    def of_windows(content: dict) -> None:
+        for frame in content["frames"]:
+            frame["file_path"] = frame["file_path"].replace("/", "\\")
+            frame["mask_path"] = ".\\" + frame["file_path"]
+
+    same_views(views, read_views(edited(folder, of_windows)), 0.0)
+
+
+def test_cameras_far_from_the_worlds_origin_keep_their_places(folder: Path):
+    """Places in metres of a national grid: float32 has steps of half a metre there."""
+    place = Sphere(np.array([5e5, 4e6, 1e2]), 1.0)
+    near = read_views(folder)
+
+    def moved(content: dict) -> None:
+        for frame in content["frames"]:
+            for row, offset in zip(frame["transform_matrix"], place.center, strict=False):
+                row[3] += offset
+
+    far = placed(read_views(edited(folder, moved)), place)
+    for given, found in zip(near.seen, far.seen, strict=True):
+        np.testing.assert_allclose(found.pose, given.pose, rtol=0, atol=1e-6)
 
 
 def test_pictures_without_suffix_in_the_layout_of_nerf_synthetic(folder: Path):
@@ -178,6 +236,42 @@ def test_reduced_pictures_keep_light_and_rays():
         np.testing.assert_allclose(other.camera.rays(*other.mask.shape[:2]).mean((0, 1))[:2], 0, atol=1e-6)
     twin = reduced(view, 30, linear=True)  # means of display values are another picture
     assert abs((srgb_decode(twin.image) * twin.mask).mean() / light - 1) > 0.05
+
+
+def test_a_little_negative_radiance_is_zero_and_told(folder: Path, caplog: pytest.LogCaptureFixture):
+    """As of every command that reads a picture: a filter's ringing is no reason to refuse it."""
+    rgba = np.ones((12, 16, 4), np.float32)
+    for index in range(4):
+        rgba[5, 5, :3] = -0.1 * index
+        write_exr(folder / f"images/{index}.exr", image_channels(rgba))
+    edited(folder, lambda content: [f.update(file_path=f"images/{i}.exr") for i, f in enumerate(content["frames"])])
+    with caplog.at_level(logging.WARNING, "unirender"):
+        views = read_views(folder)
+    assert views.seen[3].image[5, 5].max() == 0
+    assert caplog.text.count("of the radiance is negative and was set to 0") == 3
+
+
+def test_poses_count_in_the_pixels_as_they_are_stored(folder: Path, caplog: pytest.LogCaptureFixture):
+    """As in COLMAP, nerfstudio and instant-ngp: a phone's note how it was held turns neither picture nor mask."""
+    views = read_views(folder)
+    for orientation in (3, 6):  # upside down; on its side, which has other proportions
+        exif = Image.Exif()
+        exif[ExifTags.Base.Orientation] = orientation
+        for path in folder.glob("images/*.png"):
+            Image.open(path).save(path, exif=exif)
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "unirender"):
+            same_views(views, read_views(folder), 0.0)
+        assert caplog.text.count("EXIF orientations of the pictures are not followed") == 1
+
+
+@pytest.mark.parametrize(
+    "options", [{"hold_out": 1}, {"hold_out": -2}, {"most_views": 0}, {"longest_side": 0}], ids=lambda one: str(one)
+)
+def test_numbers_out_of_their_range_are_refused(folder: Path, options: dict[str, int]):
+    (name,) = options
+    with pytest.raises(UnirenderError, match=f"{name}: got .*, expected"):
+        read_views(folder, **options)  # pyright: ignore[reportArgumentType] - a number each
 
 
 def test_a_mean_with_a_clipped_value_is_a_lower_bound():
@@ -314,6 +408,12 @@ BAD = {
     "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
     "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
     "slightly oblong pixels": (first(fl_x=40.0, fl_y=39.8), "square pixels"),
+    "focal length against angle": (
+        first(camera_angle_x=1.2),
+        r"focal length 18\.\d+ \(fl_x, fl_y\) and camera_angle_x, which makes it 11\.\d+ pixels in a picture of 16",
+    ),
+    "camera model": (first(camera_model="FISHEYE624"), r"expected a pinhole \(PINHOLE, "),
+    "listed distortion": (first(distortion_params=[0.01, 0, 0, 0, 0, 0]), r"distorted \(distortion_params not 0\)"),
     "distortion": (first(k1=0.1), r"distorted \(k1 not 0\)"),
     "fisheye": (first(camera_model="OPENCV_FISHEYE"), "expected a pinhole"),
     "fisheye of instant-ngp": (broken(lambda content: content.update(is_fisheye=True)), "is_fisheye is true, expected"),
@@ -336,7 +436,7 @@ BAD = {
     "mask number": (first(mask_path=3), "mask_path is 3"),
     "cut picture": (cut, "not a readable picture"),
     "mixed kinds": (mixed, "has EXR beside other pictures"),
-    "negative radiance": (negative_exr, "2.exr: has negative, infinite or NaN"),
+    "negative radiance": (negative_exr, "2.exr: 100% of the radiance is negative"),
     "other size": (other_size, r"16 x 12 \(images/0003.png\), 32 x 24 \(images/0000.png\), expected one size"),
 }
 

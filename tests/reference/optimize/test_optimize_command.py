@@ -16,10 +16,11 @@ import tyro
 from optimizer_runs import rendered_views, truth
 from PIL import Image
 
+from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
-from unirender.files import read_result, write_png
+from unirender.files import read_result, write_png, write_result
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_reference.meshes import load_mesh_placed
 from unirender_reference.optimize.commands import Optimize
@@ -261,6 +262,9 @@ def test_wrong_command_lines_of_a_picture(tmp_path: Path):
     ):
         with pytest.raises(UsageError, match=message):
             command(tmp_path / "one.png", "--out", tmp_path / "out", *arguments).run()
+    (tmp_path / "transforms.json").write_text("{}")
+    with pytest.raises(UsageError, match="is a file of poses, expected its folder"):
+        command(tmp_path / "transforms.json", "--out", tmp_path / "out").run()
     with pytest.raises(UnirenderError, match="no such file or folder"):
         command(tmp_path / "two", "--up", "z", "--out", tmp_path / "out").run()
 
@@ -288,6 +292,27 @@ def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCa
     write_png(tmp_path / "flat.png", np.full((12, 16, 3), 0.5))
     with pytest.raises(UnirenderError, match=r"flat\.png: .* have no normal"):
         read_picture_input(tmp_path / "one.png", normal=tmp_path / "flat.png")
+
+
+def test_the_camera_is_that_of_the_header_or_of_the_normals(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """As `decompose` takes it; what it was taken from is told."""
+    rgba = np.full((12, 16, 4), 0.5, np.float32)
+    rgba[..., 3] = 1
+    camera, other = Camera(60.0, (0.4, 0.55)), Camera(50.0)
+    write_exr(tmp_path / "one.exr", image_channels(rgba), attributes={"camera": camera.describe()})
+    write_exr(tmp_path / "two.exr", image_channels(rgba))
+    normal = np.zeros((12, 16, 3), np.float32)
+    normal[..., 2] = 1
+    write_result(tmp_path / "maps", Intrinsics(normal=normal, mask=rgba[..., 3:], camera=other), {})
+    with caplog.at_level(logging.WARNING, "unirender"):
+        assert read_picture_input(tmp_path / "one.exr", normal=tmp_path / "maps").camera == camera
+        assert "60 degrees, as the picture's header says" in caplog.text
+        assert read_picture_input(tmp_path / "two.exr", normal=tmp_path / "maps").camera == other
+        assert f"50 degrees, as {tmp_path / 'maps'} has it" in caplog.text
+    given = read_picture_input(tmp_path / "one.exr", fov_deg=40.0, longest_side=8).camera
+    assert (given.fov_deg, given.principal) == (40.0, pytest.approx((0.4, 0.55)))
+    with pytest.raises(UnirenderError, match="gone: no such file"):
+        read_picture_input(tmp_path / "one.exr", normal=tmp_path / "gone")
 
 
 def test_normals_of_the_pictures_own_size_are_reduced_with_it(tmp_path: Path):

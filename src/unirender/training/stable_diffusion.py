@@ -26,7 +26,8 @@ from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
 from unirender.models.codec import KLCodec
 from unirender.models.diffusers_folder import load_tokenizer, load_weights, read_config, silent
-from unirender.models.dual_stream import DualStreamModel, unet_config
+from unirender.models.dual_stream import DualStreamModel
+from unirender.models.unet import unet_config
 from unirender.training.presets import PRESETS
 
 if TYPE_CHECKING:
