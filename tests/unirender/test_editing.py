@@ -13,13 +13,12 @@ from unirender.pipelines.editing import (
     ANCHOR_GAIN,
     LOBE_RATIO,
     anchor,
-    constant_map,
-    masked_mean,
     specular_for_roughness,
     too_coarse,
     trust,
     under_light,
 )
+from unirender.pipelines.masked_maps import constant_map, masked_mean
 
 
 def polished(roughness: float, light: np.ndarray) -> Intrinsics:
