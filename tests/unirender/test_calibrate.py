@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import diffusers
 import numpy as np
@@ -12,17 +14,20 @@ import torch
 from synthetic_shards import group_members, write_dataset, write_shard
 from tiny_models import MODEL, SIZE, TRAIN, make_pipeline
 
+from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
+from unirender.training.augment import Draw
 from unirender.training.calibrate import Calibrate, readings, write_calibrated
 from unirender.training.calibration_line import Line, fit
 from unirender.training.config import RunConfig
 from unirender.training.data import GroupDataset
 from unirender.training.facts import dataset_facts
+from unirender.training.groups import Pair
 from unirender.training.same_objects import object_of, objects_of
 from unirender.training.start import read_start
 from unirender.training.trainer import Trainer
@@ -80,6 +85,31 @@ def test_a_line_is_scored_on_objects_that_it_does_not_know() -> None:
     assert own < line.after
     assert fit(objects, 0.5 + 1e-6 * found, truth).slope == 0  # one number, in effect
     assert fit(objects, found, 1 - found).slope == 0  # more is never read as less
+
+
+def test_a_line_is_kept_where_it_gains_more_than_chance() -> None:
+    """By the paired 95 % interval: of a line without errors that of the squared errors before, over objects."""
+    found = np.linspace(0.1, 0.9, 30)
+    line = fit(np.arange(30), found, 0.25 + 0.5 * found)
+    squares = np.square(0.25 - 0.5 * found)
+    assert line.after == pytest.approx(0, abs=1e-12)
+    assert line.before == pytest.approx(squares.mean())
+    assert line.chance == pytest.approx(1.96 * np.std(squares) / math.sqrt(30), rel=1e-6)
+    for before, better in ((0.052, True), (0.050, False), (0.048, False)):
+        assert Line(0.5, 0.2, before, 0.049, chance=0.002).better == better, before
+
+
+def test_a_line_is_scored_by_values_in_their_range() -> None:
+    """As a pipeline reads by it: a line that is steep, for 0.4 and 0.6 are 0 and 1, says no more than 1 of 0.8."""
+    found, truth = np.tile([0.4, 0.6], 15), np.tile([0.0, 1.0], 15)
+    line = fit(np.arange(31), np.append(found, 0.8), np.append(truth, 1.0))
+    assert line.slope > 4
+    assert 31 * line.after < 0.5  # of 0.8 alone, it would be (5 x 0.8 - 2 - 1)^2 = 1
+
+
+def test_few_but_different_answers_have_a_slope() -> None:
+    found = 0.5 + 0.02 * np.tile([-1.0, 1.0], 15)  # twice the spread below which they are one number
+    assert fit(np.arange(30), found, 0.5 + 3 * (found - 0.5)).slope == pytest.approx(3)
 
 
 def test_every_object_counts_the_same() -> None:
@@ -201,6 +231,33 @@ def test_as_many_pictures_of_groups_of_any_kind(tmp_path: Path, checkpoint: Path
     assert objects_of(data)[0].tolist() == [0, 0, 1]
     assert found.shape == truth.shape == (6, 2)
     np.testing.assert_allclose(truth[:, 1], 0.2, atol=1e-3)
+
+
+def test_what_is_read_are_upright_pictures_of_natural_colours_as_they_are_shown(
+    data: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither turned nor with exchanged channels, and divided by coverage: an edge is no darker than the object."""
+    dataset, pipeline = GroupDataset(data), UniRenderPipeline.from_pretrained(checkpoint)
+    drawn, seen = [], []
+    augmented, decompose = GroupDataset.augmented, UniRenderPipeline.decompose_batch
+
+    def half_covered(self: GroupDataset, group: int, pair: Pair | None, draw: Draw) -> dict[str, np.ndarray]:
+        drawn.append(draw)
+        maps = augmented(self, group, pair, draw)
+        half = np.where(np.arange(SIZE) < SIZE / 2, np.float32(0.5), np.float32(1))[:, None, None]
+        return maps | {"image": maps["image"] * half, "mask": maps["mask"] * half}
+
+    def watched(self: UniRenderPipeline, images: list, masks: list, **options: Any) -> list:
+        seen.extend(images)
+        return decompose(self, images, masks, **options)
+
+    monkeypatch.setattr(GroupDataset, "augmented", half_covered)
+    monkeypatch.setattr(UniRenderPipeline, "decompose_batch", watched)
+    readings(pipeline, dataset, 2, 0)
+    assert len(drawn) == len(seen) == 20
+    assert all(draw.turns == 0 and tuple(draw.order) == (0, 1, 2) for draw in drawn)
+    whole = [image_srgb(augmented(dataset, group, None, draw)["image"]) for group, draw in enumerate(drawn[::2])]
+    np.testing.assert_allclose(seen[::2], whole, atol=1e-3)
 
 
 def test_one_object_under_several_names_counts_once(

@@ -18,7 +18,7 @@ from unirender.errors import UnirenderError
 from unirender.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
 from unirender.lighting import mean_radiance, resample_environment, rotate_environment
 from unirender.paths import cache_dir
-from unirender.surface_light import diffuse_light
+from unirender.surface_light import diffuse_light, specular_light
 from unirender.symmetries import turn_rotation
 from unirender.training.augment import (
     DEFAULT_AUGMENTATION,
@@ -196,6 +196,20 @@ def test_environment_rides_along_with_the_maps(dataset: GroupDataset) -> None:
         )
         wrong.append(diffuse_light(maps["normal"], maps["environment"][::-1]) * inside - maps["diffuse"])
     assert np.abs(wrong).max(axis=(1, 2, 3)).mean() > 3 * 0.03
+
+
+def test_specular_light_is_that_of_the_roughness_beside_it(dataset: GroupDataset) -> None:
+    """s derived from the sample's normals, roughness and environment, whatever its augmentation."""
+    for index in range(8):
+        maps = dataset.sample(index, 4, DEFAULT_AUGMENTATION)
+        inside = maps["normal"][..., 2] > 0.5
+        other = {0.4: 0.7, 0.7: 0.4}[round(float(maps["roughness"].max()), 2)]
+        error, twin = (
+            np.abs(specular_light(maps["normal"], roughness, maps["environment"]) - maps["specular"])[inside].mean()
+            for roughness in (maps["roughness"], other)
+        )
+        assert error < 0.02
+        assert twin > 0.05
 
 
 def test_metallic_of_a_mixture_needs_its_own_nodes(dataset: GroupDataset) -> None:

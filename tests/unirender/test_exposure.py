@@ -5,6 +5,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.exposure import TARGET_RANGE, draw_target, exposure_factor
+from unirender.pipelines.editing import RELIGHT_TARGET
 
 
 @pytest.fixture
@@ -42,6 +43,18 @@ def test_pixels_outside_the_mask_do_not_count(diffuse: np.ndarray, mask: np.ndar
     assert exposure_factor(changed, np.ones_like(mask), 0.7) != pytest.approx(
         exposure_factor(diffuse, mask, 0.7), rel=0.1
     )
+
+
+def test_pixels_count_by_half_their_coverage_or_not_at_all() -> None:
+    """d is not premultiplied: what is covered by more than half counts whole, a rim that is covered less does not."""
+    d, mask = np.full((1, 20, 3), 0.2, np.float32), np.full((1, 20, 1), 0.6, np.float32)
+    d[:, 10:], mask[:, 10:] = 5.0, 0.4
+    assert exposure_factor(d, mask, 0.8) == pytest.approx(0.8 / 0.2, rel=1e-5)
+    assert exposure_factor(d, mask + np.float32(0.2), 0.8) == pytest.approx(0.8 / 5.0, rel=1e-5)
+
+
+def test_a_light_from_elsewhere_is_brought_to_the_middle_of_the_range() -> None:
+    assert np.mean(TARGET_RANGE) == RELIGHT_TARGET == 0.75
 
 
 def test_targets_fill_their_range() -> None:

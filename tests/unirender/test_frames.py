@@ -127,6 +127,29 @@ def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path
     assert figures_of(tmp_path / "out" / "c.png", SETTINGS) is None
 
 
+def test_of_another_mask_the_result_is_another(tmp_path: Path) -> None:
+    picture, mask = save(tmp_path / "a.png"), tmp_path / "mask.png"
+    for columns, kept, failed in ((4, 0, False), (4, 1, False), (8, 0, True)):
+        values = np.zeros((10, 12), np.uint8)
+        values[:, :columns] = 255
+        Image.fromarray(values).save(mask)
+        found = run([picture], tmp_path / "out", masks=mask)
+        assert (found.kept, bool(found.failed)) == (kept, failed), columns
+
+
+def test_another_place_or_machine_is_no_other_setting(tmp_path: Path) -> None:
+    """Nor is a setting that an older result does not name, at the value which it then had."""
+    picture = save(tmp_path / "a.png")
+    run([picture], tmp_path / "out", settings=SETTINGS | {"device": "cpu"})
+    moved = tmp_path / "elsewhere" / "a.png"
+    moved.parent.mkdir()
+    picture.rename(moved)
+    found = run([moved], tmp_path / "out", settings=SETTINGS | {"device": "cuda", "looks": 1, "flat": False})
+    assert (found.kept, found.failed) == (1, {})
+    more = run([moved], tmp_path / "out", settings=SETTINGS | {"device": "cuda", "looks": 4, "flat": False})
+    assert "another looks" in more.failed["a.png"]
+
+
 @pytest.mark.parametrize("name", ["intrinsics.exr", "environment.exr", "normal.png"])
 def test_a_damaged_result_is_made_again(name: str, tmp_path: Path) -> None:
     pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
@@ -182,6 +205,9 @@ def test_masks_of_a_folder(tmp_path: Path) -> None:
     assert list(found.figures) == ["a.png"]
     assert "has 0 masks for b.png" in found.failed["b.png"]
     assert np.asarray(Image.open(tmp_path / "out" / "a.png" / "mask.png")).mean() == pytest.approx(255 * 5 / 12)
+    Image.fromarray(255 - values).save(tmp_path / "masks" / "a.png")
+    with pytest.raises(UnirenderError, match=r"has 2 masks for a\.png"):
+        mask_of(pictures[0], tmp_path / "masks")
 
 
 def test_batches_are_bounded() -> None:

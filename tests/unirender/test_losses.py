@@ -11,6 +11,7 @@ from tiny_models import MODEL, make_batch, make_model
 from torch import Tensor
 
 from unirender.camera import Camera
+from unirender.diffusion import inference
 from unirender.diffusion.inference import infer_attributes
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
@@ -19,6 +20,8 @@ from unirender.models.codec import KLCodec
 from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
+from unirender.training import consistency as consistency_module
+from unirender.training import loss_terms
 from unirender.training.config import LossConfig
 from unirender.training.consistency import Consistency
 from unirender.training.loss_terms import Errors, compressed, timestep_weights
@@ -102,6 +105,11 @@ def test_background_counts_little() -> None:
     assert float(terms["environment"]) == pytest.approx(outside / (outside + inside), rel=1e-5)
 
 
+def test_a_pixel_counts_by_its_coverage() -> None:
+    weights = Errors(loss_function().conditioning, background=0.2).pixel_weights(torch.tensor([[[[0.0, 0.5, 1.0]]]]))
+    torch.testing.assert_close(weights.flatten(), torch.tensor([0.2, 0.6, 1.0]))
+
+
 def test_an_image_error_is_compressed_row_by_row() -> None:
     """E log(1 + e / E): a far larger error of one picture does not decide the gradient of all."""
     error = torch.tensor([1e-8, 1e-3, 10.0], dtype=torch.float64, requires_grad=True)
@@ -139,6 +147,24 @@ def test_albedo_and_light_are_compressed_picture_by_picture_and_nothing_else_is(
         assert float(terms[name]) == float(plain[name]) > 0.05
     floored, squared = (values(loss_function(colour_floor=floor), inverse()) for floor in (0.02, 0.0))
     assert floored["albedo"] < squared["albedo"]
+
+
+def test_compressed_errors_are_weighted_by_timestep_too() -> None:
+    errors = Errors(loss_function().conditioning, background=0.02)
+    mask, clean, rows = make_batch()["mask"], torch.zeros(4, 72, 16, 16), torch.tensor([1.0, 2.0, 0.0, 5.0])
+    predicted = clean + torch.linspace(0.1, 0.5, 4)[:, None, None, None]
+    for found, alone in (
+        (
+            errors.image(predicted[:, :12], clean[:, :12], mask, rows, 0.02),
+            lambda x, m: errors.image(x, 0 * x, m, None, 0.02),
+        ),
+        (
+            errors.attributes(predicted, clean, mask, rows, 0.02)["albedo"],
+            lambda x, m: errors.attributes(x.repeat(1, 6, 1, 1), 0 * x.repeat(1, 6, 1, 1), m, None, 0.02)["albedo"],
+        ),
+    ):
+        each = [float(alone(predicted[i : i + 1, :12], mask[i : i + 1])) for i in range(4)]
+        assert float(found) == pytest.approx(sum(w * e for w, e in zip(rows.tolist(), each, strict=True)) / 4, rel=1e-5)
 
 
 def test_total_is_the_weighted_sum() -> None:
@@ -222,12 +248,13 @@ def test_each_row_is_weighted_by_its_own_timestep(kind: Literal["v", "min_snr"])
         assert float(error(slice(0, 2), weights)) == pytest.approx(by_hand, rel=1e-5)
         assert float(error(slice(0, 2), weights.flip(0))) != pytest.approx(by_hand, rel=1e-3)
     without = loss_function(cycle=0.0)
-    one = Timesteps(t.attributes[2:3], t.image[2:3])
     batch = {name: value[:1] for name, value in make_batch().items()}
-    weight = timestep_weights(kind, 5.0, loss.scheduler, one.attributes)
-    assert weight is not None
-    expected = {name: float(weight) * value for name, value in values(without, one, batch).items()}
-    assert values(loss, one, batch) == pytest.approx(expected, rel=1e-5)
+    for row in (0, 2):  # one of each direction
+        one = Timesteps(t.attributes[row : row + 1], t.image[row : row + 1])
+        weight = timestep_weights(kind, 5.0, loss.scheduler, one.attributes + one.image)
+        assert weight is not None
+        expected = {name: float(weight) * value for name, value in values(without, one, batch).items()}
+        assert values(loss, one, batch) == pytest.approx(expected, rel=1e-5)
     assert values(loss, inverse()) == values(without, inverse())  # pure noise: bit for bit
 
 
@@ -261,6 +288,21 @@ def test_cycle_value_is_the_rerendering_error_of_the_prediction() -> None:
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
 
+def test_the_cycle_takes_its_gradient_at_the_scale_of_the_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In float16 small ones would be 0 there, before the loss's own scale reaches them."""
+    scales: list[float] = []
+
+    def watched(loss: Tensor, inputs: list[Tensor], scale: float = 1.0) -> list[Tensor | None]:
+        scales.append(scale)
+        return loss_terms.gradients(loss, inputs, scale)
+
+    monkeypatch.setattr(consistency_module, "gradients", watched)
+    loss = loss_function(cycle_into_renderer=False)
+    loss.scale = 64.0
+    values(loss, inverse())
+    assert scales == [64.0]
+
+
 def test_cycle_can_be_off() -> None:
     assert "cycle" not in values(loss_function(cycle=0.0), inverse())
     waiting = loss_function()
@@ -271,6 +313,30 @@ def test_cycle_can_be_off() -> None:
 def consistency(loss: LossFunction) -> Consistency:
     errors = Errors(loss.conditioning, loss.config.background)
     return Consistency(loss.model, loss.conditioning, loss.scheduler, loss.config, errors)
+
+
+def test_the_cycle_asks_the_network_what_a_rendering_asks_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From pure noise at T, of clean attributes that are all known (paper Eq. 5); the noise itself is made zero."""
+    for module, name in ((consistency_module, "noise_like"), (inference, "draw_noise")):
+        monkeypatch.setattr(module, name, lambda x, *others: torch.zeros(x if isinstance(x, tuple) else x.shape))
+    loss, batch = loss_function(), make_batch()
+    attributes = loss.conditioning.encode_attributes(batch)
+    clean_i, given = loss.conditioning.encode_image(batch["image"]), torch.ones(4, len(TRIPLETS), dtype=torch.bool)
+    asked: list[list[Tensor]] = []
+    forward = loss.model.forward
+
+    def record(*args: Any, **kwargs: Any) -> DualStreamOutput:
+        asked.append([x for x in (*args, kwargs["image_prior"]) if isinstance(x, Tensor)])
+        return forward(*args, **kwargs)
+
+    monkeypatch.setattr(loss.model, "forward", record)
+    consistency(loss).cycle(attributes, clean_i, batch["mask"], generator())
+    maps = loss.conditioning.decode_attributes(attributes)
+    inference.infer_image(loss.model, loss.conditioning, loss.scheduler, maps, given)
+    in_training, in_use = asked
+    assert len(in_training) == len(in_use) == 7  # both streams and their timesteps, the extras of both, the prior
+    for one, other in zip(in_training, in_use, strict=True):
+        torch.testing.assert_close(one.detach(), other, rtol=0, atol=1e-4)
 
 
 def test_the_cycle_of_a_sample_is_that_of_a_sample() -> None:
@@ -378,6 +444,23 @@ def test_true_maps_of_a_closed_form_scene_have_no_composite_error(prior: str) ->
         assert (error > 1e-8) != blind, (name, error)
 
 
+def test_the_composite_is_compared_as_the_cycle_would_be() -> None:
+    """Its error is that of a network that renders the closed form, also where the object covers half of a pixel."""
+    each, batch = scene("composite")
+    mask = 0.5 * batch["mask"]
+    true, other = (
+        each.conditioning.encode_attributes(batch | {"mask": mask, "diffuse": k * batch["diffuse"]}) for k in (1, 0.5)
+    )
+    assert float(each.composite(true, 0.5 * batch["image"], mask)) < 1e-10
+    prior = each.conditioning.physics_prior
+    assert prior is not None
+    shown = prior.radiance(each.conditioning.decode_attributes(other), Camera()) * mask
+    rendered, seen = (each.conditioning.encode_image(image) for image in (shown, 0.5 * batch["image"]))
+    expected = float(each.errors.image(rendered, seen, mask))
+    assert float(each.composite(other, 0.5 * batch["image"], mask)) == pytest.approx(expected, rel=1e-4)
+    assert expected > 1e-3
+
+
 def test_composite_gradient_is_that_of_finite_differences() -> None:
     each, batch = scene("split_sum")
     true = each.conditioning.encode_attributes(batch).double()
@@ -433,7 +516,8 @@ def test_composite_counts_inverse_rows_only_and_is_off_by_default() -> None:
 
 
 def test_dropped_maps_reach_the_network_as_noise_only() -> None:
-    """With every droppable map withheld, the rendering does not depend on them."""
+    """With every droppable map withheld, the rendering does not depend on them: of a shape and its material alone."""
+    assert set(TRIPLETS) - set(DROPPABLE) == {"normal", "material"}
     batch = make_batch()
     for changed in (DROPPABLE, ("normal",), ("roughness",)):
         other = batch | {name: make_batch(seed=9)[name] for name in changed}

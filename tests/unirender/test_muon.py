@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
+from typing import Literal
 
 import pytest
 import torch
@@ -61,6 +62,14 @@ def test_all_directions_of_a_wide_matrix_learn_alike() -> None:
     assert after.max() < 1.25
 
 
+def test_five_steps_reach_singular_values_of_a_few_thousandths() -> None:
+    """In X / |X|; four steps would leave them at 0.4."""
+    singular = torch.logspace(math.log10(0.003), 0, 64)
+    after = orthogonal_factor(torch.diag(singular)[None])[0].diagonal()
+    assert after[singular > 0.003 * singular.norm()].min() > 0.65
+    assert after.max() < 1.25
+
+
 def test_zeros_stay_zeros() -> None:
     assert not orthogonal_factor(torch.zeros(1, 32, 64)).any()
 
@@ -94,6 +103,20 @@ def test_the_size_of_a_step_does_not_follow_from_that_of_the_gradient() -> None:
     for size in (1e-6, 1.0, 1e3):
         moved = stepped(nn.Parameter(torch.zeros(64, 256)), [size * gradient])
         assert moved.square().mean().sqrt() == pytest.approx(1e-2 * STEP_RMS, rel=0.2)
+
+
+def test_a_step_is_as_large_as_one_of_adamw() -> None:
+    """On gradients that are noise, so that both can have one learning rate: Liu et al. find 0.2 to 0.4."""
+    torch.manual_seed(0)
+    gradients = list(torch.randn(60, 64, 64))
+    muon = stepped(nn.Parameter(torch.zeros(64, 64)), gradients[-1:])
+    weight, before = nn.Parameter(torch.zeros(64, 64)), torch.zeros(64, 64)
+    adamw = torch.optim.AdamW([weight], 1e-2, weight_decay=0.0)
+    for gradient in gradients:
+        weight.grad, before = gradient, weight.detach().clone()
+        adamw.step()
+    sizes = [float(move.square().mean().sqrt()) for move in (muon, weight.detach() - before)]
+    assert 0.5 < sizes[0] / sizes[1] < 2
 
 
 def test_kernels_step_alike_however_they_lie_in_memory() -> None:
@@ -172,6 +195,20 @@ def test_a_state_is_restored() -> None:
         return layer.weight.detach()
 
     assert torch.equal(run(stop=True), run(stop=False))
+
+
+@pytest.mark.parametrize("kind", ["adamw", "muon"])
+def test_moments_and_decay_are_those_of_the_config(kind: Literal["adamw", "muon"]) -> None:
+    """After one step m = (1 - beta1) g and v = (1 - beta2) g^2; without a gradient a weight shrinks by rate x decay."""
+    layer = nn.Linear(40, 40)
+    config = OptimizerConfig(kind=kind, learning_rate=0.01, beta1=0.8, beta2=0.9, weight_decay=0.5)
+    optimizer, before = make_optimizer(layer, config), layer.weight.detach().clone()
+    layer.weight.grad, layer.bias.grad = torch.zeros(40, 40), torch.full((40,), 2.0)
+    optimizer.step()
+    torch.testing.assert_close(layer.weight.detach(), before * (1 - 0.01 * 0.5))
+    moments = optimizer.state[layer.bias]
+    torch.testing.assert_close(moments["exp_avg"], torch.full((40,), 0.2 * 2))
+    torch.testing.assert_close(moments["exp_avg_sq"], torch.full((40,), 0.1 * 2**2))
 
 
 def test_both_optimisers_follow_one_learning_rate() -> None:

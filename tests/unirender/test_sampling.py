@@ -175,6 +175,24 @@ def test_a_row_is_the_same_in_any_batch(name: str) -> None:
     assert float((among_image[1:2] - alone_image).abs().max()) > 1e-2  # the twin
 
 
+def test_both_directions_see_through_the_camera() -> None:
+    """One for all rows is the same for each; another one gives another answer."""
+    model, conditioning = make_model()
+    parts: tuple[Any, Any, Any] = (model, conditioning, make_scheduler())
+    batch, given = make_batch(2), torch.ones(2, 6, dtype=torch.bool)
+    near = Camera(fov_deg=80.0, principal=(0.3, 0.6))
+
+    def answers(camera: Any) -> tuple[Tensor, Tensor]:
+        seeds = (torch.Generator().manual_seed(1) for _ in range(2))
+        maps = infer_attributes(*parts, batch["image"], batch["mask"], generator=next(seeds), camera=camera)
+        return maps["normal"], infer_image(*parts, batch, given, generator=next(seeds), camera=camera)
+
+    default, one, each = answers(None), answers(near), answers([near] * 2)
+    for by_default, found, again in zip(default, one, each, strict=True):
+        assert torch.equal(found, again)
+        assert float((found - by_default).abs().max()) > 1e-3
+
+
 NETWORKS: dict[str, dict[str, Any]] = {
     "unified": {},
     "split": {"unified": False},

@@ -49,6 +49,22 @@ def test_a_gap_is_continued_and_a_smooth_map_is_read_as_it_is() -> None:
     np.testing.assert_allclose(turned(view[:, :, 0, 3]), -0.05, atol=2e-3)
 
 
+def test_beyond_an_end_that_leans_inwards_is_nothing_either() -> None:
+    """The rim is continued into the gap, at its corners too; the map's next value is the zero of the background."""
+    angle = -0.05 * np.arange(6) - 0.01 * np.arange(12)[:, None]
+    normal = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], -1).astype(np.float32)
+    there = np.ones((12, 6), bool)
+    there[:, 3:] = False
+    half = np.array([0.5], np.float32)
+    around = Surroundings(normal * there[..., None], there).of(EVERY)
+    edge = inside(around, half, 0 * half).reshape(3, 12, 3)[:, 2:-2, 2]
+    np.testing.assert_allclose(np.linalg.norm(edge, axis=0), 1, atol=0.01)
+    np.testing.assert_allclose(turned(edge), angle[2:-2, 2] - 0.025, atol=0.003)
+    for row, beyond in ((-1, 2), (0, 5), (1, 8)):
+        found = turned(around).reshape(12, 3, 9)[2:-2, 2, beyond]
+        np.testing.assert_allclose(found, angle[2 + row : 10 + row, 3], atol=0.003)
+
+
 def test_the_finest_level_is_the_map_and_coarser_ones_are_smoother() -> None:
     environment = (smooth_environment() + np.random.default_rng(2).random((32, 64, 3))).astype(np.float32)
     directions = random_directions(2000).astype(np.float32)

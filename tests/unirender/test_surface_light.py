@@ -15,6 +15,7 @@ from unirender.lighting import (
     sample_environment,
     texel_solid_angles,
 )
+from unirender.lobes import lobe_matrix
 from unirender.surface_light import SHARP_ROUGHNESS, diffuse_light, lobe_light, specular_light
 
 RNG = np.random.default_rng(4)
@@ -99,6 +100,57 @@ def test_no_energy_is_made(roughness: float) -> None:
     """Under uniform light a reflector of F = 1 gives back no more than it gets, at grazing angles too."""
     furnace = specular_light(sphere_normals(48), roughness, np.ones((64, 128, 3), dtype=np.float32))
     assert furnace.max() < 1.03
+
+
+@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.15, 0.3, 0.44, 0.5, 0.7, 1.0])
+def test_a_white_furnace_seen_from_ahead(roughness: float) -> None:
+    """Its closed form: with v = n, l is at twice the angle of h, so that f cos is D(theta / 2) G1(theta) / 4.
+
+    Where the lobe is sharp, samples and grid must make up the whole of it between them.
+    """
+    a2, theta = roughness**4, (np.arange(100_000) + 0.5) * (np.pi / 2 / 100_000)
+    d = a2 / (np.pi * (np.cos(theta / 2) ** 2 * (a2 - 1) + 1) ** 2)
+    g = 2 * np.cos(theta) / (np.cos(theta) + np.sqrt(a2 + (1 - a2) * np.cos(theta) ** 2))
+    expected = (d * g / 4 * 2 * np.pi * np.sin(theta)).mean() * np.pi / 2
+    ahead = np.array([[0, 0, 1]], np.float32)
+    found = lobe_light(ahead, ahead, roughness, np.ones((64, 128, 3), np.float32))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.02)
+    if roughness == 1:
+        assert expected == pytest.approx(1 - np.log(2), abs=1e-6)
+
+
+@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.15, 0.3])
+def test_a_sharp_reflector_gives_back_a_white_furnace(roughness: float) -> None:
+    normal = sphere_normals(16)[sphere_normals(16)[..., 2] > 0.5]
+    view = np.tile(np.array([0, 0, 1], np.float32), (len(normal), 1))
+    furnace = lobe_light(normal, view, roughness, np.ones((64, 128, 3), np.float32))
+    np.testing.assert_allclose(furnace, 1, rtol=0, atol=0.03)
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
+def test_the_light_of_a_point_does_not_depend_on_those_beside_it(roughness: float) -> None:
+    """Points of similar normals share the texels that they look at: none is left out that one of them sees."""
+    normal = random_directions(300).astype(np.float32)
+    normal[:, 2] = np.abs(normal[:, 2])
+    view = np.tile(np.array([0, 0, 1], np.float32), (300, 1))
+    environment = RNG.gamma(0.2, 1, (32, 64, 3)).astype(np.float32)
+    together = lobe_light(normal, view, roughness, environment)
+    for i in range(0, 300, 10):
+        alone = lobe_light(normal[i : i + 1], view[i : i + 1], roughness, environment)
+        np.testing.assert_allclose(together[i], alone[0], rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [0.1, 0.4, 1.0])
+def test_reflection_is_reciprocal(alpha: float) -> None:
+    """f(l, v) = f(v, l): light and viewer can change places."""
+    shape, n = (16, 32), np.tile(np.array([[0], [0.6], [0.8]], np.float32), 40)
+    directions = environment_directions(*shape).reshape(-1, 3).T
+    cosine = n[:, 0] @ directions
+    above = np.flatnonzero(cosine > 0.1)[::3][:40]
+    takes = lobe_matrix(n, directions[:, above], np.full(40, alpha, np.float32), shape)
+    f = (takes / (texel_solid_angles(*shape).reshape(-1) * np.maximum(cosine, 1e-3)))[:, above]
+    np.testing.assert_allclose(f, f.T, rtol=1e-3)
+    assert f.max() > 1.2 * f.min()
 
 
 @pytest.mark.parametrize("roughness", [0.05, 0.2, 0.5])
@@ -194,11 +246,16 @@ def two_sides(tilt: float) -> tuple[np.ndarray, np.ndarray]:
     return both, left
 
 
+@pytest.mark.parametrize("turned", [False, True], ids=["upright", "lying"])
 @pytest.mark.parametrize(("tilt", "apart"), [(0.6, True), (0.4, False), (-0.3, True), (-0.2, False)])
-def test_pixels_across_an_edge_are_of_different_surfaces(tilt: float, apart: bool) -> None:
+def test_pixels_across_an_edge_are_of_different_surfaces(tilt: float, apart: bool, turned: bool) -> None:
     """A crease sharper than the bound does not blur either side; the bound is lower where it is concave."""
-    both, left = (specular_light(normal, 0.1, smooth_environment())[:, :4] for normal in two_sides(tilt))
-    assert np.allclose(both, left, rtol=1e-4) == apart
+    sides = two_sides(tilt)
+    if turned:  # clockwise: what looked to the left looks up
+        sides = tuple(np.rot90(n, -1) @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32) for n in sides)
+    inside = np.any(sides[1] != 0, axis=-1)
+    both, alone = (specular_light(normal, 0.1, smooth_environment())[inside] for normal in sides)
+    assert np.allclose(both, alone, rtol=1e-4) == apart
 
 
 def rounded_edge(size: int, radius: float) -> np.ndarray:
