@@ -171,8 +171,7 @@ class PredictionFolder:
 
         with _named(path):
             light = load_light(path, photograph=False, normalise=False).environment
-            areas = path.suffix != ".exr" or not on_pole_grid(read_exr(path)[1])
-            if areas and len(light) < SHAPE[0]:
+            if len(light) < SHAPE[0] and (path.suffix != ".exr" or not on_pole_grid(read_exr(path)[1])):
                 light = load_light(path, photograph=False, normalise=False, shape=SHAPE).environment
             _check_brightness("the light", light)
         return light

@@ -140,11 +140,13 @@ def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     return display_values(in_srgb(image, name), name)
 
 
-def is_turned(path: Path) -> bool:
-    """Whether the file has an EXIF orientation that is not that of its pixels; a damaged one is none."""
+def is_turned(picture: Path | Image.Image) -> bool:
+    """Whether a file or a PIL picture has an EXIF orientation that is not that of its pixels; a damaged one is none."""
     try:
-        with opened(path) as file:
-            return file.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
+        if isinstance(picture, Path):
+            with opened(picture) as file:
+                return is_turned(file)
+        return picture.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
     except (OSError, ValueError, SyntaxError, struct.error):
         return False
 

@@ -27,6 +27,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
     CAMERA_ATTRIBUTE,
     channels_rgb,
+    header_camera,
     image_channels,
     intrinsics_channels,
     intrinsics_from_channels,
@@ -231,7 +232,8 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
             environment = _read_environment(path / ENVIRONMENT_FILE)
     try:
         if camera is None and CAMERA_ATTRIBUTE in attributes:
-            camera = Camera.parse(attributes[CAMERA_ATTRIBUTE])
+            text = attributes[CAMERA_ATTRIBUTE]
+            camera = Camera.parse(text) if fov_deg is None else header_camera(attributes)
         if camera is None and fov_deg is None:
             logger.warning(
                 "%s says nothing of its camera: a field of view of %g degrees is assumed (--fov)", path, DEFAULT_FOV_DEG

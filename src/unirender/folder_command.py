@@ -56,7 +56,7 @@ class Reader:
     def notices(self) -> None:
         """Says each kind of remark once."""
         for first, *others in self.remarks.values():
-            notice(first + (f" (and {len(others)} other pictures likewise)" if others else ""))
+            notice(first + (f" ({len(others)} more likewise)" if others else ""))
 
 
 def run_folder(command: "Decompose") -> int:

@@ -111,10 +111,11 @@ def read_mask_file(
     exr = path.suffix.lower() == ".exr"
     mask = _read_exr_mask(path) if exr else coverage(stored_values(path, upright=upright))
     if mask.shape[:2] != size:
-        on_its_side = " as its EXIF orientation turns it; turn the mask likewise" if mask.shape[1::-1] == size else ""
+        on_its_side = upright and mask.shape[1::-1] == size
+        advice = " as its EXIF orientation turns it; turn the mask likewise" if on_its_side else ""
         raise UnirenderError(
             f"{path}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, expected {size[1]} x {size[0]} "
-            f"like the picture{on_its_side}"
+            f"like the picture{advice}"
         )
     low, high = float(mask.min()), float(mask.max())
     if low < -MASK_BEYOND or high > 1 + MASK_BEYOND:

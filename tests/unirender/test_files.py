@@ -197,6 +197,8 @@ def test_the_camera_is_that_of_meta_json_else_of_the_header_else_the_default(
     assert read_result(tmp_path / "bare.exr", fov_deg=36).camera == Camera()
     assert not caplog.records
     assert read_result(tmp_path / "bare.exr").camera == Camera()
+    write_exr(tmp_path / "odd.exr", intrinsics_channels(Intrinsics(mask=mask)), attributes={"camera": "wide"})
+    assert read_result(tmp_path / "odd.exr", fov_deg=40).camera == Camera(40)  # as the error without it advises
     assert "36 degrees is assumed" in caplog.text
 
 

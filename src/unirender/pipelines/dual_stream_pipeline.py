@@ -118,7 +118,8 @@ class DualStreamPipeline(DiffusionPipeline):
         scheduler = copy.deepcopy(self.scheduler) if sampler is None else make_sampler(sampler, self.scheduler)
         if mode == "sample":
             check_scheduler(scheduler)
-        device = self._execution_device  # not that of the weights, which an offloading pipeline keeps elsewhere
+        # Weights that accelerate offloads lie elsewhere than they compute; of others the model knows, with one search.
+        device = self._execution_device if hasattr(self.dual_stream, "_hf_hook") else self.dual_stream.device
         return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, device, self._progress)
 
     def _progress(self, steps: Iterable[Any]) -> Iterable[Any]:

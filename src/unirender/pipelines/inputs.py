@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from unirender.display_files import display_colors, display_values
+from unirender.display_files import display_colors, display_values, is_turned
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.lighting import as_light
@@ -26,7 +26,6 @@ MIN_SIDE = 8  # pixels
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
 RANGE_ADVICE = "divide 8 bits by 255 and 16 bits by 65535; tone-map or clip radiance"
-ORIENTATION, UPRIGHT = 0x0112, 1  # of EXIF: the tag, and its value for a picture that is not turned
 
 logger = logging.getLogger(__name__)
 
@@ -49,10 +48,8 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         UnirenderError: wrong type, shape or range, NaN, or an empty mask.
     """
     if isinstance(image, Image.Image):
-        if (turned := image.getexif().get(ORIENTATION, UPRIGHT)) != UPRIGHT:
-            logger.warning(
-                "image: its EXIF orientation (%s) is not applied; PIL.ImageOps.exif_transpose(image) turns it", turned
-            )
+        if is_turned(image):
+            logger.warning("image: its EXIF orientation is not applied; PIL.ImageOps.exif_transpose(image) turns it")
         values = display_colors(image, "image")
         picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):

@@ -263,6 +263,10 @@ def test_poses_count_in_the_pixels_as_they_are_stored(folder: Path, caplog: pyte
         with caplog.at_level(logging.WARNING, "unirender"):
             same_views(views, read_views(folder), 0.0)
         assert caplog.text.count("EXIF orientations of the pictures are not followed") == 1
+    Image.new("L", (12, 16), 255).save(folder / "images/on_its_side.png")
+    edited(folder, lambda content: content["frames"][0].update(mask_path="images/on_its_side.png"))
+    with pytest.raises(UnirenderError, match=r"is 12 x 16 pixels, expected 16 x 12 like the picture$"):
+        read_views(folder)
 
 
 @pytest.mark.parametrize(
