@@ -63,7 +63,8 @@ class FolderResult:
 def list_pictures(folder: Path) -> list[Path]:
     """The pictures that lie in a folder, not in folders inside it, in natural order: `f2.png` before `f10.png`.
 
-    Links that lead nowhere and a camera's files that cannot be read are among them, so that they are listed as failed.
+    Links that lead nowhere are among them, so that they are listed as failed; so are a camera's files that cannot be
+    read, unless a picture of the same stem was made of them.
 
     Raises:
         UnirenderError: there is none, or the folder is a result.
@@ -73,6 +74,8 @@ def list_pictures(folder: Path) -> list[Path]:
             f"{folder}: is a result, whose pictures are maps, expected a folder of pictures; see `unirender render`"
         )
     found = [path for path in folder.iterdir() if _is_picture(path) and not path.is_dir()]
+    stems = {path.stem for path in found}
+    found += [path for path in folder.iterdir() if _is_foreign(path) and path.stem not in stems]
     if not found:
         raise UnirenderError(f"{folder}: has no pictures, expected files that end in {', '.join(SUFFIXES)}")
     return sorted(found, key=lambda path: (natural_order(path.name), path.name))
@@ -80,7 +83,11 @@ def list_pictures(folder: Path) -> list[Path]:
 
 def _is_picture(path: Path) -> bool:
     """By its name."""
-    return path.suffix.lower() in SUFFIXES + RARE_SUFFIXES + FOREIGN_SUFFIXES and not path.name.startswith(".")
+    return path.suffix.lower() in SUFFIXES + RARE_SUFFIXES and not path.name.startswith(".")
+
+
+def _is_foreign(path: Path) -> bool:
+    return path.suffix.lower() in FOREIGN_SUFFIXES and not path.name.startswith(".") and not path.is_dir()
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:

@@ -76,9 +76,10 @@ def test_pictures_in_natural_order(tmp_path: Path) -> None:
 
 def test_a_cameras_files_are_listed_as_failed(tmp_path: Path) -> None:
     Image.new("RGB", (12, 10)).save(tmp_path / "thumbnail.tiff")
-    for name in ("a.DNG", "b.cr2", "c.heic"):
+    for name in ("a.DNG", "b.cr2", "c.heic", "thumbnail.NEF"):
         (tmp_path / name).write_bytes((tmp_path / "thumbnail.tiff").read_bytes() if name != "c.heic" else b"ftypheic")
-    found = list_pictures(tmp_path)
+    found = list_pictures(tmp_path)  # but those of which there is a picture: cameras write both
+    assert mask_of(Path("elsewhere/thumbnail.png"), tmp_path) == tmp_path / "thumbnail.tiff"
     failed = run(found, tmp_path / "out").failed
     assert set(failed) == {"a.DNG", "b.cr2", "c.heic"}
     assert all("a camera's raw file, expected PNG" in failed[name] for name in ("a.DNG", "b.cr2"))
