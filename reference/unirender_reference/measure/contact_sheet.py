@@ -51,9 +51,9 @@ class Sheet:
             )
         if not self.out.absolute().parent.is_dir():
             raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into")
+        check_file("--out", self.out)
         if self.out.suffix.lower() != ".png":
             raise UsageError(f"--out {self.out}: expected the name of a PNG file, like {self.out.with_suffix('.png')}")
-        check_file("--out", self.out)
         specs = list(self.specs())  # a mesh that cannot be read is told before anything is rendered
         style = LIGHT if self.background == "light" else DARK
         rows, labels = [], []
