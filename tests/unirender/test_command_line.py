@@ -150,11 +150,21 @@ def test_ctrl_c_in_a_refinement(tmp_path: Path) -> None:
     assert text.endswith("unirender: interrupted; run the same command again to go on\n")
 
 
+# as `python -m unirender`, but that writing a result takes a minute
+SLOW_TO_WRITE = """
+import time
+import unirender.files
+from unirender.cli import main
+unirender.files.write_exr = lambda *_, **__: time.sleep(60)
+main()
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_is_told_to_end_takes_back_what_it_began(number: signal.Signals, tmp_path: Path) -> None:
     write_png(tmp_path / "mug.png", np.full((16, 16, 3), 0.5, np.float32))
-    command = [sys.executable, "-m", "unirender", "decompose", "mug.png", "--output", "out"]
+    command = [sys.executable, "-c", SLOW_TO_WRITE, "decompose", "mug.png", "--output", "out"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, preexec_fn=heed_hang_up)
     try:
         while process.poll() is None and not list(tmp_path.glob(".out.*")):
