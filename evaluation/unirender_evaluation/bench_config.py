@@ -6,10 +6,11 @@ from typing import Any
 
 from unirender.errors import UsageError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
-from unirender_evaluation import bounds, multiview_methods, physics_rows
+from unirender_evaluation import bounds, physics_rows
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.mitsuba_method import MITSUBA
+from unirender_evaluation.multiview.methods import NAMES as MULTIVIEW_NAMES
 from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import absolute, installed_plugins, named_plugin
@@ -23,7 +24,7 @@ BOUNDS = (  # keys that no row of a stranger may have
     bounds.REFERENCE_KEY,
     slug(bounds.Shade.name),
     *(info.key for info in (bounds.TRUE_LIGHT, MITSUBA, *physics_rows.INFOS)),
-    *map(slug, multiview_methods.NAMES),
+    *map(slug, MULTIVIEW_NAMES),
 )
 
 

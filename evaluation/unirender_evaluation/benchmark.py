@@ -30,9 +30,9 @@ from unirender.whole_files import replace_file
 from unirender_evaluation import bounds, physics_rows
 from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.mitsuba_method import MITSUBA
-from unirender_evaluation.multiview_pictures import MultiviewPictures
-from unirender_evaluation.multiview_rows import multiview_jobs, multiview_rows
-from unirender_evaluation.multiview_scenes import multiview_scenes
+from unirender_evaluation.multiview.pictures import MultiviewPictures
+from unirender_evaluation.multiview.rows import multiview_jobs, multiview_rows
+from unirender_evaluation.multiview.scenes import multiview_scenes
 from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_csv, write_run

@@ -72,7 +72,7 @@ class Stage:
     @property
     def own_material(self) -> Material:
         """One of the scene's stratified materials: over a suite's objects, roughly uniform on the unit square."""
-        from unirender_evaluation.multiview_scenes import scene_material  # the optimiser
+        from unirender_evaluation.multiview.scenes import scene_material  # the optimiser
 
         return scene_material(self.suite, self.scene)
 

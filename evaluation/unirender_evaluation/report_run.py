@@ -74,7 +74,7 @@ def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] 
 
 def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Record], tables: Sequence[Table]) -> Path:
     """Writes `report.html` of a run, with the gallery from its kept pictures; returns its path."""
-    from unirender_evaluation.multiview_pictures import MultiviewPictures
+    from unirender_evaluation.multiview.pictures import MultiviewPictures
     from unirender_evaluation.pictures import Pictures
     from unirender_evaluation.tasks import scene_ids
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from unirender_evaluation.metrics import METRICS, Metric, Variant, metric_key
-from unirender_evaluation.multiview_settings import STANDARD as VIEWS
+from unirender_evaluation.multiview.settings import STANDARD as VIEWS
 
 GRID_MSE = 0.100  # mean of (x - 0.5)^2 over x in {0, .1 .. 1}: what a constant 0.5 scores on the paper's materials
 GRID_TOLERANCE = 0.002  # a suite whose constant scores within it has the paper's distribution of materials

@@ -2,7 +2,7 @@
 
 from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import METRICS, Metric
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics_tests import PHYSICS_TABLE
 from unirender_evaluation.specs import TABLES, TableSpec
 

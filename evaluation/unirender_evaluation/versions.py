@@ -115,7 +115,7 @@ OUTSIDE = (
 PICTURES = ("figures*", "gallery*", "pictures*", "report*")
 # Parts of their own: a change there concerns no other row.
 OPTIMIZED = ("optimized_*",)
-VIEWS = ("multiview_*",)
+VIEWS = ("multiview/*",)
 ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-ins do
 MITSUBA_ROW = ("mitsuba_method",)
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
@@ -166,7 +166,7 @@ PARTS: Mapping[str, Part] = {
                 f"unirender_evaluation/{name}.py"
                 for name in (
                     *(*COMMANDS, *FROM_RECORDS, *PICTURES, "versions"),
-                    *(*OPTIMIZED, *VIEWS, *ADAPTERS, *MITSUBA_ROW),
+                    *(*OPTIMIZED, *ADAPTERS, *MITSUBA_ROW),
                 )
             ),
         ),
@@ -205,6 +205,7 @@ PARTS: Mapping[str, Part] = {
             "unirender_evaluation": tuple(f"{name}.py" for name in VIEWS),
         },
         (),
+        ("unirender_evaluation/multiview/__init__.py",),
     ),
 }
 

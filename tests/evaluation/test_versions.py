@@ -67,7 +67,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
         (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
-        (MULTIVIEW, "unirender_evaluation", ("multiview_scoring.py", "multiview_settings.py")),
+        (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
         ("core", "unirender_evaluation", ("physics.py", "physics_rows.py", "records.py", "suite_spec.py")),
         ("core", "unirender_evaluation", ("light_balls.py", "light_methods.py", "light_metrics.py")),
         ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
@@ -83,7 +83,7 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender_evaluation", ("optimized_method.py", "multiview_scoring.py", "light_tables.py")),
+        ("core", "unirender_evaluation", ("optimized_method.py", "adapters_rgbx.py", "light_tables.py")),
         (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
         (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
     ],
@@ -110,10 +110,13 @@ def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
 
 def test_packages_beside_the_benchmark_are_in_no_key() -> None:
     root = package_folder("unirender_evaluation")
-    patterns = [pattern for part in PARTS.values() for pattern in part.files.get("unirender_evaluation", ())]
-    covered = {path.relative_to(root) for pattern in patterns for path in root.glob(pattern)}
-    assert covered
-    assert {path.parent for path in covered} == {Path()}
+    folders = {
+        name: {path.relative_to(root).parent.as_posix() for p in patterns for path in root.glob(p)}
+        for name, part in PARTS.items()
+        if (patterns := part.files.get("unirender_evaluation"))
+    }
+    assert folders.pop(MULTIVIEW) == {"multiview"}
+    assert set().union(*folders.values()) == {"."}
 
 
 def test_a_study_whose_modules_were_moved_does_not_go_on_without_them() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 from reference_scenes import environment, sphere
 
 from unirender.camera import Camera
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_settings import MultiviewSettings
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject
 

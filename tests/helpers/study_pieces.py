@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tiny_suites import write_suite
 
-from unirender_evaluation.multiview_settings import MultiviewSettings
+from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_evaluation.studies.optimiser.ingredients import FULL, REFINEMENT, START, Ingredient
 from unirender_evaluation.studies.optimiser.study import Study
 from unirender_evaluation.versions import LPIPS, MULTIVIEW, OPTIMIZER, REFERENCE, Versions

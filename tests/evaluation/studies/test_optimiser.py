@@ -16,9 +16,9 @@ from study_pieces import FEW, SMALL, VERSIONS, full, one_thread, small_study, tw
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.multiview_methods import Optimized, PlainLoop
-from unirender_evaluation.multiview_scoring import score_solution
-from unirender_evaluation.multiview_tables import PROTOCOL
+from unirender_evaluation.multiview.methods import Optimized, PlainLoop
+from unirender_evaluation.multiview.scoring import score_solution
+from unirender_evaluation.multiview.tables import PROTOCOL
 from unirender_evaluation.records import Record
 from unirender_evaluation.studies.cells import signed
 from unirender_evaluation.studies.folder import open_folder

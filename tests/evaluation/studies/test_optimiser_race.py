@@ -14,7 +14,7 @@ from rich.console import Console
 from study_pieces import FEW, SMALL, one_thread, small_study
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.multiview_scoring import score_solution
+from unirender_evaluation.multiview.scoring import score_solution
 from unirender_evaluation.studies.optimiser.commands import BenchRace
 from unirender_evaluation.studies.optimiser.curves import Curve, Point, finish, geometric_mean
 from unirender_evaluation.studies.optimiser.race import (

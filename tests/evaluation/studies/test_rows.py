@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from unirender.errors import UsageError
-from unirender_evaluation.multiview_settings import MultiviewSettings
+from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_evaluation.statistics import METHOD
 from unirender_evaluation.studies.optimiser.ingredients import GROUPS, ingredients
 from unirender_evaluation.studies.rows import StudyRow, chosen

@@ -11,8 +11,8 @@ from tiny_suites import make_suite
 
 from unirender.errors import UsageError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
-from unirender_evaluation.multiview_settings import MultiviewSettings
-from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.multiview.settings import MultiviewSettings
+from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
 from unirender_evaluation.studies.unknown_mesh.measure import STRIP, UnknownMesh, measure

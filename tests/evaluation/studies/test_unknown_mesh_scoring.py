@@ -7,8 +7,8 @@ import pytest
 from multiview_pieces import ball_scene, true_solution
 
 from unirender.color import srgb_encode
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import Looks, ceiling_values, solution_looks, true_looks
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import Looks, ceiling_values, solution_looks, true_looks
 from unirender_evaluation.studies.unknown_mesh.pictures import camera_panels, found_strip
 from unirender_evaluation.studies.unknown_mesh.scoring import score_found, shape_values
 from unirender_reference.optimize.solution import Solution

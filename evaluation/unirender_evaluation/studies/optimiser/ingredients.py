@@ -8,7 +8,7 @@ anchor, where the map is 0.05 away from its start, and the light's logarithm 0.3
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from unirender_evaluation.multiview_methods import PLAIN_ITERATIONS, PLAIN_TEXTURE
+from unirender_evaluation.multiview.methods import PLAIN_ITERATIONS, PLAIN_TEXTURE
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.transport_config import TransportConfig

@@ -13,9 +13,9 @@ from pathlib import Path
 from rich.console import Console
 
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import score_solution
-from unirender_evaluation.multiview_tables import PROTOCOL, SECONDS
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import score_solution
+from unirender_evaluation.multiview.tables import PROTOCOL, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.store import Store
 from unirender_evaluation.studies.optimiser.ingredients import Ingredient

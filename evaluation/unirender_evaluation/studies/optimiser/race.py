@@ -17,8 +17,8 @@ from rich.console import Console
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import Variant, metric_key
-from unirender_evaluation.multiview_methods import LIGHT_SHAPE, PLAIN_TEXTURE
-from unirender_evaluation.multiview_scenes import MultiviewScene
+from unirender_evaluation.multiview.methods import LIGHT_SHAPE, PLAIN_TEXTURE
+from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.scoring import score_colour
 from unirender_evaluation.studies.optimiser.curves import Curve, Point
 from unirender_evaluation.studies.optimiser.study import Study, work_through

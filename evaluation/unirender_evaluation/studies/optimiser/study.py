@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.console import Console
 
-from unirender_evaluation.multiview_scenes import MultiviewScene, multiview_scenes, suite_scene
-from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
+from unirender_evaluation.multiview.scenes import MultiviewScene, multiview_scenes, suite_scene
+from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.store import content_key
 from unirender_evaluation.studies.progress import study_bar
 from unirender_evaluation.suites import Scene, Suite, load_suite

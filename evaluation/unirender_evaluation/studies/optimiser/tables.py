@@ -11,7 +11,7 @@ from rich.console import Console
 
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.multiview_scenes import scene_material
+from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.store import Store, content_key

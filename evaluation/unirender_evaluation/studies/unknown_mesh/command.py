@@ -52,8 +52,8 @@ class BenchUnknownMesh:
         self.check()
         from rich.console import Console
 
-        from unirender_evaluation.multiview_scenes import multiview_scenes
-        from unirender_evaluation.multiview_settings import STANDARD
+        from unirender_evaluation.multiview.scenes import multiview_scenes
+        from unirender_evaluation.multiview.settings import STANDARD
         from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh
         from unirender_evaluation.studies.unknown_mesh.run import run
         from unirender_evaluation.suites import load_suite

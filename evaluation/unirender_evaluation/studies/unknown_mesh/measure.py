@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.multiview_scenes import suite_scene
-from unirender_evaluation.multiview_scoring import solution_looks
-from unirender_evaluation.multiview_settings import MultiviewSettings
-from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.multiview.scenes import suite_scene
+from unirender_evaluation.multiview.scoring import solution_looks
+from unirender_evaluation.multiview.settings import MultiviewSettings
+from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.studies.folder import write_files

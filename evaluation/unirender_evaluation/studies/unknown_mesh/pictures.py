@@ -7,8 +7,8 @@ from unirender.color import unpremultiply
 from unirender.files import map_picture
 from unirender_evaluation.figures import Grid, Line, Tile, draw, over_white
 from unirender_evaluation.gallery import Picture
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import Looks, true_looks
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import Looks, true_looks
 
 CAMERAS = 2  # of the held-out ones are shown
 MAPS = ("albedo", "normal", "roughness", "metallic")

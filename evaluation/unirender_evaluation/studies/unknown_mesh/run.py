@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 
 from rich.console import Console
 
-from unirender_evaluation.multiview_scenes import scene_material
+from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
 from unirender_evaluation.stratification import Material
 from unirender_evaluation.studies.folder import open_folder, write_files

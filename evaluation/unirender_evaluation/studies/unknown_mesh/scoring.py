@@ -16,8 +16,8 @@ import numpy as np
 
 from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.metrics import Metric, metric_key
-from unirender_evaluation.multiview_scenes import LitPictures, MultiviewScene
-from unirender_evaluation.multiview_scoring import NEIGHBOURS, Looks, camera_means, solution_looks
+from unirender_evaluation.multiview.scenes import LitPictures, MultiviewScene
+from unirender_evaluation.multiview.scoring import NEIGHBOURS, Looks, camera_means, solution_looks
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.shape.cameras import Cameras

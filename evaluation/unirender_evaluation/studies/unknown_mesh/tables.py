@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.multiview_settings import MultiviewSettings
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, SECONDS
+from unirender_evaluation.multiview.settings import MultiviewSettings
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, mean_estimate

@@ -25,8 +25,8 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.methods import seen_linear
 from unirender_evaluation.metrics import Metric, metric_key
-from unirender_evaluation.multiview_scenes import scene_material
-from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.multiview.scenes import scene_material
+from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.optimized_method import SHADE_SPP
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image, score_maps

@@ -8,7 +8,7 @@ from typing import Any
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, Metric
-from unirender_evaluation.multiview_tables import SECONDS
+from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import quantise
-from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
+from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.rows import evenly
 from unirender_evaluation.suite_objects import bare_mesh, scene_object
 from unirender_evaluation.suites import Material, Scene, Suite

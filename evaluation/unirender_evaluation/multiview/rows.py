@@ -12,12 +12,12 @@ from functools import cache, partial
 
 from unirender_evaluation.bounds import KeyOf, ceiling_info
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.multiview_methods import PLAIN_ITERATIONS, ConstantObject, Optimized, PlainLoop
-from unirender_evaluation.multiview_pictures import MultiviewPictures
-from unirender_evaluation.multiview_scenes import MultiviewScene, suite_scene
-from unirender_evaluation.multiview_scoring import ceiling_values, score_solution, solution_looks, true_looks
-from unirender_evaluation.multiview_settings import STANDARD, MultiviewSettings
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL, SECONDS
+from unirender_evaluation.multiview.methods import PLAIN_ITERATIONS, ConstantObject, Optimized, PlainLoop
+from unirender_evaluation.multiview.pictures import MultiviewPictures
+from unirender_evaluation.multiview.scenes import MultiviewScene, suite_scene
+from unirender_evaluation.multiview.scoring import ceiling_values, score_solution, solution_looks, true_looks
+from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL, SECONDS
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.store import Job

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from multiview_pieces import MATERIAL, ball_scene, true_solution
 
-from unirender_evaluation.multiview_methods import ConstantObject
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import camera_means, ceiling_values, score_solution, solution_looks
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE
+from unirender_evaluation.multiview.methods import ConstantObject
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import camera_means, ceiling_values, score_solution, solution_looks
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_reference.optimize.solution import Solution
 
 RAW, ALIGNED = "psnr@masked-srgb-raw", "psnr@masked-srgb-aligned"

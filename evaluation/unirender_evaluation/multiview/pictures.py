@@ -12,10 +12,10 @@ import numpy as np
 from unirender.color import image_srgb
 from unirender_evaluation.gallery import GalleryItem, Picture, image_picture
 from unirender_evaluation.metrics import METRICS, metric_key
-from unirender_evaluation.multiview_scenes import MultiviewScene
-from unirender_evaluation.multiview_scoring import Looks
-from unirender_evaluation.multiview_settings import STANDARD
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import Looks
+from unirender_evaluation.multiview.settings import STANDARD
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL
 from unirender_evaluation.pictures import SCORES, chosen_places, read_sheet, sheet_key, write_sheet
 from unirender_evaluation.records import Record
 from unirender_evaluation.suites import Suite

@@ -5,7 +5,7 @@ import pytest
 from multiview_pieces import MATERIAL, SMALL, ball_scene, painted_ball
 
 from unirender_evaluation.methods import quantise
-from unirender_evaluation.multiview_scenes import (
+from unirender_evaluation.multiview.scenes import (
     MultiviewScene,
     multiview_scenes,
     scene_material,

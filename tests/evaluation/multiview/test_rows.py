@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from multiview_pieces import SMALL
 
-from unirender_evaluation.multiview_methods import ConstantObject
-from unirender_evaluation.multiview_pictures import MultiviewPictures
-from unirender_evaluation.multiview_rows import TRIVIAL_USES, multiview_jobs
-from unirender_evaluation.multiview_settings import MultiviewSettings
-from unirender_evaluation.multiview_tables import MULTIVIEW_TABLE, PROTOCOL
+from unirender_evaluation.multiview.methods import ConstantObject
+from unirender_evaluation.multiview.pictures import MultiviewPictures
+from unirender_evaluation.multiview.rows import TRIVIAL_USES, multiview_jobs
+from unirender_evaluation.multiview.settings import MultiviewSettings
+from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.report import write_report
 from unirender_evaluation.rows import Row, make_row
