@@ -16,7 +16,7 @@ from doc_pages import EXAMPLES, Example, Names
 CONSOLE = ("console", "bash")
 CELL = "{code-cell} python"  # sphinx runs it; other directives hold text, and blocks that are looked at
 NOT_RUN = {
-    "physics.md": ["pseudo-code; unirender_evaluation/physics_ambiguity.py is the code"],
+    "physics.md": ["pseudo-code; unirender_evaluation/physics/ambiguity.py is the code"],
 }
 """All there is of blocks that are not run; a reason stands above its block as `<!-- not run: reason -->`."""
 

@@ -6,12 +6,13 @@ from typing import Any
 
 from unirender.errors import UsageError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
-from unirender_evaluation import bounds, physics_rows
+from unirender_evaluation import bounds
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview.methods import NAMES as MULTIVIEW_NAMES
 from unirender_evaluation.optimized_rows import optimized_rows
+from unirender_evaluation.physics import rows as physics_rows
 from unirender_evaluation.pipeline_method import LazyPipeline
 from unirender_evaluation.plugins import absolute, installed_plugins, named_plugin
 from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows

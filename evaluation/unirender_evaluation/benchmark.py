@@ -27,12 +27,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.whole_files import replace_file
-from unirender_evaluation import bounds, physics_rows
+from unirender_evaluation import bounds
 from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview.pictures import MultiviewPictures
 from unirender_evaluation.multiview.rows import multiview_jobs, multiview_rows
 from unirender_evaluation.multiview.scenes import multiview_scenes
+from unirender_evaluation.physics import rows as physics_rows
 from unirender_evaluation.prediction_check import check_predictions
 from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_csv, write_run

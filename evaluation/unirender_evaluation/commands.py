@@ -8,7 +8,7 @@ import tyro
 
 from unirender.option_checks import at_least
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
-from unirender_evaluation.physics_command import BenchPhysics
+from unirender_evaluation.physics.command import BenchPhysics
 from unirender_evaluation.public.command import BenchPublic
 from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
 from unirender_evaluation.run_command import BenchRun

@@ -3,7 +3,7 @@
 from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
-from unirender_evaluation.physics_tests import PHYSICS_TABLE
+from unirender_evaluation.physics.tests import PHYSICS_TABLE
 from unirender_evaluation.specs import TABLES, TableSpec
 
 BESIDE_THE_PAPERS = (LIGHT_TABLE, MULTIVIEW_TABLE, PHYSICS_TABLE)

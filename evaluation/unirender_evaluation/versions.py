@@ -60,11 +60,13 @@ COMMANDS = (
     "dry_run",
     "export",
     "lpips_convert",
-    "physics_ambiguity",
-    "physics_region",
-    "physics_run",
-    "physics_tracer",
-    "physics_twins",
+    "physics/__init__",
+    "physics/ambiguity",
+    "physics/command",
+    "physics/region",
+    "physics/run",
+    "physics/tracer",
+    "physics/twins",
     "prediction_check",
     "run_folder",
     "score_api",
@@ -158,7 +160,7 @@ NOT_IN_RECORDS = (
 NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
-        {"unirender": ("*.py",), "unirender_evaluation": ("*.py",), "unirender_reference": LIGHT_READER},
+        {"unirender": ("*.py",), "unirender_evaluation": ("*.py", "physics/*.py"), "unirender_reference": LIGHT_READER},
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
             *(f"unirender/{name}.py" for name in OUTSIDE),

@@ -23,7 +23,7 @@ from unirender.worker_pool import WorkerPool
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.mitsuba_method import mitsuba_jobs
-from unirender_evaluation.physics_rows import physics_jobs, physics_scenes
+from unirender_evaluation.physics.rows import physics_jobs, physics_scenes
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, evenly

@@ -15,8 +15,8 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation import methods
 from unirender_evaluation.claims import SHADOWED
 from unirender_evaluation.engine import Prediction, answer, method_jobs, score
-from unirender_evaluation.physics_rows import _record
-from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics.rows import _record
+from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
 from unirender_evaluation.suites import Suite

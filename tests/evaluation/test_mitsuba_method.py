@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from tiny_suites import make_suite
 
-from unirender_evaluation import physics_rows
 from unirender_evaluation.engine import score
 from unirender_evaluation.mitsuba_method import MITSUBA, MitsubaScene, mitsuba_jobs, prediction
-from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics import rows as physics_rows
+from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.suites import Scene, Suite, load_suite
 from unirender_evaluation.tables import RANKED_KINDS
 from unirender_evaluation.tasks import tasks

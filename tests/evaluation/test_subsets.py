@@ -8,7 +8,7 @@ from tiny_suites import make_suite
 
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.optimized_rows import optimized_rows
-from unirender_evaluation.physics_rows import physics_scenes
+from unirender_evaluation.physics.rows import physics_scenes
 from unirender_evaluation.rows import Row
 from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets

@@ -68,7 +68,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
-        ("core", "unirender_evaluation", ("physics.py", "physics_rows.py", "records.py", "suite_spec.py")),
+        ("core", "unirender_evaluation", ("physics/formulas.py", "physics/rows.py", "records.py")),
         ("core", "unirender_evaluation", ("light_balls.py", "light_methods.py", "light_metrics.py")),
         ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
     ],
@@ -83,7 +83,7 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender_evaluation", ("optimized_method.py", "adapters_rgbx.py", "light_tables.py")),
+        ("core", "unirender_evaluation", ("optimized_method.py", "light_tables.py")),
         (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
         (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
     ],
@@ -116,6 +116,7 @@ def test_packages_beside_the_benchmark_are_in_no_key() -> None:
         if (patterns := part.files.get("unirender_evaluation"))
     }
     assert folders.pop(MULTIVIEW) == {"multiview"}
+    assert folders.pop("core") == {".", "physics"}
     assert set().union(*folders.values()) == {"."}
 
 

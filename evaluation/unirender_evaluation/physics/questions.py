@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation import physics, physics_region
 from unirender_evaluation.methods import Image
 from unirender_evaluation.metrics import METRICS, metric_key
-from unirender_evaluation.physics_ambiguity import Points
-from unirender_evaluation.physics_stage import LEVELS, ROUGH, Light, Shader, Stage
+from unirender_evaluation.physics import formulas, region
+from unirender_evaluation.physics.ambiguity import Points
+from unirender_evaluation.physics.stage import LEVELS, ROUGH, Light, Shader, Stage
 from unirender_evaluation.suites import Material
 
 Decompose = Callable[[Stage, Material, Image], Intrinsics]
@@ -21,11 +21,11 @@ Posterior = Callable[[Stage, Material, Image], Points]  # samples of the object'
 PSNR_KEY = metric_key("loop", METRICS["psnr"])
 
 
-def roughness_response(render: physics.Render, stage: Stage) -> float:
+def roughness_response(render: formulas.Render, stage: Stage) -> float:
     """Correlation of the renderer's with Mitsuba's change from the least to the highest roughness of the edits."""
     suite, scene, m = stage.suite, stage.scene, stage.suite.spec.base[0]
     low, high = (m, min(suite.spec.specular_roughness)), (m, max(suite.spec.specular_roughness))
-    return physics.roughness_response(
+    return formulas.roughness_response(
         render,
         suite.intrinsics(scene, low),
         suite.intrinsics(scene, high),
@@ -75,18 +75,18 @@ def tau(parameter: Literal["metallic", "roughness"], decompose: Decompose, stage
     """Kendall's tau of the found against the true parameter over the 11 pictures of its sweep."""
     m, r = stage.suite.spec.base
     sweep = [(level, r) if parameter == "metallic" else (m, level) for level in LEVELS]
-    found = [physics.map_mean(decomposition(decompose, stage, at), parameter, stage.mask) for at in sweep]
-    return physics.kendall_tau(LEVELS, found)
+    found = [formulas.map_mean(decomposition(decompose, stage, at), parameter, stage.mask) for at in sweep]
+    return formulas.kendall_tau(LEVELS, found)
 
 
 def share_inside(posterior: Posterior, stage: Stage) -> float:
     """Share of the materials that explain the picture that lie inside the posterior's region."""
-    return float(physics_region.inside(_samples(posterior, stage), stage.explanations.materials).mean())
+    return float(region.inside(_samples(posterior, stage), stage.explanations.materials).mean())
 
 
 def region_volume(posterior: Posterior, stage: Stage) -> float:
     """Share of the unit cube that the posterior's region covers."""
-    return physics_region.volume(_samples(posterior, stage))
+    return region.volume(_samples(posterior, stage))
 
 
 def _samples(posterior: Posterior, stage: Stage) -> Points:

@@ -8,12 +8,12 @@ import pytest
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
-from unirender_evaluation import physics_ambiguity
 from unirender_evaluation.methods import quantise
-from unirender_evaluation.physics_ambiguity import EXPLANATIONS, POSTERIOR, SIGMAS, Points, material_point
-from unirender_evaluation.physics_region import RESOLUTION, inside, perfect_share, volume
-from unirender_evaluation.physics_stage import Stage
-from unirender_evaluation.physics_tests import TESTS
+from unirender_evaluation.physics import ambiguity
+from unirender_evaluation.physics.ambiguity import EXPLANATIONS, POSTERIOR, SIGMAS, Points, material_point
+from unirender_evaluation.physics.region import RESOLUTION, inside, perfect_share, volume
+from unirender_evaluation.physics.stage import Stage
+from unirender_evaluation.physics.tests import TESTS
 from unirender_evaluation.suites import load_suite
 from unirender_reference.render import Renderer
 
@@ -74,7 +74,7 @@ def test_too_few_samples_have_no_region() -> None:
 def test_what_mitsuba_finds_explains_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     """The true material does, and so do materials found, rendered again with many samples; others do not. A perfect
     posterior passes both tests, and their twins fail."""
-    monkeypatch.setattr(physics_ambiguity, "LEVELS", (0.0, 0.25, 0.5, 0.75, 1.0))
+    monkeypatch.setattr(ambiguity, "LEVELS", (0.0, 0.25, 0.5, 0.75, 1.0))
     suite = load_suite("tiny")
     stage = Stage(suite, suite.scene(SCENE))
     found, (m, r) = stage.explanations, stage.own_material
@@ -110,7 +110,7 @@ def display_distance(stage: Stage, point: np.ndarray) -> float:
 
 
 def test_the_example_of_the_documentation_prints_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "physics.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[3] / "docs" / "physics.md").read_text(encoding="utf-8")
     code = page.partition("```python\n")[2].partition("```")[0]
     exec(code, {})
     assert capsys.readouterr().out.split() == code.rpartition("#")[2].split()

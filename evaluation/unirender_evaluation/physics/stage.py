@@ -13,8 +13,8 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Image, Mask
 from unirender_evaluation.mitsuba_method import MitsubaScene
-from unirender_evaluation.physics import composite_shader
-from unirender_evaluation.physics_ambiguity import Explanations
+from unirender_evaluation.physics.ambiguity import Explanations
+from unirender_evaluation.physics.formulas import composite_shader
 from unirender_evaluation.suites import Material, Scene, Suite
 
 Shader = Literal["shade", "composite"]

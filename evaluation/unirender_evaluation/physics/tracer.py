@@ -18,8 +18,8 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.symmetries import mirror, quarter_turn, turn_rotation
 from unirender_evaluation.methods import Image
-from unirender_evaluation.physics import changed
-from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics.formulas import changed
+from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.truth_render import good_spp, item_seed
 from unirender_reference.shapes import MeshObject
 

@@ -2,7 +2,7 @@
 
 Notation: R(x) is the method's `render` of the maps x, in linear light, premultiplied; sums run over the mask's pixels
 and channels; *unclipped* are pixels where no term exceeds display white. The tests that are made of these formulas,
-each with its unit, direction, expected value and a broken twin, stand in `physics_tests`.
+each with its unit, direction, expected value and a broken twin, stand in `tests`.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,12 +1,13 @@
-"""The physics tests, a row each (`physics_test` says what the fields mean), and the table that `bench run` prints."""
+"""The physics tests, a row each (`definition` says what the fields mean), and the table that `bench run` prints."""
 
 from collections.abc import Callable
 from functools import partial
 
-from unirender_evaluation import physics, physics_region, physics_twins
 from unirender_evaluation.metrics import METRICS, Metric
-from unirender_evaluation.physics_ambiguity import EXPLANATIONS, POSTERIOR
-from unirender_evaluation.physics_questions import (
+from unirender_evaluation.physics import formulas, region, twins
+from unirender_evaluation.physics.ambiguity import EXPLANATIONS, POSTERIOR
+from unirender_evaluation.physics.definition import PhysicsTest
+from unirender_evaluation.physics.questions import (
     loop,
     loss,
     region_volume,
@@ -16,8 +17,7 @@ from unirender_evaluation.physics_questions import (
     share_inside,
     tau,
 )
-from unirender_evaluation.physics_stage import ROUGH, Light, Shader, Stage
-from unirender_evaluation.physics_test import PhysicsTest
+from unirender_evaluation.physics.stage import ROUGH, Light, Shader, Stage
 from unirender_evaluation.specs import Column, TableSpec
 
 PSNR = METRICS["psnr"]
@@ -31,7 +31,7 @@ RELATIVE = _metric("relative", "rel. error", "", False, 0.0, 4, "sum |difference
 CORRELATION = _metric("correlation", "corr.", "", True, 1.0, 3, "Pearson, masked pixels, linear light")
 LOSS = _metric("loss", "loss", "dB", False, 0.0, 2, "masked sRGB PSNR of the true maps' loop minus that of the row's")
 TAU = _metric("tau", "tau", "", True, 1.0, 3, "Kendall's tau-b over 11 renders")
-SHARE = _metric("share", "share", "", True, physics_region.perfect_share(POSTERIOR), 2, "of what explains the input")
+SHARE = _metric("share", "share", "", True, region.perfect_share(POSTERIOR), 2, "of what explains the input")
 VOLUME = _metric("volume", "volume", "", False, 0.0, 4, "share of the unit cube (metallic, roughness, luminance)")
 
 CEILING = "true maps' loop"
@@ -43,8 +43,8 @@ def _identity(
     name: str,
     label: str,
     formula: str,
-    run: Callable[[physics.Render, Stage], float],
-    twin: physics.Render,
+    run: Callable[[formulas.Render, Stage], float],
+    twin: formulas.Render,
     twin_is: str,
 ) -> PhysicsTest:
     """A renderer test of something that light does whatever the scene: a relative error, 0 for a perfect renderer."""
@@ -61,7 +61,7 @@ def _of_maps(
     in_run: bool = True,
 ) -> PhysicsTest:
     """A test of found maps, in dB; its twin has the true ones, but for their normals."""
-    twin, twin_is = physics_twins.dents_for_bumps, "true maps with dents for bumps"
+    twin, twin_is = twins.dents_for_bumps, "true maps with dents for bumps"
     return PhysicsTest(name, label, formula, metric, expected, "decompose", run, twin, twin_is, 1.0, in_run)
 
 
@@ -70,48 +70,48 @@ _RENDERER = (
         "superposition",
         "Superposition",
         "sum |R(a+b) - R(a) - R(b)| / sum (R(a) + R(b)); a, b: two lights at half strength; unclipped",
-        lambda render, stage: physics.superposition(render, stage.base, stage.other),
-        physics_twins.gamma,
+        lambda render, stage: formulas.superposition(render, stage.base, stage.other),
+        twins.gamma,
         GAMMA,
     ),
     _identity(
         "exposure_linearity",
         "Exposure linearity",
         "sum |R(x/2) - R(x)/2| / sum R(x)/2; unclipped",
-        lambda render, stage: physics.exposure_linearity(render, stage.base),
-        physics_twins.gamma,
+        lambda render, stage: formulas.exposure_linearity(render, stage.base),
+        twins.gamma,
         GAMMA,
     ),
     _identity(
         "white_furnace",
         "White furnace",
         "sum |R(x) - L| / sum L; x: a mirror (albedo, metallic 1, roughness 0) in uniform light L: it vanishes",
-        lambda render, stage: physics.white_furnace(render, stage.base),
-        physics_twins.darkening,
+        lambda render, stage: formulas.white_furnace(render, stage.base),
+        twins.darkening,
         "0.8 of the radiance",
     ),
     _identity(
         "mirror_flip",
         "Mirror flip",
         "sum |R(flip x) - flip R(x)| / sum R(x)",
-        lambda render, stage: physics.mirror_flip(render, stage.base),
-        physics_twins.gradient,
+        lambda render, stage: formulas.mirror_flip(render, stage.base),
+        twins.gradient,
         GRADIENT,
     ),
     _identity(
         "roll",
         "Roll",
         "sum |R(turn x) - turn R(x)| / sum R(x); a quarter turn of all about the view axis",
-        lambda render, stage: physics.roll(render, stage.base),
-        physics_twins.gradient,
+        lambda render, stage: formulas.roll(render, stage.base),
+        twins.gradient,
         GRADIENT,
     ),
     _identity(
         "metallic_linearity",
         "Metallic linearity",
         "sum |R(m = .5) - (R(0) + R(1)) / 2| / sum R(.5); exact for one bounce, not for interreflection",
-        lambda render, stage: physics.metallic_linearity(render, stage.base),
-        physics_twins.squared_metallic,
+        lambda render, stage: formulas.metallic_linearity(render, stage.base),
+        twins.squared_metallic,
         "metallic squared",
     ),
     PhysicsTest(
@@ -122,7 +122,7 @@ _RENDERER = (
         expected=1.0,
         asks="render",
         run=roughness_response,
-        twin=physics_twins.blind_to_roughness,
+        twin=twins.blind_to_roughness,
         twin_is="s replaced by d: blind to roughness",
         margin=0.5,
     ),
@@ -189,7 +189,7 @@ _TAUS = tuple(
         expected=1.0,
         asks="decompose",
         run=partial(tau, parameter),
-        twin=physics_twins.constant_material,
+        twin=twins.constant_material,
         twin_is="metallic and roughness 0.5 for every picture",
         margin=0.5,
         in_run=False,
@@ -206,7 +206,7 @@ _AMBIGUITY = (
         expected=SHARE.perfect,
         asks="sample",
         run=share_inside,
-        twin=physics_twins.too_sure,
+        twin=twins.too_sure,
         twin_is="a posterior shrunk to a tenth",
         margin=0.3,
         in_run=False,
@@ -219,7 +219,7 @@ _AMBIGUITY = (
         expected="Mitsuba's",
         asks="sample",
         run=region_volume,
-        twin=physics_twins.anything,
+        twin=twins.anything,
         twin_is="any material, whatever the picture",
         margin=0.3,
         in_run=False,
@@ -230,7 +230,7 @@ TESTS: dict[str, PhysicsTest] = {
 }
 
 
-def renderer_tests(render: physics.Render, stage: Stage) -> dict[str, float]:
+def renderer_tests(render: formulas.Render, stage: Stage) -> dict[str, float]:
     """All renderer tests on one scene, from its true maps with true s, d and light: name -> value."""
     return {test.name: test.run(render, stage) for test in TESTS.values() if test.asks == "render"}
 

@@ -10,8 +10,8 @@ from unirender_evaluation.bounds import SHADE_SPP, KeyOf
 from unirender_evaluation.engine import NoAnswer, ask, decomposition
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.mitsuba_method import MITSUBA
-from unirender_evaluation.physics_stage import Light, Stage
-from unirender_evaluation.physics_tests import LOSS, PSNR, TESTS, renderer_tests
+from unirender_evaluation.physics.stage import Light, Stage
+from unirender_evaluation.physics.tests import LOSS, PSNR, TESTS, renderer_tests
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job

@@ -21,12 +21,12 @@ import numpy as np
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
 from unirender_evaluation.methods import Composite, Image, quantise
-from unirender_evaluation.physics_ambiguity import POSTERIOR, Points, material_point
-from unirender_evaluation.physics_questions import Posterior, true_maps
-from unirender_evaluation.physics_stage import Stage
-from unirender_evaluation.physics_test import PhysicsTest
-from unirender_evaluation.physics_tests import TESTS
-from unirender_evaluation.physics_tracer import PathTracer
+from unirender_evaluation.physics.ambiguity import POSTERIOR, Points, material_point
+from unirender_evaluation.physics.definition import PhysicsTest
+from unirender_evaluation.physics.questions import Posterior, true_maps
+from unirender_evaluation.physics.stage import Stage
+from unirender_evaluation.physics.tests import TESTS
+from unirender_evaluation.physics.tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.studies.folder import write_files

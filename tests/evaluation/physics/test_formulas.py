@@ -8,12 +8,12 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
-from unirender_evaluation import physics
 from unirender_evaluation.methods import Composite, Image
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.physics_questions import rough_loop, true_maps
-from unirender_evaluation.physics_stage import LEVELS, ROUGH, Stage
-from unirender_evaluation.physics_tests import PHYSICS_TABLE, TESTS, renderer_tests
+from unirender_evaluation.physics import formulas
+from unirender_evaluation.physics.questions import rough_loop, true_maps
+from unirender_evaluation.physics.stage import LEVELS, ROUGH, Stage
+from unirender_evaluation.physics.tests import PHYSICS_TABLE, TESTS, renderer_tests
 from unirender_evaluation.suites import Material, Scene, Suite, load_suite
 
 PERFECT = Composite().render
@@ -48,20 +48,20 @@ def test_quarter_turn_is_a_symmetry_of_the_world(suite: Suite) -> None:
     """Light derived from the turned normals and environment is the turned light; without turning the light it is
     not."""
     maps = suite.intrinsics(suite.scenes[1], suite.spec.base).replace(specular=None, diffuse=None)
-    error = physics.roll(PERFECT, maps)
+    error = formulas.roll(PERFECT, maps)
     assert error < 0.03  # the environment is resampled
-    turned = physics.changed(maps, quarter_turn)
+    turned = formulas.changed(maps, quarter_turn)
     wrong = turned.replace(environment=maps.environment)
-    assert physics.relative_error(PERFECT(wrong), np.rot90(PERFECT(maps))) > 3 * error
+    assert formulas.relative_error(PERFECT(wrong), np.rot90(PERFECT(maps))) > 3 * error
     four = maps
     for _ in range(4):
-        four = physics.changed(four, quarter_turn)
+        four = formulas.changed(four, quarter_turn)
     np.testing.assert_allclose(four.require("normal")["normal"], maps.require("normal")["normal"], rtol=0, atol=1e-5)
 
 
 def test_mirror_of_derived_light_is_exact(suite: Suite) -> None:
     maps = suite.intrinsics(suite.scenes[1], suite.spec.base).replace(specular=None, diffuse=None)
-    assert physics.mirror_flip(PERFECT, maps) < 1e-4
+    assert formulas.mirror_flip(PERFECT, maps) < 1e-4
 
 
 def test_closed_loop_of_true_maps(suite: Suite) -> None:
@@ -156,7 +156,7 @@ def test_tau_ranks_the_sweep(parameter: str, suite: Suite, monkeypatch: pytest.M
 def test_kendall_tau_counts_pairs() -> None:
     """One swapped neighbour among n(n-1)/2 pairs costs two of them."""
     swapped = [1, 0, *range(2, 11)]
-    assert physics.kendall_tau(LEVELS, [float(x) for x in swapped]) == pytest.approx(1 - 2 / 55)
+    assert formulas.kendall_tau(LEVELS, [float(x) for x in swapped]) == pytest.approx(1 - 2 / 55)
 
 
 def test_every_test_is_defined_and_has_a_column(suite: Suite) -> None:

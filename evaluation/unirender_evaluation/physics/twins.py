@@ -4,8 +4,8 @@ import numpy as np
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import Composite, Image
-from unirender_evaluation.physics_ambiguity import POSTERIOR, Points
-from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics.ambiguity import POSTERIOR, Points
+from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.suites import Material
 from unirender_evaluation.truth_render import item_seed
 

@@ -2,7 +2,7 @@
 
 A *renderer* test asks a function `maps -> image`, a *decomposer* test a function `(stage, material, picture) -> maps`,
 a *posterior* test the same for samples of the material (a method sees the picture alone; Mitsuba and the twins know the
-rest; see `physics_questions`). A test is sound where its twin (`physics_twins`) is worse than Mitsuba on the same
+rest; see `questions`). A test is sound where its twin (`twins`) is worse than Mitsuba on the same
 scenes by more than its margin.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from unirender_evaluation.metrics import Metric, metric_key
-from unirender_evaluation.physics_stage import Stage
+from unirender_evaluation.physics.stage import Stage
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.symmetries import turn_rotation
-from unirender_evaluation import physics, physics_run
 from unirender_evaluation.methods import Composite
-from unirender_evaluation.physics_ambiguity import POSTERIOR
-from unirender_evaluation.physics_run import (
+from unirender_evaluation.physics import formulas
+from unirender_evaluation.physics import run as physics_run
+from unirender_evaluation.physics.ambiguity import POSTERIOR
+from unirender_evaluation.physics.run import (
     COMPOSITE,
     MITSUBA,
     OURS,
@@ -26,9 +27,9 @@ from unirender_evaluation.physics_run import (
     markdown,
     write,
 )
-from unirender_evaluation.physics_stage import Stage
-from unirender_evaluation.physics_tests import TESTS
-from unirender_evaluation.physics_tracer import MIRROR, PathTracer, moved
+from unirender_evaluation.physics.stage import Stage
+from unirender_evaluation.physics.tests import TESTS
+from unirender_evaluation.physics.tracer import MIRROR, PathTracer, moved
 from unirender_evaluation.suites import load_suite
 from unirender_reference.shapes import make_object
 
@@ -118,7 +119,7 @@ def test_path_tracer_passes_what_light_does(tmp_path: Path) -> None:
     stage = Stage(suite, suite.scene(SCENE))
     tracer = PathTracer(stage, 256)
     assert TESTS["mirror_flip"].run(tracer.render, stage) < 0.06
-    unflipped = physics.relative_error(tracer.render(stage.base), tracer.render(stage.base)[:, ::-1])
+    unflipped = formulas.relative_error(tracer.render(stage.base), tracer.render(stage.base)[:, ::-1])
     assert unflipped > 0.2, "twin: the scene is not its own mirror image"
     with pytest.raises(UnirenderError, match="normals"):
         tracer.render(stage.base.replace(normal=stage.base.require("normal")["normal"][::-1].copy()))
