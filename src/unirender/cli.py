@@ -33,7 +33,7 @@ from unirender.training.command import Train
 from unirender.training.visibility import TrainVisibility
 from unirender_evaluation.commands import Bench
 from unirender_evaluation.demo.command import Demo
-from unirender_evaluation.figures_command import Figures
+from unirender_evaluation.figures.command import Figures
 from unirender_evaluation.public.command import BenchPublic
 from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.studies.derived_light.command import BenchDerivedLight

@@ -21,7 +21,7 @@ from tiny_suites import write_suite
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation import workers
-from unirender_evaluation.figures import Grid, Line, Tile, save
+from unirender_evaluation.figures.grid import Grid, Line, Tile, save
 from unirender_evaluation.methods import UneditedInput
 from unirender_evaluation.pictures import write_sheet
 from unirender_evaluation.rows import make_row

@@ -23,7 +23,7 @@ from unirender.errors import UnirenderError
 from unirender.input_picture import read_input
 from unirender.lighting import resample_environment
 from unirender.pictures import Picture
-from unirender_evaluation.figures_pictures import framed
+from unirender_evaluation.figures.pictures import framed
 from unirender_reference.lights import load_light
 
 SIDES = (64, 128)  # pixels of the square in which the page works

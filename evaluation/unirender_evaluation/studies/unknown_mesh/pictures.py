@@ -5,7 +5,7 @@ from PIL import Image
 
 from unirender.color import unpremultiply
 from unirender.files import map_picture
-from unirender_evaluation.figures import Grid, Line, Tile, draw, over_white
+from unirender_evaluation.figures.grid import Grid, Line, Tile, draw, over_white
 from unirender_evaluation.gallery import Picture
 from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.multiview.scoring import Looks, true_looks

@@ -12,10 +12,10 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
-from unirender_evaluation.figures_command import Figures
-from unirender_evaluation.figures_overview import MAPS
-from unirender_evaluation.figures_panels import Subject
-from unirender_evaluation.figures_pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
+from unirender_evaluation.figures.command import Figures
+from unirender_evaluation.figures.overview import MAPS
+from unirender_evaluation.figures.panels import Subject
+from unirender_evaluation.figures.pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
 from unirender_evaluation.methods import InputAsAlbedo
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites import load_suite

@@ -13,7 +13,7 @@ from unirender.camera import DEFAULT_FILL, Camera
 from unirender.color import image_srgb
 from unirender.files import map_picture
 from unirender.lighting import environment_directions
-from unirender_evaluation.figures import over_white
+from unirender_evaluation.figures.grid import over_white
 from unirender_evaluation.suites import Scene, Suite
 
 if TYPE_CHECKING:

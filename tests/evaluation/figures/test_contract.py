@@ -8,8 +8,8 @@ from PIL import Image
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
-from unirender_evaluation.figures_command import CONTRACT, KINDS, Figures
-from unirender_evaluation.figures_contract import SAID, ball, camera_figure, maps_figure, png, texel_of
+from unirender_evaluation.figures.command import CONTRACT, KINDS, Figures
+from unirender_evaluation.figures.contract import SAID, ball, camera_figure, maps_figure, png, texel_of
 from unirender_evaluation.suites import Suite
 
 

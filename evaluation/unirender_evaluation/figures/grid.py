@@ -1,6 +1,6 @@
 """Draws the paper's kinds of figure: a grid of labelled pictures, in rows that belong to one scene.
 
-A grid says what stands where; `figures_panels` fills it. Pictures are display values in [0, 1] over white, `[h, w, 3]`,
+A grid says what stands where; `panels` fills it. Pictures are display values in [0, 1] over white, `[h, w, 3]`,
 enlarged by a whole factor without interpolation, so that every pixel of the suite can be counted. A grid of many
 columns is folded: a page would shrink it until nobody can read its labels.
 """

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.figures import Grid, Line, Shown, Tile
-from unirender_evaluation.figures_panels import Subject, able, input_tile
+from unirender_evaluation.figures.grid import Grid, Line, Shown, Tile
+from unirender_evaluation.figures.panels import Subject, able, input_tile
 from unirender_evaluation.light_balls import GLOSSY, ball_mask, ball_values
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.pictures import BALL_PICTURES, BALLS, ball_pictures

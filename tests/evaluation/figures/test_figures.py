@@ -12,7 +12,8 @@ from PIL import Image, ImageFont
 from tiny_suites import SIZE, make_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.figures import (
+from unirender_evaluation.figures.command import Figures, default_scenes, labels
+from unirender_evaluation.figures.grid import (
     FONT,
     GAP,
     HEADING_LINES,
@@ -27,10 +28,9 @@ from unirender_evaluation.figures import (
     folded,
     save,
 )
-from unirender_evaluation.figures_command import Figures, default_scenes, labels
-from unirender_evaluation.figures_light import light_figure
-from unirender_evaluation.figures_overview import MAPS, overview
-from unirender_evaluation.figures_panels import (
+from unirender_evaluation.figures.light import light_figure
+from unirender_evaluation.figures.overview import MAPS, overview
+from unirender_evaluation.figures.panels import (
     MitsubaTruth,
     Subject,
     comparison_sheet,
@@ -364,6 +364,6 @@ def test_where_none_is_named_the_checkpoint_is_the_one_for_the_suites_pictures()
 
 
 def test_the_command_is_light_to_import() -> None:
-    code = "import sys, unirender_evaluation.figures_command; print({'torch', 'mitsuba', 'PIL'} & sys.modules.keys())"
+    code = "import sys, unirender_evaluation.figures.command; print({'torch', 'mitsuba', 'PIL'} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

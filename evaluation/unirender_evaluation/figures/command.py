@@ -15,8 +15,8 @@ from unirender.options import Device
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
-    from unirender_evaluation.figures import Grid
-    from unirender_evaluation.figures_panels import MitsubaTruth, Subject
+    from unirender_evaluation.figures.grid import Grid
+    from unirender_evaluation.figures.panels import MitsubaTruth, Subject
     from unirender_evaluation.suites import Scene, Suite
 
 Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview", "light"]  # of checkpoints and methods
@@ -92,8 +92,8 @@ class Figures:
         self.check()
         from rich.console import Console
 
-        from unirender_evaluation.figures import Grid, save
-        from unirender_evaluation.figures_panels import MitsubaTruth, Subject
+        from unirender_evaluation.figures.grid import Grid, save
+        from unirender_evaluation.figures.panels import MitsubaTruth, Subject
         from unirender_evaluation.suites import load_suite
 
         suite = load_suite(self.suite)
@@ -122,7 +122,7 @@ class Figures:
     def explain(self, kind: Contract, suite: "Suite", scene: "Scene") -> Path:
         """A figure of the data contract."""
         from unirender.whole_files import replace_file
-        from unirender_evaluation import figures_contract as contract
+        from unirender_evaluation.figures import contract
 
         drawn = contract.maps_figure(suite, scene) if kind == "maps" else contract.camera_figure(suite.spec.camera)
         return replace_file(self.out / f"{kind}.png", contract.png(drawn))
@@ -133,7 +133,7 @@ class Figures:
         Raises:
             UnirenderError: some of them cannot be used; all are named.
         """
-        from unirender_evaluation.figures_pictures import framed, read_cut_out
+        from unirender_evaluation.figures.pictures import framed, read_cut_out
 
         found, problems = [], []
         for path in self.pictures:
@@ -147,14 +147,14 @@ class Figures:
 
     def sheet(self, subjects: "list[Subject]", suite: "Suite", pictures: "list[Picture]") -> "Grid":
         """The figure of the user's pictures, relit by lights of the suite."""
-        from unirender_evaluation.figures_pictures import pictures_sheet
+        from unirender_evaluation.figures.pictures import pictures_sheet
 
         lights = {scene.light: suite.environment(scene) for scene in self.relit_by(suite, [])}
         return pictures_sheet(subjects, pictures, lights, suite.spec.camera)
 
     def relit_by(self, suite: "Suite", scenes: "Sequence[Scene]") -> "list[Scene]":
         """Scenes of the suite with the lights of relightings; a notice where there are fewer than were asked for."""
-        from unirender_evaluation.figures_panels import other_lights
+        from unirender_evaluation.figures.panels import other_lights
 
         found = other_lights(suite, scenes, self.lights)
         if len(found) < self.lights:
@@ -171,7 +171,7 @@ class Figures:
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
         from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
-        from unirender_evaluation.figures_panels import Subject
+        from unirender_evaluation.figures.panels import Subject
         from unirender_evaluation.pipeline_method import PipelineMethod
         from unirender_evaluation.plugins import named_plugin
         from unirender_evaluation.rows import make_row, plugin_rows
@@ -194,13 +194,12 @@ class Figures:
         self, kind: Asked, subjects: "list[Subject]", suite: "Suite", scenes: "list[Scene]", truth: "MitsubaTruth"
     ) -> "Grid":
         """One figure."""
-        from unirender_evaluation import figures_light, figures_overview
-        from unirender_evaluation import figures_panels as panels
+        from unirender_evaluation.figures import light, overview, panels
 
         if kind == "light":
-            return figures_light.light_figure(subjects, suite, scenes)
+            return light.light_figure(subjects, suite, scenes)
         if kind == "overview":
-            return figures_overview.overview(subjects, suite, scenes)
+            return overview.overview(subjects, suite, scenes)
         if kind == "comparison":
             return panels.comparison_sheet(subjects, suite, scenes)
         if kind == "relighting":

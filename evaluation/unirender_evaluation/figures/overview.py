@@ -11,8 +11,8 @@ import numpy as np
 from unirender.files import map_picture
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
-from unirender_evaluation.figures import Grid, Line, Tile, over_white
-from unirender_evaluation.figures_panels import Subject, able, input_tile, picture_over_white
+from unirender_evaluation.figures.grid import Grid, Line, Tile, over_white
+from unirender_evaluation.figures.panels import Subject, able, input_tile, picture_over_white
 from unirender_evaluation.methods import Mask
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture

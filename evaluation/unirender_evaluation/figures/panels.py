@@ -17,7 +17,7 @@ from unirender.color import image_srgb, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
 from unirender_evaluation.engine import answer, answered, ask
-from unirender_evaluation.figures import Grid, Line, Tile
+from unirender_evaluation.figures.grid import Grid, Line, Tile
 from unirender_evaluation.methods import Image, Mask, capabilities
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.mitsuba_method import MitsubaScene

@@ -15,9 +15,9 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.pictures import Picture, check_mask, read_picture
-from unirender_evaluation.figures import Grid, Line, Tile
-from unirender_evaluation.figures_overview import MAPS, map_tiles
-from unirender_evaluation.figures_panels import Subject, able, input_tile, picture_over_white
+from unirender_evaluation.figures.grid import Grid, Line, Tile
+from unirender_evaluation.figures.overview import MAPS, map_tiles
+from unirender_evaluation.figures.panels import Subject, able, input_tile, picture_over_white
 
 SIDE = 128  # pixels of the square in which methods see an object
 MARGIN = 0.1  # of that square, left free on each side of the object at least
