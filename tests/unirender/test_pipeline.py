@@ -164,6 +164,8 @@ def test_a_batch_is_one_pass_and_each_picture_is_what_it_is_alone(monkeypatch: p
         ({"masks": [None]}, "2 pictures, 1 masks"),
         ({"cameras": [Camera()] * 3}, "3 cameras"),
         ({"generator": [torch.Generator()] * 3}, "got 3 for 2 pictures"),
+        ({"images_srgb": picture()[0]}, "images_srgb: got one array of shape"),
+        ({"masks": picture()[1]}, "masks: got one array of shape"),
     ],
 )
 def test_a_batch_that_does_not_fit_is_refused(pipeline: UniRenderPipeline, change: dict, words: str) -> None:

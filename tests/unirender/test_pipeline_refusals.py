@@ -108,8 +108,25 @@ def test_a_picture_of_another_shape_is_told_how_to_fit(shape: tuple[int, ...], w
 def test_one_picture_is_no_batch() -> None:
     one = Image.new("RGB", (SIZE, SIZE), "grey")
     with pytest.raises(UnirenderError, match="masks: got one Image, expected a list, one for each picture"):
-        as_list("masks", one)
-    assert as_list("masks", (one, None)) == [one, None]
+        as_list("masks", one, 1)
+    assert as_list("masks", (one, None), 1) == [one, None]
+    with pytest.raises(UnirenderError, match="images_srgb: got one str, expected a list"):
+        as_list("images_srgb", "photos", 3)
+
+
+@pytest.mark.parametrize(("shape", "channels"), [((9, 8, 3), 3), ((9, 8), 3), ((), 3), ((9, 8, 1), 1), ((9, 8), 1)])
+def test_one_array_is_no_batch(shape: tuple[int, ...], channels: int) -> None:
+    with pytest.raises(UnirenderError, match=r"maps: got one array of shape .*; one picture goes to `decompose`"):
+        as_list("maps", np.zeros(shape, np.float32), channels)
+
+
+@pytest.mark.parametrize(("shape", "channels"), [((2, 9, 8, 3), 3), ((2, 9, 8, 1), 1), ((2, 9, 8), 1)])
+def test_an_array_of_pictures_or_masks_is_a_batch(shape: tuple[int, ...], channels: int) -> None:
+    batch = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    np.testing.assert_array_equal(as_list("maps", batch, channels), batch)
+    unlike = np.empty(2, object)
+    unlike[:] = [batch[0], batch[0, 1:]]
+    assert as_list("maps", unlike, channels) == list(unlike)
 
 
 def test_a_turned_photograph_is_said_to_be_so(caplog: pytest.LogCaptureFixture) -> None:

@@ -30,13 +30,24 @@ RANGE_ADVICE = "divide 8 bits by 255 and 16 bits by 65535; tone-map or clip radi
 logger = logging.getLogger(__name__)
 
 
-def as_list(name: str, several: Any) -> list[Any]:
+def as_list(name: str, several: Any, channels: int) -> list[Any]:
     """What is handed in for several pictures, one by one.
 
+    Args:
+        name: of the argument.
+        several: pictures or masks, or an array of them [n h w channels]; of masks [n h w], too.
+        channels: of each of them.
+
     Raises:
-        UnirenderError: a PIL picture, or something else that is one.
+        UnirenderError: a PIL picture, an array that is one picture or mask, or something else that is one.
     """
-    if not isinstance(several, Iterable):
+    if isinstance(several, np.ndarray) and several.dtype != object and not _is_batch(several, channels):
+        shapes = f"[n, height, width, {channels}]" + (" or [n, height, width]" if channels == 1 else "")
+        raise UnirenderError(
+            f"{name}: got one array of shape {several.shape}, expected a list, one for each picture, or an array "
+            f"{shapes}; one picture goes to `decompose`"
+        )
+    if isinstance(several, str) or not isinstance(several, Iterable):
         raise UnirenderError(f"{name}: got one {type(several).__name__}, expected a list, one for each picture")
     return list(several)
 
@@ -256,6 +267,11 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
         )
     given = _checked(name, given, "roughness and metallic are fractions")
     return constant_map(given.reshape(mask.shape if given.size != 1 else ()), mask)
+
+
+def _is_batch(array: np.ndarray, channels: int) -> bool:
+    """Whether an array is several pictures or masks; [h, w, 1] is one mask, [n, h, w] are several."""
+    return array.ndim >= 4 or (channels == 1 and array.ndim == 3 and array.shape[-1] != 1)
 
 
 def _shape_advice(shape: tuple[int, ...]) -> str:

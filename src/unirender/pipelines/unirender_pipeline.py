@@ -172,8 +172,8 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `decompose`; no pictures, or another number of masks, cameras or generators.
         """
         check_switches(tile=tile, closed=closed, flat=flat)
-        images_srgb = as_list("images_srgb", images_srgb)
-        masks = [None] * len(images_srgb) if masks is None else as_list("masks", masks)
+        images_srgb = as_list("images_srgb", images_srgb, channels=3)
+        masks = [None] * len(images_srgb) if masks is None else as_list("masks", masks, channels=1)
         cameras = list_cameras(cameras, len(images_srgb))
         if not images_srgb or {len(images_srgb)} != {len(masks), len(cameras)}:
             raise UnirenderError(
