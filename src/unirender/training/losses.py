@@ -19,8 +19,8 @@ from torch import Tensor
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.added import Answers
-from unirender.models.conditioning import Conditioning
-from unirender.models.dual_stream import DualStreamModel
+from unirender.models.conditioning import Conditioning, Extras
+from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.packing import TRIPLETS, pack_image
 from unirender.models.picture_encoder import answers_error, truth_of
 from unirender.models.priors import Maps
@@ -67,16 +67,8 @@ class LossFunction:
         if self.encoder_alone:
             return self._encoder_terms(batch)
         clean_a, clean_i = self._encode(batch)
-        seen, derived = self._seen(batch, timesteps.attributes == 0)
-        shown_a = clean_a if seen is batch else self._encode_attributes(seen)
         noisy_a, noisy_i = (t.cpu() > 0 for t in (timesteps.attributes, timesteps.image))  # a GPU is waited for once
-        given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
-        known = self.conditioning.by_triplet(self.conditioning.in_latents(given) | noisy_a[:, None]).to(clean_a.device)
-        given = given.to(clean_a.device)
-        noise_a = noise_like(clean_a, generator)
-        attributes = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
-        image = add_noise(self.scheduler, clean_i, noise_like(clean_i, generator), timesteps.image)
-        extras = self.conditioning.extras(batch["mask"], given, seen, derived=derived)
+        attributes, image, extras = self._noised(batch, clean_a, clean_i, timesteps, noisy_a, generator)
         span_a, span_i = _span(noisy_a), _span(noisy_i)
         output = predict(self.model, attributes, image, timesteps, extras, span_a, span_i)
         errors = Errors(self.conditioning, self.config.background)
@@ -84,29 +76,17 @@ class LossFunction:
         if span_i is not None:
             assert output.image is not None
             rows = _Rows(span_i, noisy_i)
-            weights = self._timestep_weights(rows.of(timesteps.image))
-            terms["image"] = errors.image(
-                rows.of_decoded(output.image),
-                rows.of(clean_i),
-                rows.of(batch["mask"]),
-                weights,
-                self.config.image_floor,
-            )
+            truth, mask, t = (rows.of(x) for x in (clean_i, batch["mask"], timesteps.image))
+            predicted = rows.of_decoded(output.image)
+            terms["image"] = errors.image(predicted, truth, mask, self._timestep_weights(t), self.config.image_floor)
         if span_a is not None:
             assert output.attributes is not None
             rows = _Rows(span_a, noisy_a)
-            weights = self._timestep_weights(rows.of(timesteps.attributes))
+            truth, mask, t = (rows.of(x) for x in (clean_a, batch["mask"], timesteps.attributes))
             predicted = rows.of_decoded(output.attributes)
-            terms |= errors.attributes(
-                predicted, rows.of(clean_a), rows.of(batch["mask"]), weights, self.config.colour_floor
-            )
+            terms |= errors.attributes(predicted, truth, mask, self._timestep_weights(t), self.config.colour_floor)
             inverse = _Rows(span_a, noisy_a & ~noisy_i)
-            part = {name: inverse.of(batch[name]) for name in ("image", "mask")}
-            predicted = inverse.of_decoded(output.attributes).float()
-            terms |= self._consistency(predicted, inverse.of(clean_i), part, errors, generator)
-            if output.answers is not None and self.config.answers and len(predicted):
-                answers = output.answers.each(inverse.of_decoded)
-                terms["answers"] = self._answers_error(answers, {name: inverse.of(x) for name, x in batch.items()})
+            terms |= self._inverse_terms(output, clean_i, batch, inverse, errors, generator)
         return terms
 
     def total(self, terms: LossTerms) -> Float[Tensor, ""]:
@@ -114,6 +94,26 @@ class LossFunction:
         scale = {"cycle": self.cycle_scale}
         weights = [getattr(self.config, name) * scale.get(name, 1.0) for name in terms]
         return torch.stack([weight * term for weight, term in zip(weights, terms.values(), strict=True)]).sum()
+
+    def _noised(
+        self,
+        batch: Maps,
+        clean_a: Float[Tensor, "b nc h w"],
+        clean_i: Float[Tensor, "b c h w"],
+        timesteps: Timesteps,
+        noisy_a: Bool[Tensor, " b"],
+        generator: torch.Generator,
+    ) -> tuple[Float[Tensor, "b nc h w"], Float[Tensor, "b c h w"], Extras]:
+        """Both streams' latents at their timesteps, and what enters beside them; dropped maps are noise throughout."""
+        seen, derived = self._seen(batch, timesteps.attributes == 0)
+        shown_a = clean_a if seen is batch else self._encode_attributes(seen)
+        given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
+        known = self.conditioning.by_triplet(self.conditioning.in_latents(given) | noisy_a[:, None]).to(clean_a.device)
+        given = given.to(clean_a.device)
+        noise_a = noise_like(clean_a, generator)
+        attributes = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
+        image = add_noise(self.scheduler, clean_i, noise_like(clean_i, generator), timesteps.image)
+        return attributes, image, self.conditioning.extras(batch["mask"], given, seen, derived=derived)
 
     @torch.no_grad()  # an autoencoder is not trained here, and its activations would be kept
     def _encode(self, batch: Maps) -> tuple[Tensor, Tensor]:
@@ -154,18 +154,30 @@ class LossFunction:
         shadowed = batch["shadowed"].flatten()[:, None] > 0
         return batch | swapped, rows[:, None] & torch.where(shadowed, of_diffuse, of_light)
 
-    def _consistency(
-        self, predicted: Tensor, clean_i: Tensor, batch: Maps, errors: Errors, generator: torch.Generator
+    def _inverse_terms(
+        self,
+        output: DualStreamOutput,
+        clean_i: Float[Tensor, "b c h w"],
+        batch: Maps,
+        inverse: "_Rows",
+        errors: Errors,
+        generator: torch.Generator,
     ) -> LossTerms:
-        """The terms of inverse rows; the cycle's of a share of them only."""
+        """What the attributes predicted of clean images render to (the cycle: of a share of the rows), and the answers
+        of the picture encoder's heads."""
+        assert output.attributes is not None
+        predicted = inverse.of_decoded(output.attributes).float()
+        truth, image, mask = (inverse.of(x) for x in (clean_i, batch["image"], batch["mask"]))
         consistency = Consistency(self.model, self.conditioning, self.scheduler, self.config, errors, self.scale)
         terms: LossTerms = {}
         if self.config.composite and len(predicted):
-            terms["composite"] = consistency.composite(predicted, batch["image"], batch["mask"])
+            terms["composite"] = consistency.composite(predicted, image, mask)
         count = round(self.config.cycle_share * len(predicted))
         if self.config.cycle and self.cycle_scale and count:
-            some = predicted[:count], clean_i[:count], batch["mask"][:count]
-            terms["cycle"] = consistency.cycle(*some, generator)
+            terms["cycle"] = consistency.cycle(predicted[:count], truth[:count], mask[:count], generator)
+        if output.answers is not None and self.config.answers and len(predicted):
+            answers = output.answers.each(inverse.of_decoded)
+            terms["answers"] = self._answers_error(answers, {name: inverse.of(x) for name, x in batch.items()})
         return terms
 
     def _timestep_weights(self, timestep: Int[Tensor, " b"]) -> Float[Tensor, " b"] | None:
