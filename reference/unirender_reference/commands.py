@@ -182,8 +182,14 @@ class Dataset:
                 verify=self.verify,
             )
         print(self._summary(report))
-        if report.floor is not None:
-            floor = report.floor
+        self._tell_noise(report, MOST_SPP)
+        self._tell_lights(report)
+        self._tell_failures(report)
+        return 1 if report.failures else 0
+
+    def _tell_noise(self, report: "GenerateReport", most_spp: int) -> None:
+        """What was reached of --noise-floor, and what noise leaves below 0 in a sweep."""
+        if (floor := report.floor) is not None:
             print(
                 f"noise floor {self.noise_floor:g} dB: reached by {floor.reached} of {floor.buffers} images, s and d; "
                 f"the lowest is at {floor.minimum_db:.1f} dB"
@@ -193,13 +199,16 @@ class Dataset:
                     "%d images, s and d did not reach the noise floor with the %d samples per pixel at which sampling "
                     "ends; the json of each group says which, and what they reached",
                     floor.buffers - floor.reached,
-                    MOST_SPP,
+                    most_spp,
                 )
-        if config.vary == "sweep":
+        if self.vary == "sweep":
             print(
                 f"{report.negative_pixels} pixels of interpolated pictures have a channel below 0: their noise is "
                 "unbiased and not clipped"
             )
+
+    def _tell_lights(self, report: "GenerateReport") -> None:
+        """Which files of --lights are none."""
         for line in report.unreadable_lights[:SHOWN_LIGHTS]:
             _log.warning("no light: %s", line)
         if report.unreadable_lights:
@@ -208,6 +217,9 @@ class Dataset:
                 len(report.unreadable_lights),
                 self.out / "manifest.json",
             )
+
+    def _tell_failures(self, report: "GenerateReport") -> None:
+        """Which mesh files failed, and which of them another run may bring."""
         for failure in report.failures[:SHOWN_FAILURES]:
             _log.warning("%s: %s", failure.file, failure.reason)
         if report.failures:
@@ -218,7 +230,6 @@ class Dataset:
                 "%d of them lacked time or memory, or their worker died; the same command tries these again",
                 len(again),
             )
-        return 1 if report.failures else 0
 
     def _summary(self, report: "GenerateReport") -> str:
         if report.workers == 0:
