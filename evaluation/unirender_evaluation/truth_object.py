@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ __all__ = ["PART", "ObjectJob", "object_hash", "render_object"]
 
 PART = "part.json"
 Environment = Float[np.ndarray, "eh ew 3"]
+Mask = Float[np.ndarray, "h w 1"]
 
 
 @dataclass(frozen=True)
@@ -93,20 +94,10 @@ def render_object(job: ObjectJob) -> Path:
         hashes[key] = list(hash_of.values())
         twins = (job.source.name, index) in spec.ceiling_scenes
         for buffer in _buffers(renderer, spec, scene, environment, hash_of):
-            first = item_seed(spec.name, buffer.name)
-            found, channels = render_to_ceiling(buffer.render, mask, spec, first, buffer.kind)
-            ceiling = stored_ceiling_db(channels, mask, buffer.kind)
-            quality[buffer.name] = {"spp": found.spp, "ceiling_db": round(ceiling, 3), "nan_pixels": found.nan_pixels}
-            made = _made(buffer, found.spp, found.nan_pixels, ceiling, first)
-            members[buffer.name] = exr_bytes(channels, attributes={**header, **made})
+            members[buffer.name], quality[buffer.name] = _member(buffer, spec, mask, header)
             if twins and buffer.has_twin:
-                spp, other = good_spp(spec.ceiling_factor * found.spp, spec), item_seed(spec.name, CEILING, buffer.name)
-                twin = buffer.render(spp, other)
-                mean, variance = (x[..., :3].astype(np.float64) for x in (twin.mean, twin.variance))
-                channels = estimate_channels(buffer.kind, mean, None, mask)
-                ceiling = noise_floor_db(mean, variance, mask, buffer.kind == "image")
-                made = _made(buffer, spp, twin.nan_pixels, ceiling, other)
-                members[CEILING + buffer.name] = exr_bytes(channels, attributes={**header, **made})
+                spp = good_spp(spec.ceiling_factor * quality[buffer.name]["spp"], spec)
+                members[CEILING + buffer.name] = _twin_member(buffer, spec, spp, mask, header)
     shared = {**header, "spp": str(spec.geometry_spp), "seed": str(seed)}
     shared["scene"] = shared_scene_hash(h for own in hashes.values() for h in own)
     members[shared_member(name)] = exr_bytes(intrinsics_channels(geometry), attributes=shared)
@@ -177,6 +168,26 @@ def _buffers(
 
         attributes = {**common, "depth": str(IMAGE_DEPTH), "metallic": f"{m:g}", "roughness": f"{r:g}", "scene": own}
         yield _Buffer(image_member(scene.key, (m, r)), "image", image, attributes, (m, r) in (spec.base, *spec.edits))
+
+
+def _member(buffer: _Buffer, spec: SuiteSpec, mask: Mask, header: Mapping[str, str]) -> tuple[bytes, dict[str, Any]]:
+    """A buffer rendered to the suite's ceiling, as an EXR; and the samples, the ceiling and the NaN pixels it had."""
+    seed = item_seed(spec.name, buffer.name)
+    found, channels = render_to_ceiling(buffer.render, mask, spec, seed, buffer.kind)
+    ceiling = stored_ceiling_db(channels, mask, buffer.kind)
+    made = _made(buffer, found.spp, found.nan_pixels, ceiling, seed)
+    quality = {"spp": found.spp, "ceiling_db": round(ceiling, 3), "nan_pixels": found.nan_pixels}
+    return exr_bytes(channels, attributes={**header, **made}), quality
+
+
+def _twin_member(buffer: _Buffer, spec: SuiteSpec, spp: int, mask: Mask, header: Mapping[str, str]) -> bytes:
+    """A buffer's near-noise-free twin as an EXR: other noise and more samples, and no variance beside it."""
+    seed = item_seed(spec.name, CEILING, buffer.name)
+    twin = buffer.render(spp, seed)
+    mean, variance = (x[..., :3].astype(np.float64) for x in (twin.mean, twin.variance))
+    ceiling = noise_floor_db(mean, variance, mask, buffer.kind == "image")
+    made = _made(buffer, spp, twin.nan_pixels, ceiling, seed)
+    return exr_bytes(estimate_channels(buffer.kind, mean, None, mask), attributes={**header, **made})
 
 
 def _made(buffer: _Buffer, spp: int, nan_pixels: int, ceiling_db: float, seed: int) -> dict[str, str]:
