@@ -303,7 +303,7 @@ def test_every_answer_has_the_policy_and_only_html_is_changed(kind: str) -> None
     async def send(message: Any) -> None:
         sent.append(message)
 
-    asyncio.run(server.NothingElsewhere(app)({"type": "http"}, None, send))  # type: ignore[arg-type] - never received
+    asyncio.run(server.NothingElsewhere(app)({"type": "http"}, None, send))  # pyright: ignore[reportArgumentType] - never received
     headers = dict(sent[0]["headers"])
     assert b"default-src 'self'" in headers[b"content-security-policy"]
     body = b"".join(message["body"] for message in sent[1:]).decode()

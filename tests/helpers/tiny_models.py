@@ -1,6 +1,7 @@
 """Very small dual-stream models and batches, for tests of the model, the losses, the trainer and the pipeline."""
 
 import dataclasses
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -34,10 +35,10 @@ TRAIN = TrainConfig(
 )
 
 
-def make_model(seed: int = 0, **changes: object) -> tuple[DualStreamModel, Conditioning]:
+def make_model(seed: int = 0, **changes: Any) -> tuple[DualStreamModel, Conditioning]:
     """A model with everything at random, the zero convolutions too: no path is silent."""
     torch.manual_seed(seed)
-    model, conditioning = build_model(dataclasses.replace(MODEL, **changes))  # type: ignore[arg-type]  # any field
+    model, conditioning = build_model(dataclasses.replace(MODEL, **changes))
     with torch.no_grad():
         for p in model.parameters():
             if not p.any():

@@ -10,6 +10,7 @@ import tarfile
 import time
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,14 +32,14 @@ SIZE = 8
 SPP = 16
 
 
-def config(out: Path, objects: int = 2, pairs: int = 3, vary: str = "basis", **changes: object) -> DatasetConfig:
-    return DatasetConfig(objects, pairs, SIZE, vary, out, **{"spp": SPP, "workers": 1, **changes})  # type: ignore[arg-type] - from tests
+def config(out: Path, objects: int = 2, pairs: int = 3, vary: Any = "basis", **changes: Any) -> DatasetConfig:
+    return DatasetConfig(objects, pairs, SIZE, vary, out, **{"spp": SPP, "workers": 1, **changes})
 
 
 def read_back(folder: Path) -> list[dict[str, bytes]]:
     """Every sample as the WebDataset library delivers it."""
     urls = [str(path) for path in sorted(folder.glob("*.tar"))]
-    return list(webdataset.WebDataset(urls, shardshuffle=False))  # type: ignore[attr-defined] - exported lazily
+    return list(webdataset.WebDataset(urls, shardshuffle=False))  # pyright: ignore[reportAttributeAccessIssue] - exported lazily
 
 
 @pytest.mark.parametrize(

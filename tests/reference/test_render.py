@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -233,7 +234,7 @@ def test_stated_variance_is_the_variance_between_seeds(buffer: str) -> None:
     ]
     means = np.stack([estimate.mean[..., :3] for estimate in estimates]).astype(np.float64)
     stated = np.mean([estimate.variance[..., :3] for estimate in estimates if estimate.variance is not None], axis=0)
-    full = renderer.geometry(256).mask[..., 0] > 0.999  # type: ignore[index] - geometry always has a mask
+    full = renderer.geometry(256).require("mask")["mask"][..., 0] > 0.999
     ratio = (means.var(axis=0, ddof=1) / np.maximum(stated, 1e-20))[full]
     # Mean over independent pixels (channels are correlated: count pixels only); 24 - 1 degrees of freedom each.
     freedom = 23 * len(ratio)
@@ -337,9 +338,9 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         *("no bounce", "above the zenith", "nan azimuth"),
     ],
 )
-def test_bad_arguments_are_refused(renderer: Renderer, call: object) -> None:
+def test_bad_arguments_are_refused(renderer: Renderer, call: Callable[[Renderer], object]) -> None:
     with pytest.raises(UnirenderError, match="expected"):
-        call(renderer)  # type: ignore[operator] - a lambda of the list above
+        call(renderer)
 
 
 def test_paths_without_an_end_are_mitsubas(renderer: Renderer) -> None:

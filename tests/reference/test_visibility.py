@@ -124,7 +124,7 @@ def test_a_data_set_of_it_is_read_back(tmp_path: Path) -> None:
     command = Dataset(out=tmp_path / "data", vary="visibility", objects=2, resolution=16, workers=1, turn_objects=True)
     assert command.run() == 0
     urls = [str(path) for path in sorted((tmp_path / "data").glob("*.tar"))]
-    groups = list(webdataset.WebDataset(urls, shardshuffle=False))  # type: ignore[attr-defined] - exported lazily
+    groups = list(webdataset.WebDataset(urls, shardshuffle=False))  # pyright: ignore[reportAttributeAccessIssue] - exported lazily
     assert len(groups) == 2
     for group in groups:
         assert set(group) - {"__key__", "__url__", "__local_path__"} == {"shared.exr", "visible.npy", "json"}

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,7 +19,7 @@ from unirender.models.unet import pyramid_channels
 from unirender.training.presets import PRESETS
 
 
-def small(**changes: object) -> DualStreamModel:
+def small(**changes: Any) -> DualStreamModel:
     torch.manual_seed(0)
     settings = {
         "attribute_channels": 24,
@@ -30,7 +31,7 @@ def small(**changes: object) -> DualStreamModel:
         "prompt_tokens": 3,
         "norm_num_groups": 8,
     }
-    return DualStreamModel(**(settings | changes)).eval()  # type: ignore[arg-type]  # any field
+    return DualStreamModel(**(settings | changes)).eval()
 
 
 def inputs(model: DualStreamModel, batch: int = 3, size: int = 16) -> tuple[Tensor, Tensor, Tensor, Tensor]:

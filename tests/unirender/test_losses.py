@@ -31,9 +31,9 @@ T = 999
 MAPS = {"material", "albedo", "normal", "specular", "diffuse", "environment"}
 
 
-def loss_function(map_dropout: float = 0.0, prior: str = "split_sum", **changes: object) -> LossFunction:
+def loss_function(map_dropout: float = 0.0, prior: str = "split_sum", **changes: Any) -> LossFunction:
     model, conditioning = make_model(physics_prior=prior)
-    config = dataclasses.replace(LossConfig(cycle_share=1.0), **changes)  # type: ignore[arg-type] - any field
+    config = dataclasses.replace(LossConfig(cycle_share=1.0), **changes)
     return LossFunction(model, conditioning, make_scheduler(), config, map_dropout)
 
 

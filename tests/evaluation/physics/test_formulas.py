@@ -1,5 +1,7 @@
 """Each physics test: a perfect renderer or decomposer passes, and a broken one (its twin) fails that test."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from tiny_suites import make_suite
@@ -112,8 +114,8 @@ def unshadowed_share(suite: Suite, scene: Scene) -> float:
 class OneShading(Stage):
     """The composite in Mitsuba's place: nothing is rendered, and the loops of the true maps are exact here."""
 
-    def shaded(self, maps: Intrinsics, shader: object, light: object) -> Image:
-        return super().shaded(maps, "composite", light)  # type: ignore[arg-type]  # one of Light
+    def shaded(self, maps: Intrinsics, shader: Any, light: Any) -> Image:
+        return super().shaded(maps, "composite", light)
 
 
 def test_loss_is_what_the_found_maps_lose(suite: Suite) -> None:

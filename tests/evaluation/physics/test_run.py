@@ -31,7 +31,7 @@ from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.physics.tests import TESTS
 from unirender_evaluation.physics.tracer import MIRROR, PathTracer, moved
 from unirender_evaluation.suites import load_suite
-from unirender_reference.shapes import make_object
+from unirender_reference.shapes import MeshObject, make_object
 
 SCENE = "test-000015_l1"  # its truth took the fewest samples
 
@@ -67,7 +67,7 @@ def test_rows_of_a_test(tmp_path: Path) -> None:
     tracer.stage = stage
     render, decompose = TESTS["roll"], TESTS["loss_rough"]
     assert tuple(physics_run.subjects(render, tracer, ours)) == ROWS
-    ours.decompose = lambda **_: None  # type: ignore[attr-defined]  # a method's
+    ours.decompose = lambda **_: None  # pyright: ignore[reportAttributeAccessIssue] - of methods that decompose
     assert set(ROWS) - set(physics_run.subjects(decompose, tracer, ours)) == {COMPOSITE}
     posterior = TESTS["ambiguity_share"]
     assert set(physics_run.subjects(posterior, tracer, ours)) == {MITSUBA, TWIN}
@@ -101,10 +101,10 @@ def test_moved_meshes_stay_outside_out() -> None:
     a reflection's would not."""
     obj = make_object(0, "test")
 
-    def agreement(of: object) -> float:
-        corners = of.vertices[of.faces]  # type: ignore[attr-defined]  # a MeshObject
+    def agreement(of: MeshObject) -> float:
+        corners = of.vertices[of.faces]
         faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return float(np.mean((faces * of.normals[of.faces].mean(axis=1)).sum(axis=-1) > 0))  # type: ignore[attr-defined]  # a MeshObject
+        return float(np.mean((faces * of.normals[of.faces].mean(axis=1)).sum(axis=-1) > 0))
 
     assert agreement(obj) > 0.95
     assert agreement(moved(obj, turn_rotation(1))) == pytest.approx(agreement(obj), abs=0.01)

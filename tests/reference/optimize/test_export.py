@@ -51,7 +51,8 @@ def surface_points(obj: MeshObject, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     """A point of each face: position, uv and normal."""
     weights = np.random.default_rng(seed).dirichlet([1, 1, 1], len(obj.faces))[:, :, None]
     assert obj.uv is not None
-    return tuple((values[obj.faces] * weights).sum(1) for values in (obj.vertices, obj.uv, obj.normals))  # type: ignore[return-value] - three arrays
+    position, uv, normal = ((values[obj.faces] * weights).sum(1) for values in (obj.vertices, obj.uv, obj.normals))
+    return position, uv, normal
 
 
 def test_our_reader_sees_the_same_surface(solution: Solution, folder: Path):
