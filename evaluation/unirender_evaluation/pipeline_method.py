@@ -1,6 +1,7 @@
 """Our model as a benchmark method, and what identifies its checkpoint."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -10,45 +11,40 @@ from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.methods import Image, Mask
 
 
+@dataclass(eq=False, repr=False)
 class PipelineMethod:
     """Our model as a benchmark method.
 
-    Args:
+    Attributes:
         pipeline: a `UniRenderPipeline`.
         name: of the row.
+        weights: sha256 of the checkpoint.
         mode: "mean" (one step) or "sample".
         anchored: edits and relighting carry over what the decomposition could not explain.
         steps: denoising steps of "sample".
         samples: averaged per prediction in "sample".
         seed: of the generator; every call starts from it.
-        weights: sha256 of the checkpoint.
-        decompositions: shared with another row of the same pipeline and mode.
         closed: albedo, s and d are changed so that their rendering is the picture.
-        device: where the pipeline runs: another one rounds otherwise.
         looks: at each picture that is taken apart.
         flat: the albedo is made even between its edges.
+        device: where the pipeline runs: another one rounds otherwise.
+        decompositions: shared with another row of the same pipeline and mode.
     """
 
-    def __init__(
-        self,
-        pipeline: Any,
-        name: str,
-        mode: str,
-        anchored: bool,
-        steps: int,
-        samples: int,
-        seed: int,
-        weights: str,
-        decompositions: Decompositions[Any] | None = None,
-        closed: bool = True,
-        device: str = "cpu",
-        looks: int = 1,
-        flat: bool = False,
-    ) -> None:
-        self.pipeline, self.name, self.mode, self.anchored = pipeline, name, mode, anchored
-        self.closed, self.device, self.looks, self.flat = closed, device, looks, flat
-        self.steps, self.samples, self.seed, self.weights = steps, samples, seed, weights
-        self._decompositions = Decompositions[Any]() if decompositions is None else decompositions
+    pipeline: Any
+    name: str
+    weights: str
+    _: KW_ONLY
+    mode: str = "mean"
+    anchored: bool = False
+    steps: int = 1
+    samples: int = 1
+    seed: int = 0
+    closed: bool = True
+    looks: int = 1
+    flat: bool = False
+    device: str = "cpu"
+    decompositions: Decompositions[Any] = field(default_factory=Decompositions[Any])
 
     @property
     def config(self) -> dict[str, Any]:
@@ -83,7 +79,7 @@ class PipelineMethod:
         """Of a picture, computed once: the rows that share it differ in what they do with it."""
         options = {**self._options(), "closed": self.closed, "looks": self.looks, "flat": self.flat}
         make = partial(self.pipeline.decompose, image_srgb, mask=mask, camera=camera, **options)
-        return self._decompositions.of(image_srgb, mask, camera, make)[0]
+        return self.decompositions.of(image_srgb, mask, camera, make)[0]
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
         return self._decomposition(image_srgb, mask, camera).intrinsics

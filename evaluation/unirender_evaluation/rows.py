@@ -194,8 +194,8 @@ def our_rows(
     shared = Decompositions[Any]()
     edited: dict[str, Intrinsics] = {}
 
-    def ours(name: str, anchored: bool = False, mode: str = "mean", steps: int = 1, samples: int = 1, **options: Any):
-        return PipelineMethod(pipeline, name, mode, anchored, steps, samples, seed, weights, device=device, **options)
+    def ours(name: str, **options: Any) -> PipelineMethod:
+        return PipelineMethod(pipeline, name, weights, seed=seed, device=device, **options)
 
     mean = ours("Ours (mean)", decompositions=shared)
     anchored = ours("Ours (mean, anchored)", anchored=True, decompositions=shared)

@@ -23,7 +23,7 @@ class Counting:
 
 def test_rows_share_decompositions_but_thousands_of_them_are_not_kept() -> None:
     pipeline, shared, mask = Counting(), Decompositions[Any](), np.ones((2, 2, 1), np.float32)
-    rows = [PipelineMethod(pipeline, name, "mean", False, 1, 1, 0, "w", decompositions=shared) for name in "ab"]
+    rows = [PipelineMethod(pipeline, name, "w", decompositions=shared) for name in "ab"]
     pictures = [np.full((2, 2, 3), value, np.float32) for value in np.linspace(0, 1, 2 * KEPT)]
     for picture in pictures:
         for row in rows:

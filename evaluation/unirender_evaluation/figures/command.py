@@ -184,7 +184,7 @@ class Figures:
         for folder, label in zip(folders, labels(folders), strict=True):
             pipeline = ModelOptions(folder, self.device, "float32", progress=False).load()
             weights = checkpoint_sha256(folder)
-            method = PipelineMethod(pipeline, label, "mean", True, 1, 1, 0, weights, device=device)
+            method = PipelineMethod(pipeline, label, weights, anchored=True, device=device)
             found.append(Subject(label, make_row(method, "ours")))
         for row in plugin_rows([named_plugin(spec) for spec in self.method]):
             found.append(Subject(row.info.label, row))

@@ -62,7 +62,7 @@ def our_rows(public: PublicSet, checkpoint: Path | None, device: Device) -> list
     shared = Decompositions[Any]()
     rows = []
     for name, anchored in (("Ours (mean)", False), ("Ours (mean, anchored)", True)):
-        method = PipelineMethod(pipeline, name, "mean", anchored, 1, 1, 0, weights, decompositions=shared, device=place)
+        method = PipelineMethod(pipeline, name, weights, anchored=anchored, device=place, decompositions=shared)
         only = relighting(public) if anchored else None
         rows.append(make_row(method, "ours", steps=1, samples=1, uses=frozenset({MODEL}), protocols=only))
     return rows if relighting(public) else rows[:1]
