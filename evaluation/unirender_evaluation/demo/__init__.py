@@ -9,6 +9,7 @@
 | `panels` | pictures and captions as HTML |
 | `jobs` | one function for each thing that the page asks for |
 | `worker` | the process that runs them, each within a time limit |
-| `page` | the page itself; the only module, with `server`, that knows gradio |
+| `widgets` | what stands where on the page |
+| `page` | the page itself; the only modules that know gradio are `page`, `widgets` and `server` |
 | `server` | serves it, and sees to it that it asks no other host |
 """

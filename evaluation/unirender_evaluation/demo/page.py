@@ -1,5 +1,5 @@
-"""The page: what stands where, and which job each control asks for. The state of a session is in `gr.State`, so that
-visitors share the worker and nothing else.
+"""The page: which job each control asks for. What stands where is in `widgets`; the state of a session is in
+`gr.State`, so that visitors share the worker and nothing else.
 """
 
 import functools
@@ -14,27 +14,19 @@ from unirender.errors import UnirenderError
 from unirender.pictures import Picture
 from unirender_evaluation.demo import jobs
 from unirender_evaluation.demo.session import Controls, Environment, Subject
-from unirender_evaluation.demo.uploads import SIDES, Limits, Upload
+from unirender_evaluation.demo.uploads import Limits, Upload
+from unirender_evaluation.demo.widgets import INTRODUCTION, NOTHING, OWN, PREDICTED, Edited, Found, Given
 from unirender_evaluation.demo.worker import Worker
 from unirender_evaluation.gallery import data_uri
-from unirender_reference.lights import bundled_light, catalogue
+from unirender_reference.lights import bundled_light
 
-PICTURES = [".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".exr"]
-LIGHTS = [".hdr", ".exr", ".pfm", ".png", ".jpg", ".jpeg"]
-PREDICTED, OWN = "predicted", "own file"
 DECIMALS = 2  # of the sliders
 STATE_SECONDS = 3600  # for which a session that does nothing is remembered
 FILE_SECONDS = (60, 600)  # how often stray uploads are looked for, and from which age they are deleted
 QUEUE = 32  # requests that may wait
-NOTHING = "Drop in a picture or choose an example first."
 # One worker: one queue for all that is asked of it.
 EVENT: dict[str, Any] = {"concurrency_id": "worker", "concurrency_limit": 1, "api_visibility": "private"}
 Handler = Callable[..., Any]
-INTRODUCTION = """
-<h1>unirender</h1>
-<p>A picture of one object in, and out come its material, shape and light. Change them, and let a physical renderer
-check the result. Nothing leaves the machine that serves this page.</p>
-"""
 
 
 @dataclass(frozen=True)
@@ -134,81 +126,38 @@ class Page:
             gr.HTML(INTRODUCTION, elem_id="introduction")
             with gr.Row():
                 with gr.Column(scale=1, min_width=280):
-                    picture = gr.File(label="Picture", file_types=PICTURES, height=150, elem_id="picture")
-                    with gr.Row(elem_id="examples"):
-                        examples = [
-                            gr.Button(name, elem_id=f"example-{k}", size="sm", min_width=64)
-                            for k, name in enumerate(self.examples)
-                        ]
-                    side = gr.Radio([(f"{s} px", s) for s in SIDES], value=SIDES[0], label="Resolution", elem_id="side")
-                    with gr.Accordion("Mask", open=False, elem_id="mask-section"):
-                        gr.HTML("<p>White where the object is. Without one, the picture's alpha channel.</p>")
-                        mask = gr.File(label="Mask", file_types=PICTURES, height=120, elem_id="mask")
-                    gr.HTML(limits_text(self.limits), elem_id="limits")
+                    given = Given.place(self.examples, self.limits)
                 with gr.Column(scale=2, min_width=320):
-                    view = gr.HTML(f'<p class="remark">{NOTHING}</p>', elem_id="view")
-                    with gr.Row():
-                        metallic = gr.Slider(
-                            0, 1, 0, step=0.01, label="Metallic", elem_id="metallic", min_width=240, buttons=[]
-                        )
-                        roughness = gr.Slider(
-                            0, 1, 0.5, step=0.01, label="Roughness", elem_id="roughness", min_width=240, buttons=[]
-                        )
-                    with gr.Row():
-                        light = gr.Dropdown(
-                            light_choices(), value=PREDICTED, label="Light", elem_id="light", min_width=240
-                        )
-                        turn = gr.Slider(
-                            -180,
-                            180,
-                            0,
-                            step=5,
-                            label="Light turned, degrees",
-                            elem_id="turn",
-                            min_width=240,
-                            buttons=[],
-                        )
-                    anchored = gr.Checkbox(True, label="Keep the picture's own detail", elem_id="anchored")
-                    with gr.Accordion("A light of your own", open=False, elem_id="light-section"):
-                        gr.HTML("<p>A lat-long HDR, EXR or PFM, or a photograph (PNG, JPG).</p>")
-                        own = gr.File(label="Light", file_types=LIGHTS, height=120, elem_id="own-light")
-                    with gr.Row():
-                        predicted = gr.Button("As predicted", elem_id="reset", size="md", min_width=120)
-                        mitsuba = gr.Button(
-                            "Check with Mitsuba", elem_id="check", variant="primary", size="md", min_width=160
-                        )
-                    checked = gr.HTML(elem_id="checked")
+                    edited = Edited.place()
             gr.HTML("<h2>Maps</h2>", elem_classes="heading")
-            maps = gr.HTML(elem_id="maps")
-            with gr.Row():
-                uncertain = gr.Button("How sure is the model?", elem_id="spread-button", size="md", min_width=160)
-                files = gr.Button("Files to take along", elem_id="pack", size="md", min_width=160)
-            spread = gr.HTML(elem_id="spread")
-            downloads = gr.HTML(elem_id="downloads")
-
-            controls = [metallic, roughness, light, turn, anchored]
-            seen = [view, checked, downloads]  # what is there follows from the controls
-            as_predicted = [*controls[:-1], *seen]
-            opened = [session, picture, mask, maps, spread, *as_predicted]
-            with_controls = [session, *controls]
-
-            def on(trigger: Any, handler: Handler, inputs: Any, outputs: Any, **options: Any) -> None:
-                gr.on(trigger, refusing(handler), inputs, outputs, **EVENT, **options)
-
-            on(picture.upload, self.open_file, [picture, side, session], opened, show_progress_on=view)
-            on(mask.upload, self.open_mask, [mask, side, session], opened, show_progress_on=view)
-            on(side.input, self.reopen, [side, session], opened, show_progress_on=view)
-            for button in examples:
-                on(button.click, self.open_example, [button, side, session], opened, show_progress_on=view)
-            on(predicted.click, self.reset, session, as_predicted, show_progress_on=view)
-            on(own.upload, self.open_light, [own, *with_controls], [session, light, *seen], show_progress_on=view)
-            moved = [control.input for control in controls]
-            on(moved, self.show, with_controls, seen, trigger_mode="always_last", show_progress="hidden")
-            on(mitsuba.click, self.check, with_controls, checked)
-            on(uncertain.click, self.spread, session, spread)
-            on(files.click, self.pack, with_controls, downloads)
+            self._answer_events(session, given, edited, Found.place())
         page.queue(max_size=QUEUE, default_concurrency_limit=1)
         return page
+
+    def _answer_events(self, session: gr.State, given: Given, edited: Edited, found: Found) -> None:
+        """Which handler each event has, what it reads and what it changes."""
+        view, controls = edited.view, edited.controls
+        seen = [view, edited.checked, found.downloads]  # what is there follows from the controls
+        as_predicted = [*controls[:-1], *seen]
+        opened = [session, given.picture, given.mask, found.maps, found.spread, *as_predicted]
+        with_controls = [session, *controls]
+
+        def on(trigger: Any, handler: Handler, inputs: Any, outputs: Any, **options: Any) -> None:
+            gr.on(trigger, refusing(handler), inputs, outputs, **EVENT, **options)
+
+        on(given.picture.upload, self.open_file, [given.picture, given.side, session], opened, show_progress_on=view)
+        on(given.mask.upload, self.open_mask, [given.mask, given.side, session], opened, show_progress_on=view)
+        on(given.side.input, self.reopen, [given.side, session], opened, show_progress_on=view)
+        for button in given.examples:
+            on(button.click, self.open_example, [button, given.side, session], opened, show_progress_on=view)
+        on(edited.predicted.click, self.reset, session, as_predicted, show_progress_on=view)
+        lit = [session, edited.light, *seen]
+        on(edited.own.upload, self.open_light, [edited.own, *with_controls], lit, show_progress_on=view)
+        moved = [control.input for control in controls]
+        on(moved, self.show, with_controls, seen, trigger_mode="always_last", show_progress="hidden")
+        on(edited.mitsuba.click, self.check, with_controls, edited.checked)
+        on(found.uncertain.click, self.spread, session, found.spread)
+        on(found.files.click, self.pack, with_controls, found.downloads)
 
 
 def refusing(handler: Handler) -> Handler:
@@ -253,20 +202,6 @@ def read_controls(
         light=None if light == PREDICTED else session.light if light == OWN else bundled_light(light).environment,
         turn_deg=turn_deg,
         anchored=anchored,
-    )
-
-
-def light_choices() -> list[str]:
-    """Names of the lights: the predicted one, those that ship with the package, the visitor's."""
-    return [PREDICTED, *sorted(catalogue()), OWN]
-
-
-def limits_text(limits: Limits) -> str:
-    """What is taken, as HTML."""
-    return (
-        f"<p>PNG or JPG, best with transparency around the object, or linear EXR. At most {limits.megabytes:g} MB and "
-        f"{limits.pixels / 1e6:g} megapixels. The object is put into the middle of a square; the camera is taken to "
-        "have a vertical field of view of 36 degrees.</p>"
     )
 
 
