@@ -1,5 +1,6 @@
 """The groups of a shard as rows of arrays; what their members may hold, `unirender.training.members` says."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -73,24 +74,9 @@ class Packer:
         """
         where = f"{self.path}: group {key}"
         found = members_of_lights(members, where)
-        images: list[tuple[int, int | None, int | None]] = [  # light, metallic, roughness in percent
-            (int(match["light"]), percent(match["metallic"]), percent(match["roughness"]))
-            for match in found.values()
-            if not (match["environment"] or match["diffuse"] or match["specular"])
-        ]
         vary = vary_of(members, where)
-        if not images:
-            raise UnirenderError(f"{where}: has no picture, expected at least one; {ADVICE}")
-        if len(set(images)) < len(images):
-            raise UnirenderError(
-                f"{where}: two members are the same picture, like m050_r030 and m50_r30, expected one of each; {ADVICE}"
-            )
+        images = _images(found, vary, where)
         own_maps = any(metallic is None for _, metallic, _ in images)
-        if own_maps and vary == "basis":
-            raise UnirenderError(
-                f"{where}: vary is basis and the pictures have the object's own roughness and metallic maps, expected "
-                "pictures at metallic 0, 0.5 and 1; write vary independent"
-            )
         size = self._add_shared(key, members, own_maps)
         rows: dict[tuple, int] = {}
         lights: dict[int, int] = {}
@@ -147,6 +133,31 @@ class Packer:
             )
         self._shared.append(maps.astype(np.float16))
         return size
+
+
+def _images(found: Mapping[str, re.Match[str]], vary: str, where: str) -> list[tuple[int, int | None, int | None]]:
+    """The light, and metallic and roughness in percent (None: the object's own maps), of each picture of a group.
+
+    Raises:
+        UnirenderError: there is none, one of them twice, or own maps in a basis group.
+    """
+    images = [
+        (int(match["light"]), percent(match["metallic"]), percent(match["roughness"]))
+        for match in found.values()
+        if not (match["environment"] or match["diffuse"] or match["specular"])
+    ]
+    if not images:
+        raise UnirenderError(f"{where}: has no picture, expected at least one; {ADVICE}")
+    if len(set(images)) < len(images):
+        raise UnirenderError(
+            f"{where}: two members are the same picture, like m050_r030 and m50_r30, expected one of each; {ADVICE}"
+        )
+    if vary == "basis" and any(metallic is None for _, metallic, _ in images):
+        raise UnirenderError(
+            f"{where}: vary is basis and the pictures have the object's own roughness and metallic maps, expected "
+            "pictures at metallic 0, 0.5 and 1; write vary independent"
+        )
+    return images
 
 
 def _pair(
