@@ -17,6 +17,7 @@ RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2") 
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
+GREY_STEPS = {"L;2": 255 // 3, "L;4": 255 // 15}  # grey of 2 and 4 bits as Pillow names it: a step in 8 bits
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
@@ -42,12 +43,20 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                         f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
                         "cannot be read; save it as PNG, or with interleaved channels"
                     )
+                _scale_transparent_grey(file)
                 file.load()
                 return ImageOps.exif_transpose(file) if upright else file.copy()
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
+
+
+def _scale_transparent_grey(file: Image.Image) -> None:
+    """A PNG's transparent grey in the 8 bits of the decoded pixels: Pillow leaves that of 2 or 4 bits as it is."""
+    step = next((GREY_STEPS.get(str(tile.args), 1) for tile in getattr(file, "tile", ())), 1)
+    if step > 1 and isinstance(key := file.info.get("transparency"), int):
+        file.info["transparency"] = key * step
 
 
 def stored_values(path: str | Path, *, upright: bool = True) -> Float[np.ndarray, "h w c"]:
@@ -104,7 +113,8 @@ def _gamma_remarks(image: Image.Image) -> dict[str, str]:
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     """The pixels of a PIL picture of any mode as display values in [0, 1], not premultiplied: RGB, or RGBA where the
-    picture has an alpha channel. 16-bit grey keeps its 16 bits (Pillow's own conversion saturates it).
+    picture has an alpha channel or a transparent colour. 16-bit grey keeps its 16 bits (Pillow's own conversion
+    saturates it).
 
     Args:
         image: the picture; its EXIF orientation is not looked at.
@@ -126,7 +136,9 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
                 f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
                 "grey; save linear radiance as EXR"
             )
-        return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+        grey = np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+        key = image.info.get("transparency")  # one value of the pixels, in a PNG
+        return grey if key is None else np.concatenate([grey, (values != key)[..., None].astype(np.float32)], axis=-1)
     if image.mode == "LAB":
         raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied

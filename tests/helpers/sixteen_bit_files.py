@@ -24,7 +24,17 @@ def write_png16(path: Path, values: np.ndarray, filter_type: int = 0, chunks: Ma
     raw = values.astype(">u2").view(np.uint8).reshape(height, width, 2 * channels)
     rows = raw if filter_type == 0 else np.diff(raw, axis=1, prepend=np.zeros_like(raw[:, :1]))
     data = b"".join(bytes([filter_type]) + row.tobytes() for row in rows)
-    header = struct.pack(">IIBBBBB", width, height, 16, COLOUR_TYPES[channels], 0, 0, 0)
+    _write_png(path, struct.pack(">IIBBBBB", width, height, 16, COLOUR_TYPES[channels], 0, 0, 0), chunks, data)
+
+
+def write_small_grey_png(path: Path, values: np.ndarray, bits: int, chunks: Mapping[bytes, bytes] = {}) -> None:
+    """A grey PNG of `[h w]` whole numbers of 1, 2 or 4 bits; `chunks` as in `write_png16`."""
+    every_bit = (values[..., None] >> np.arange(bits)[::-1] & 1).reshape(len(values), -1).astype(np.uint8)
+    data = b"".join(b"\0" + row.tobytes() for row in np.packbits(every_bit, axis=1))
+    _write_png(path, struct.pack(">IIBBBBB", values.shape[1], len(values), bits, 0, 0, 0, 0), chunks, data)
+
+
+def _write_png(path: Path, header: bytes, chunks: Mapping[bytes, bytes], data: bytes) -> None:
     every = {b"IHDR": header, **chunks, b"IDAT": zlib.compress(data), b"IEND": b""}
     parts = [struct.pack(">I", len(v)) + k + v + struct.pack(">I", zlib.crc32(k + v)) for k, v in every.items()]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))

@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 from icc_profiles import SRGB_D50, matrix_profile
 from PIL import Image, ImageCms
-from sixteen_bit_files import write_png16, write_tiff16
+from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
 from unirender.display_files import MAX_PIXELS, display_values
@@ -102,6 +102,21 @@ def test_sixteen_bits_are_turned_as_exif_says_and_a_transparent_colour_is_alpha(
     mask = read_picture(tmp_path / "a.png").mask
     assert mask is not None
     np.testing.assert_array_equal(np.argwhere(mask[..., 0] == 0), [[2, 3]])
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4, 16])
+def test_a_transparent_grey_is_alpha(bits: int, tmp_path: Path) -> None:
+    values = RNG.integers(0, 2**bits, (8, 9))
+    values[2:4], transparent = values[0, 0], int(values[0, 0])
+    chunk = {b"tRNS": struct.pack(">H", transparent)}
+    if bits == 16:
+        write_png16(tmp_path / "a.png", values[..., None], chunks=chunk)
+    else:
+        write_small_grey_png(tmp_path / "a.png", values, bits, chunk)
+    picture = read_picture(tmp_path / "a.png")
+    assert picture.mask is not None
+    np.testing.assert_array_equal(picture.mask[..., 0], values != transparent)
+    np.testing.assert_allclose(picture.image_srgb[..., 0], values / (2**bits - 1), rtol=0, atol=1e-7)
 
 
 def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_path: Path) -> None:
