@@ -10,6 +10,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
+from unirender.primaries import REC709, SAME_PRIMARIES
 from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
@@ -18,6 +19,7 @@ MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
 GREY_STEPS = {"L;2": 255 // 3, "L;4": 255 // 15}  # grey of 2 and 4 bits as Pillow names it: a step in 8 bits
+PNG_POINTS, PNG_SRGB = ("white", "red", "green", "blue"), (*REC709[6:], *REC709[:6])  # of the cHRM chunk
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
@@ -93,7 +95,7 @@ def srgb_values_and_remarks(
     """The same, and remarks by kind on what was lost in reading it; `upright` as of `stored_values`."""
     image = open_picture(path, upright=upright)
     srgb = in_srgb(image, name)
-    remarks = _gamma_remarks(image)
+    remarks = _png_remarks(image)
     full = sixteen_bit_values(path, upright=upright) if srgb is image else None
     if full is not None:
         return full, remarks
@@ -102,13 +104,24 @@ def srgb_values_and_remarks(
     return display_values(srgb, name), remarks | ({"depth": SIXTEEN_BITS} if cut else {})
 
 
-def _gamma_remarks(image: Image.Image) -> dict[str, str]:
-    """What is due on a PNG that states another gamma and nothing that counts more (an sRGB chunk, an ICC profile)."""
-    gamma, more = image.info.get("gamma"), {"srgb", "icc_profile"} & image.info.keys()
-    if gamma is None or more or abs(gamma - SRGB_GAMMA) <= SAME_GAMMA:
+def _png_remarks(image: Image.Image) -> dict[str, str]:
+    """What is due on a PNG that states another gamma or other primaries than sRGB's, and nothing that counts more (an
+    sRGB chunk, an ICC profile)."""
+    if {"srgb", "icc_profile"} & image.info.keys():
         return {}
-    said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), and its values are taken as sRGB"
-    return {"gamma": f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said}
+    remarks, gamma = {}, image.info.get("gamma")
+    if gamma is not None and abs(gamma - SRGB_GAMMA) > SAME_GAMMA:
+        said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), its values are taken as sRGB"
+        remarks["gamma"] = f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said
+    stated, ours = (np.reshape(points, (4, 2)) for points in (image.info.get("chromaticity", PNG_SRGB), PNG_SRGB))
+    farthest = int(np.abs(stated - ours).max(axis=1).argmax())
+    if np.abs(stated - ours).max() > SAME_PRIMARIES:
+        (x, y), (our_x, our_y) = stated[farthest], ours[farthest]
+        where = f"{PNG_POINTS[farthest]} at {x:.3g}, {y:.3g}; sRGB: {our_x:.3g}, {our_y:.3g}"
+        remarks["primaries"] = (
+            f"the file states other primaries than sRGB's (cHRM: {where}), its colours are taken as sRGB: convert it"
+        )
+    return remarks
 
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
