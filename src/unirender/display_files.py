@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
 from unirender.primaries import REC709, SAME_PRIMARIES
-from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
+from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
@@ -27,7 +27,8 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     """A picture file in a format of Pillow's, decoded and, if `upright`, turned as its EXIF orientation says.
 
     Raises:
-        UnirenderError: no readable picture, a camera's raw file, or one of more than `MAX_PIXELS`.
+        UnirenderError: no readable picture, a camera's raw file, one of more than `MAX_PIXELS`, or grey that Pillow
+            hands out otherwise than it is meant.
     """
     if Path(path).suffix.lower() in RAW_SUFFIXES:
         raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
@@ -45,6 +46,7 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                         f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
                         "cannot be read; save it as PNG, or with interleaved channels"
                     )
+                _check_grey(file, str(path))
                 _scale_transparent_grey(file)
                 file.load()
                 return ImageOps.exif_transpose(file) if upright else file.copy()
@@ -52,6 +54,11 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
+
+
+def _check_grey(image: Image.Image, name: str) -> None:
+    if what := unheeded_grey(image):
+        raise UnirenderError(f"{name}: a TIFF, {what}, expected 8 or 16 bits and 0 for black; save it as PNG")
 
 
 def _scale_transparent_grey(file: Image.Image) -> None:
@@ -134,9 +141,10 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
         name: what to call it in messages.
 
     Raises:
-        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; or
-            one of L*a*b*.
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; one
+            of L*a*b*; or a TIFF of grey that Pillow hands out otherwise than it is meant.
     """
+    _check_grey(image, name)
     if image.mode.startswith("I;16") or image.mode in ("I", "F"):
         values = np.asarray(image, dtype=np.float32)
         if image.mode == "I" and 0 < values.max(initial=0) <= DISPLAY_MAX_8_BIT:

@@ -140,6 +140,28 @@ def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_r
     np.testing.assert_allclose(picture.image_srgb, (values >> 8) / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("bits", "photometric", "told"), [(16, 1, None), (16, 0, "its 0 is white"), (12, 1, "its grey has 12 bits")]
+)
+def test_a_grey_tiff_whose_values_mean_something_else_is_refused(
+    bits: int, photometric: int, told: str | None, tmp_path: Path
+) -> None:
+    """Pillow hands out such values as they are stored: inverted, or at a sixteenth of their brightness."""
+    values = RNG.integers(0, 2**bits, (8, 10, 1))
+    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric)
+    readers = (
+        lambda: read_picture(tmp_path / "a.tif").image_srgb,
+        lambda: read_mask(tmp_path / "a.tif", (8, 10)),
+        lambda: as_picture(Image.open(tmp_path / "a.tif"))[0],
+    )
+    for read in readers:
+        if told is None:
+            np.testing.assert_allclose(read()[..., :1], values / 65535, rtol=0, atol=1e-6)
+        else:
+            with pytest.raises(UnirenderError, match=f"{told}, expected .* save it as PNG"):
+                read()
+
+
 def test_a_bitmap_of_16_bits_a_pixel_has_lost_nothing(tmp_path: Path) -> None:
     pixels = np.full((8, 9), 0xF81F, dtype="<u2")  # magenta: five bits of red, six of green, five of blue
     rows = np.pad(pixels, ((0, 0), (0, 1))).tobytes()
