@@ -68,7 +68,7 @@ class HdrCurve:
     """The curve through which HDR maps enter the network: `log1p(k x) / log1p(k x_max)`, [0, x_max] -> [0, 1].
 
     Attributes:
-        k: slope at 0, in 1/radiance; a larger k gives dark radiance more of the range.
+        k: in 1/radiance; a larger k gives dark radiance more of the range. The slope at 0 is k / log1p(k x_max).
         x_max: radiance that maps to 1. Larger values are not clipped: they map above 1 and `overflow` counts them.
     """
 

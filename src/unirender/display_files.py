@@ -10,13 +10,16 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
-from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values
+from unirender.primaries import REC709, SAME_PRIMARIES
+from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
+GREY_STEPS = {"L;2": 255 // 3, "L;4": 255 // 15}  # grey of 2 and 4 bits as Pillow names it: a step in 8 bits
+PNG_POINTS, PNG_SRGB = ("white", "red", "green", "blue"), (*REC709[6:], *REC709[:6])  # of the cHRM chunk
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
@@ -24,7 +27,8 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     """A picture file in a format of Pillow's, decoded and, if `upright`, turned as its EXIF orientation says.
 
     Raises:
-        UnirenderError: no readable picture, a camera's raw file, or one of more than `MAX_PIXELS`.
+        UnirenderError: no readable picture, a camera's raw file, one of more than `MAX_PIXELS`, or grey that Pillow
+            hands out otherwise than it is meant.
     """
     if Path(path).suffix.lower() in RAW_SUFFIXES:
         raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
@@ -42,12 +46,26 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                         f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
                         "cannot be read; save it as PNG, or with interleaved channels"
                     )
+                _check_grey(file, str(path))
+                _scale_transparent_grey(file)
                 file.load()
                 return ImageOps.exif_transpose(file) if upright else file.copy()
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
+
+
+def _check_grey(image: Image.Image, name: str) -> None:
+    if what := unheeded_grey(image):
+        raise UnirenderError(f"{name}: a TIFF, {what}, expected 8 or 16 bits and 0 for black; save it as PNG")
+
+
+def _scale_transparent_grey(file: Image.Image) -> None:
+    """A PNG's transparent grey in the 8 bits of the decoded pixels: Pillow leaves that of 2 or 4 bits as it is."""
+    step = next((GREY_STEPS.get(str(tile.args), 1) for tile in getattr(file, "tile", ())), 1)
+    if step > 1 and isinstance(key := file.info.get("transparency"), int):
+        file.info["transparency"] = key * step
 
 
 def stored_values(path: str | Path, *, upright: bool = True) -> Float[np.ndarray, "h w c"]:
@@ -84,7 +102,7 @@ def srgb_values_and_remarks(
     """The same, and remarks by kind on what was lost in reading it; `upright` as of `stored_values`."""
     image = open_picture(path, upright=upright)
     srgb = in_srgb(image, name)
-    remarks = _gamma_remarks(image)
+    remarks = _png_remarks(image)
     full = sixteen_bit_values(path, upright=upright) if srgb is image else None
     if full is not None:
         return full, remarks
@@ -93,27 +111,40 @@ def srgb_values_and_remarks(
     return display_values(srgb, name), remarks | ({"depth": SIXTEEN_BITS} if cut else {})
 
 
-def _gamma_remarks(image: Image.Image) -> dict[str, str]:
-    """What is due on a PNG that states another gamma and nothing that counts more (an sRGB chunk, an ICC profile)."""
-    gamma, more = image.info.get("gamma"), {"srgb", "icc_profile"} & image.info.keys()
-    if gamma is None or more or abs(gamma - SRGB_GAMMA) <= SAME_GAMMA:
+def _png_remarks(image: Image.Image) -> dict[str, str]:
+    """What is due on a PNG that states another gamma or other primaries than sRGB's, and nothing that counts more (an
+    sRGB chunk, an ICC profile)."""
+    if {"srgb", "icc_profile"} & image.info.keys():
         return {}
-    said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), and its values are taken as sRGB"
-    return {"gamma": f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said}
+    remarks, gamma = {}, image.info.get("gamma")
+    if gamma is not None and abs(gamma - SRGB_GAMMA) > SAME_GAMMA:
+        said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), its values are taken as sRGB"
+        remarks["gamma"] = f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said
+    stated, ours = (np.reshape(points, (4, 2)) for points in (image.info.get("chromaticity", PNG_SRGB), PNG_SRGB))
+    farthest = int(np.abs(stated - ours).max(axis=1).argmax())
+    if np.abs(stated - ours).max() > SAME_PRIMARIES:
+        (x, y), (our_x, our_y) = stated[farthest], ours[farthest]
+        where = f"{PNG_POINTS[farthest]} at {x:.3g}, {y:.3g}; sRGB: {our_x:.3g}, {our_y:.3g}"
+        remarks["primaries"] = (
+            f"the file states other primaries than sRGB's (cHRM: {where}), its colours are taken as sRGB: convert it"
+        )
+    return remarks
 
 
 def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
     """The pixels of a PIL picture of any mode as display values in [0, 1], not premultiplied: RGB, or RGBA where the
-    picture has an alpha channel. 16-bit grey keeps its 16 bits (Pillow's own conversion saturates it).
+    picture has an alpha channel or a transparent colour. 16-bit grey keeps its 16 bits (Pillow's own conversion
+    saturates it).
 
     Args:
         image: the picture; its EXIF orientation is not looked at.
         name: what to call it in messages.
 
     Raises:
-        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; or
-            one of L*a*b*.
+        UnirenderError: a floating-point or 32-bit picture, whose values have no display white or may have either; one
+            of L*a*b*; or a TIFF of grey that Pillow hands out otherwise than it is meant.
     """
+    _check_grey(image, name)
     if image.mode.startswith("I;16") or image.mode in ("I", "F"):
         values = np.asarray(image, dtype=np.float32)
         if image.mode == "I" and 0 < values.max(initial=0) <= DISPLAY_MAX_8_BIT:
@@ -126,7 +157,9 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
                 f"{name}: a picture of mode {image.mode} has no display values, expected 8 bits a channel or 16-bit "
                 "grey; save linear radiance as EXR"
             )
-        return np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+        grey = np.repeat(values[..., None] / np.float32(DISPLAY_MAX_16_BIT), 3, axis=-1)
+        key = image.info.get("transparency")  # one value of the pixels, in a PNG
+        return grey if key is None else np.concatenate([grey, (values != key)[..., None].astype(np.float32)], axis=-1)
     if image.mode == "LAB":
         raise UnirenderError(f"{name}: a picture of mode {image.mode}, expected RGB, grey or CMYK; convert it to sRGB")
     if image.mode in ("RGBa", "La"):  # premultiplied

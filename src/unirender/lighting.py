@@ -168,6 +168,8 @@ def resample_environment(
 
     Where it grows by a factor that is no whole number, texels of the old map would be met by more or fewer of the new
     one's as they happen to lie: where that matters (`MOST_ALIASING`), it is energy-preserving there as well.
+    Beside the poles, where texels are small, samples say more: of 16 rows that become 32 (the network's light, where s
+    and d are derived from it), up to 5 % too much of a lamp on the first or the last row, 1.2 % on the next.
     """
     check_map(environment)
     check_shape(shape)

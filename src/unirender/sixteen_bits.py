@@ -18,6 +18,7 @@ UNPACKED = {"RGB": "RGB", "RGBX": "RGBX", "RGBA": "RGBA", "RGBa": "RGBA"}  # as 
 PLANAR_CONFIGURATION, SEPARATE = 284, 2  # tags and values of TIFF
 COMPRESSION, UNCOMPRESSED = 259, 1
 BITS = 258
+PHOTOMETRIC, WHITE_IS_ZERO = 262, 0
 GREY_AND_ALPHA = "LA"  # four bytes a pixel: the grey's, then the alpha's
 
 
@@ -77,6 +78,16 @@ def misread(picture: Image.Image) -> bool:
     """Whether Pillow makes noise of it: such a TIFF, uncompressed and of more than 8 bits."""
     tags = getattr(picture, "tag_v2", {})
     return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and max(tags.get(BITS, (8,))) > 8
+
+
+def unheeded_grey(picture: Image.Image) -> str:
+    """What a TIFF of grey with more than 8 bits says of its values and Pillow does not heed; empty where nothing is."""
+    tags = getattr(picture, "tag_v2", {})
+    if not picture.mode.startswith("I"):
+        return ""
+    if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO:
+        return "its 0 is white"
+    return f"its grey has {bits} bits" if 8 < (bits := max(tags.get(BITS, (16,)))) < 16 else ""
 
 
 def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:

@@ -296,13 +296,17 @@ def test_tiff_of_floats_and_of_32_bits(tmp_path, kind):
     assert obj.roughness == pytest.approx(np.full_like(obj.roughness, expected), abs=0.5 / 255 + 1e-6)
 
 
-@pytest.mark.parametrize(("kind", "bits", "value"), [(1, 32, 1 << 30), (1, 16, 1 << 14), (2, 16, 1 << 13), (1, 8, 64)])
-def test_tiff_of_whole_numbers(tmp_path, kind, bits, value):
-    """4 x 4 texels of a quarter, written byte by byte; kind 1 has no sign, 2 has one."""
-    entries = [(256, 4, 4), (257, 4, 4), (258, 3, bits), (259, 3, 1), (262, 3, 1), (273, 4, 134), (277, 3, 1)]
+WHOLE_NUMBERS = [(1, 32, 1, 1 << 30), (1, 16, 1, 1 << 14), (2, 16, 1, 1 << 13), (1, 8, 1, 64), (1, 12, 1, 1 << 10)]
+WHITE_IS_ZERO = [(1, 16, 0, 0xBFFF), (1, 8, 0, 191), (3, 32, 0, 0x3F400000)]  # the last is 0.75 in float32
+
+
+@pytest.mark.parametrize(("kind", "bits", "black", "value"), WHOLE_NUMBERS + WHITE_IS_ZERO)
+def test_tiff_of_whole_numbers(tmp_path, kind, bits, black, value):
+    """4 x 4 texels of a quarter, byte by byte; kind 1 has no sign, 2 has one, 3 is floats; black 0: 0 is white."""
+    entries = [(256, 4, 4), (257, 4, 4), (258, 3, bits), (259, 3, 1), (262, 3, black), (273, 4, 134), (277, 3, 1)]
     entries += [(278, 4, 4), (279, 4, 2 * bits), (339, 3, kind)]
     body = b"".join(struct.pack("<HHII", tag, form, 1, number) for tag, form, number in entries)
-    texels = np.full(16, value, f"<u{bits // 8}").tobytes()
+    texels = struct.pack(">Q", value << 12 | value)[-3:] * 8 if bits == 12 else value.to_bytes(bits // 8, "little") * 16
     (tmp_path / "a.tiff").write_bytes(b"II*\0" + struct.pack("<IH", 8, len(entries)) + body + b"\0" * 4 + texels)
     obj = write(tmp_path, "map_Pr a.tiff")
     assert obj.roughness is not None

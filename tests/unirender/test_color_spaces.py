@@ -2,6 +2,7 @@
 
 import io
 import re
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +54,7 @@ def test_a_picture_in_srgb_keeps_its_values(tmp_path: Path, profile: bytes | Non
     ("chunks", "told"),
     [
         ({b"gAMA": 100_000}, "gamma of 1 .*if they are linear, save the picture as EXR"),
-        ({b"gAMA": 55_556}, r"gamma of 0\.556 \(gAMA; sRGB: 0\.455\), and its values are taken as sRGB$"),
+        ({b"gAMA": 55_556}, r"gamma of 0\.556 \(gAMA; sRGB: 0\.455\), its values are taken as sRGB$"),
         ({b"gAMA": 45_455}, None),
         ({b"gAMA": 100_000, b"sRGB": 0}, None),  # which counts more
     ],
@@ -67,6 +68,30 @@ def test_a_png_of_another_gamma_is_told(tmp_path: Path, chunks: dict[bytes, int]
     np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=1e-6)
     assert told is None or re.search(told, picture.remarks["gamma"])
     assert ("gamma" in picture.remarks) == (told is not None)
+
+
+@pytest.mark.parametrize(
+    ("green", "more", "told"),
+    [
+        ((0.30, 0.60), {}, False),
+        ((0.3001, 0.60), {}, False),
+        ((0.21, 0.71), {}, True),  # Adobe RGB's; its red and blue are ours
+        ((0.21, 0.71), {b"sRGB": b"\0"}, False),
+    ],
+)
+def test_a_png_of_other_primaries_is_told(
+    tmp_path: Path, green: tuple[float, float], more: dict[bytes, bytes], told: bool
+) -> None:
+    chunks = PngInfo()
+    points = (0.3127, 0.329, 0.64, 0.33, *green, 0.15, 0.06)
+    chunks.add(b"cHRM", struct.pack(">8I", *(round(100_000 * x) for x in points)))
+    for name, value in more.items():
+        chunks.add(name, value)
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", pnginfo=chunks)
+    picture = read_picture(tmp_path / "a.png")
+    np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=1e-6)
+    assert ("green at 0.21, 0.71; sRGB: 0.3, 0.6" in picture.remarks.get("primaries", "")) == told
+    assert ("primaries" in picture.remarks) == told
 
 
 def test_alpha_and_palettes_go_through_a_profile(tmp_path: Path) -> None:

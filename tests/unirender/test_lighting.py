@@ -118,6 +118,14 @@ def test_growing_keeps_the_energy_of_a_lamp_wherever_it_stands(shape: tuple[int,
         np.testing.assert_allclose(resample_environment(np.ones_like(lamp), (32, 64)), 1, rtol=1e-5, atol=0)
 
 
+@pytest.mark.parametrize(("row", "most"), [(0, 0.05), (1, 0.012), (2, 0.005), (7, 0.005)])
+def test_a_light_that_doubles_has_little_more_of_a_lamp_at_a_pole(row: int, most: float) -> None:
+    lamp = np.zeros((16, 32, 3), np.float32)
+    lamp[row, 5] = 50
+    grown = resample_environment(lamp, (32, 64))
+    np.testing.assert_allclose(mean_radiance(grown), mean_radiance(lamp), rtol=most, atol=0)
+
+
 @pytest.mark.parametrize("height", [9, 14, 27])  # of some, the last row was turned by half
 def test_a_turn_by_nothing_or_by_whole_columns_moves_no_texel(height: int) -> None:
     light = np.random.default_rng(3).random((height, 16, 3)).astype(np.float32)

@@ -9,7 +9,7 @@ import OpenEXR
 import pytest
 from icc_profiles import SRGB_D50, matrix_profile
 from PIL import Image, ImageCms
-from sixteen_bit_files import write_png16, write_tiff16
+from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
 from unirender.display_files import MAX_PIXELS, display_values
@@ -104,6 +104,21 @@ def test_sixteen_bits_are_turned_as_exif_says_and_a_transparent_colour_is_alpha(
     np.testing.assert_array_equal(np.argwhere(mask[..., 0] == 0), [[2, 3]])
 
 
+@pytest.mark.parametrize("bits", [1, 2, 4, 16])
+def test_a_transparent_grey_is_alpha(bits: int, tmp_path: Path) -> None:
+    values = RNG.integers(0, 2**bits, (8, 9))
+    values[2:4], transparent = values[0, 0], int(values[0, 0])
+    chunk = {b"tRNS": struct.pack(">H", transparent)}
+    if bits == 16:
+        write_png16(tmp_path / "a.png", values[..., None], chunks=chunk)
+    else:
+        write_small_grey_png(tmp_path / "a.png", values, bits, chunk)
+    picture = read_picture(tmp_path / "a.png")
+    assert picture.mask is not None
+    np.testing.assert_array_equal(picture.mask[..., 0], values != transparent)
+    np.testing.assert_allclose(picture.image_srgb[..., 0], values / (2**bits - 1), rtol=0, atol=1e-7)
+
+
 def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_path: Path) -> None:
     profile = zlib.compress(matrix_profile(SRGB_D50, 1.0))
     write_png16(tmp_path / "a.png", np.full((8, 9, 3), 40000), chunks={b"iCCP": b"a\0\0" + profile})
@@ -123,6 +138,28 @@ def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_r
     picture, remarks = read_input(tmp_path / "c.tif", None)
     assert "depth" not in remarks
     np.testing.assert_allclose(picture.image_srgb, (values >> 8) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("bits", "photometric", "told"), [(16, 1, None), (16, 0, "its 0 is white"), (12, 1, "its grey has 12 bits")]
+)
+def test_a_grey_tiff_whose_values_mean_something_else_is_refused(
+    bits: int, photometric: int, told: str | None, tmp_path: Path
+) -> None:
+    """Pillow hands out such values as they are stored: inverted, or at a sixteenth of their brightness."""
+    values = RNG.integers(0, 2**bits, (8, 10, 1))
+    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric)
+    readers = (
+        lambda: read_picture(tmp_path / "a.tif").image_srgb,
+        lambda: read_mask(tmp_path / "a.tif", (8, 10)),
+        lambda: as_picture(Image.open(tmp_path / "a.tif"))[0],
+    )
+    for read in readers:
+        if told is None:
+            np.testing.assert_allclose(read()[..., :1], values / 65535, rtol=0, atol=1e-6)
+        else:
+            with pytest.raises(UnirenderError, match=f"{told}, expected .* save it as PNG"):
+                read()
 
 
 def test_a_bitmap_of_16_bits_a_pixel_has_lost_nothing(tmp_path: Path) -> None:

@@ -84,7 +84,8 @@ def orb_psnr(p: Rgb, t: Rgb, m: OneMask, *, peak: float, lift: bool, encode: boo
         t: truth, linear.
         m: the eroded mask.
         peak: radiance at which both are clipped.
-        lift: multiply both by mean(srgb(t)) / mean(t), the mean over the frame: linear pictures are dark (PSNR-H).
+        lift: multiply both by mean(srgb(t)) / mean(t), of t clipped at 1, over the frame: linear pictures are dark
+            (PSNR-H).
         encode: compare display values (PSNR-L).
         aligned: fit a factor per channel first.
     """

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
@@ -16,6 +16,7 @@ from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, 
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
 _LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
 BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED = 258, 339, 2  # TIFF tags, and a value of the second
+PHOTOMETRIC, WHITE_IS_ZERO = 262, 0  # the same
 STRIP = 500_000  # stored pixels made float at a time
 SLACK = 1e-3  # by which floats may miss [0, 1]: rounding, resampling
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
@@ -105,11 +106,16 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
 
 
 def _eight_bits(image: Image.Image, name: str) -> Image.Image:
-    """Grey of more bits: the upper 8 of whole numbers, 255 times floats in [0, 1]. Pillow would clip both."""
-    if image.mode.startswith("I;16"):
-        return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-    if image.mode not in ("I", "F"):
+    """Grey of more bits: the upper 8 of whole numbers, 255 times floats in [0, 1]. Pillow would clip both, and leaves
+    those of a TIFF whose 0 is white inverted."""
+    if image.mode[0] not in "IF":
         return image
+    upper = _upper_bits(image, name)
+    inverted = getattr(image, "tag_v2", {}).get(PHOTOMETRIC) == WHITE_IS_ZERO
+    return Image.fromarray(255 - upper if inverted else upper)
+
+
+def _upper_bits(image: Image.Image, name: str) -> UInt8[np.ndarray, "h w"]:
     values = np.asarray(image)
     if image.mode == "F":
         if not (values.min() >= -SLACK and values.max() <= 1 + SLACK):  # NaN is neither
@@ -117,9 +123,11 @@ def _eight_bits(image: Image.Image, name: str) -> Image.Image:
                 f"texture {name}: got floats from {values.min():.9g} to {values.max():.9g}, expected [0, 1]; export it "
                 "as PNG"
             )
-        return Image.fromarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
+        return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
     tags = getattr(image, "tag_v2", {})  # of a TIFF; other formats have 16 bits
     bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
+    if image.mode != "I":
+        return (values >> (bits - 8)).astype(np.uint8)
     if bits == 32 and not signed:
         values = values.view(np.uint32)
     if values.min() < 0:
@@ -127,7 +135,7 @@ def _eight_bits(image: Image.Image, name: str) -> Image.Image:
             f"texture {name}: got numbers from {values.min():,}, expected 0 and more; export it as PNG"
         )
     used = 16 if bits == 32 and values.max() < 1 << 16 else bits - int(signed)  # 16 bits are often kept in 32
-    return Image.fromarray((values >> (used - 8)).astype(np.uint8))
+    return (values >> (used - 8)).astype(np.uint8)
 
 
 def area_means(

@@ -25,7 +25,8 @@ class Decomposition:
             is closed, the light is the one that agrees with its s and d (`unirender.pipelines.revealed_light`).
         roughness: coverage-weighted mean over the object.
         metallic: the same.
-        std: per map, standard deviation over the samples; None in mode `mean` or with one sample.
+        std: per map, standard deviation over the samples, whose number N is the denominator: sqrt((N - 1) / N) of the
+            unbiased one. None in mode `mean` or with one sample.
         samples: each sample's intrinsics, where there are several, with its light as the network predicts it;
             `intrinsics` is their mean, but for the light: the mean of theirs, about which `std` is, is `network_light`.
         network_light: the light as the network predicts it, [eh ew 3], which its own renderings of these maps are told:

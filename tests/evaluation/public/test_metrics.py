@@ -60,7 +60,8 @@ def test_psnr_h_lifts_both_sides_and_clips_at_4() -> None:
     assert found.value == pytest.approx(-10 * math.log10((0.1 * lift) ** 2 / 3), abs=1e-3)
     bright = flat(9.0, 9.0, 9.0)
     assert psnr_h(bright, flat(7.0, 7.0, 7.0), ONES, aligned=False).value == math.inf  # both clipped
-    assert psnr_h(bright, flat(2.0, 2.0, 2.0), ONES, aligned=False).value < 0  # lift 1: (4 - 2)^2
+    found = psnr_h(flat(1.5, 1.5, 1.5), flat(2.0, 2.0, 2.0), ONES, aligned=False)
+    assert found.value == pytest.approx(-10 * math.log10(0.25), abs=1e-3)  # lift 1: both means are of white
 
 
 def test_no_psnr_is_below_that_of_the_constant_one_half() -> None:
