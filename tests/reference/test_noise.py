@@ -5,11 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from inline_executor import Inline
 from reference_scenes import light, sphere
 
 from unirender.color import display_slope, image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference.adaptive import render_sample_to_floor
+from unirender_reference.measure import noise_floor
 from unirender_reference.measure.noise_floor import FloorRow, NoiseFloor, summary
 from unirender_reference.noise import (
     FLOOR_BATCHES,
@@ -233,6 +235,31 @@ def test_the_command_judges_what_it_measured(measured: tuple[float, ...], status
     assert found == status
     assert said in lines[-1]
     assert f"min {min(measured):.2f} dB" in lines[0]
+
+
+class Here(Inline):
+    """A pool whose tasks run at once, in the process of the test."""
+
+    def __enter__(self) -> "Here":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("reaching", [(0, 1, 2), (1, 5, 6), (12, 13, 14), (14,), ()])
+def test_images_are_drawn_until_enough_are_measured_or_none_is_left(
+    reaching: tuple[int, ...], workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 15 candidates for 3 images those that reach the floor, the last of all included, and the ones before them."""
+    monkeypatch.setattr(noise_floor, "WorkerPool", lambda *options: Here())
+    monkeypatch.setattr(
+        noise_floor, "measure_floor", lambda job: measured_row(job.number, 45, 45 if job.number in reaching else None)
+    )
+    rows = list(NoiseFloor(images=3, workers=workers)._rows())
+    assert [row.number for row in rows if row.measured_db is not None] == list(reaching)
+    assert [row.number for row in rows] == list(range(reaching[-1] + 1 if len(reaching) == 3 else 15))
 
 
 @pytest.mark.long
