@@ -6,7 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.claims import (
+    OPTIMISED,
+    OUR_CLAIMS,
+    REFINED,
+    SHADOWED,
+    Claim,
+    optimisation_claims,
+    run_claims,
+    stranger_claims,
+)
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.verdict import ceiling_breaches, findings, verdict_text
 
@@ -107,6 +116,39 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
     assert "FAILS  inverse/single-image albedo PSNR: theirs is beaten by mean-albedo" in text
     assert "theirs is beaten by noise-ceiling, difference -20" in text
     assert "ours" not in text
+
+
+def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
+    """And what depends on a light's level, on metallic or on closed forms is stated and no claim."""
+    claims = stranger_claims("theirs")
+    assert {c.a for c in claims} == {"theirs"}
+    bars = {c.b for c in claims if c.expected == "beats"}
+    assert {(c.quantity, c.b) for c in claims if c.table == "inverse"} == {
+        *(("albedo", bar) for bar in ("input-as-albedo", "mean-albedo")),
+        *(("normal", bar) for bar in ("mean-normal", "sphere-normal")),
+        *((material, "constant-0-5") for material in ("metallic", "roughness")),
+    }
+    assert {c.protocol for c in claims if c.b == SHADOWED} == {"given-light"}, "elsewhere there is nothing to derive"
+    assert {(c.key.partition(".")[2], c.expected) for c in claims if c.table == "light"} == {
+        ("log_rmse_scaled", "beats"),
+        ("rmse_relative@aligned", "beats"),
+        ("rmse_relative@raw", "stated"),
+    }
+    ceiling = {(c.protocol, c.quantity) for c in claims if c.b == "noise-ceiling" and c.table == "relighting"}
+    assert ceiling == {
+        *((protocol, "relit") for protocol in ("from-image-sd", "from-image-hdri")),
+        *(("from-image-sd", quantity) for quantity in ("specular", "diffuse")),
+    }
+    rows = {c.b for c in claims}
+    assert rows - bars == {"composite", "composite-split-sum", SHADOWED, "noise-ceiling"}
+    theirs = {(c.a, c.b, c.quantity): c for c in optimisation_claims() if c.table != "light"}
+    assert {key for key, c in theirs.items() if c.expected == "beats"} == {
+        *(("ours-mean", OPTIMISED, what) for what in ("edit_metallic", "edit_roughness", "albedo", "normal")),
+        *(("ours-mean", OPTIMISED, what) for what in ("roughness", "relit")),
+        *((f"{OPTIMISED}-multi-view", "constant-object", what) for what in ("albedo", "metallic", "roughness")),
+        *((f"{OPTIMISED}-multi-view", "constant-object", what) for what in ("relit", "novel")),
+    }
+    assert (REFINED, "ours-mean", "albedo") in theirs
 
 
 def test_our_claims_are_made_where_our_rows_ran() -> None:

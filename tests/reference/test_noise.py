@@ -113,6 +113,27 @@ def test_combined_estimates_are_weighted_by_their_samples() -> None:
     assert np.abs((a.mean + b.mean) / 2 - samples.mean(0)).max() > 0.01
 
 
+@pytest.mark.parametrize("premultiplied", [True, False])
+def test_the_measured_floor_is_the_error_less_what_the_long_render_has_left(premultiplied: bool) -> None:
+    """Weighted by coverage; nothing is left where noise explains it all."""
+    mask = np.where(np.arange(64)[:, None, None] < 32, 1, 0.25).astype(np.float32) * WHOLE
+    scale = mask if premultiplied else WHOLE
+    level = np.where(mask == 1, 0.41, 0.43) * np.ones(3)
+    picture = Estimate((level * scale).astype(np.float32), None)
+    converged = Estimate(
+        (0.4 * scale * np.ones(3)).astype(np.float32), (1e-6 * scale**2 * np.ones(3)).astype(np.float32)
+    )
+    shown = image_srgb(np.array([0.4, 0.41, 0.43]))
+    error = np.average(np.square(shown[1:] - shown[0]), weights=[1, 0.25])
+    left = float(display_slope(np.array(0.4))) ** 2 * 1e-6
+    found = measured_floor_db(picture, converged, mask, premultiplied)
+    assert found == pytest.approx(-10 * math.log10(error - left), abs=2e-3)
+    assert abs(-10 * math.log10(error) - found) > 0.01  # the twin: the long render taken for exact
+    assert measured_floor_db(converged, converged, mask, premultiplied) == math.inf
+    with pytest.raises(UnirenderError, match="without variance"):
+        measured_floor_db(converged, picture, mask, premultiplied)
+
+
 @pytest.mark.parametrize("wanted", [1, 9, 256, 1000, 20_000, 60_000])
 @pytest.mark.parametrize("batches", [1, 8, 16])
 def test_sample_counts_make_full_passes(wanted: int, batches: int) -> None:

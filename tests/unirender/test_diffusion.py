@@ -17,8 +17,11 @@ from unirender.errors import UnirenderError
 # --- schedule
 
 
-def test_both_ends_are_exact() -> None:
-    alpha_bar = make_scheduler().alphas_cumprod
+@pytest.mark.parametrize("timesteps", [1000, 50])
+def test_both_ends_are_exact(timesteps: int) -> None:
+    scheduler = make_scheduler(timesteps)
+    alpha_bar = scheduler.alphas_cumprod
+    assert last_timestep(scheduler) == len(alpha_bar) - 1 == timesteps - 1
     assert alpha_bar[0] == 1.0
     assert alpha_bar[-1] == 0.0
     assert (alpha_bar.diff() < 0).all()
