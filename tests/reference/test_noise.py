@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from unirender_reference.noise import (
     FLOOR_BATCHES,
     FloorEstimate,
     combined,
+    floor_provenance,
     floor_range,
     full_spp,
     measured_floor_db,
@@ -168,6 +170,21 @@ def test_sampling_goes_on_until_the_floor_is_reached() -> None:
     assert found.nan_pixels == 2 * len(calls)
     np.testing.assert_allclose(found.variance, unit / found.spp, rtol=1e-4)
     assert np.abs((found.mean - 0.5) / np.sqrt(unit / found.spp)).max() < 6
+
+
+def test_a_floor_is_that_of_the_colours_or_what_it_is_measured_by() -> None:
+    """Noise of the coverage does not count; a measure of one's own decides alone."""
+    unit, calls = np.full((64, 64, 4), 0.01), []
+    unit[..., 3] = 1e3
+    assert render_to_floor(simulated(unit, calls), WHOLE, 30, premultiplied=True, spp=64).spp == 64
+    calls.clear()
+    found = render_to_floor(
+        simulated(unit, calls), WHOLE, 80, premultiplied=True, spp=64, measure=lambda mean, variance: (90.0, 85.0)
+    )
+    assert (len(calls), found.floor_db, found.sure_db, found.reached) == (1, 90.0, 85.0, True)
+    unsure = replace(found, sure_db=79.0)
+    assert not unsure.reached, "it takes the floor that is sure"
+    assert floor_provenance({"image": found, "diffuse": unsure})["floor_reached"] == "no"
 
 
 def test_a_floor_that_is_not_reached_is_reported() -> None:
