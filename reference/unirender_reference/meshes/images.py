@@ -3,13 +3,15 @@
 import io
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
+from unirender.sixteen_bits import as_stored
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
@@ -81,8 +83,8 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         UnirenderError: the image is cut off or damaged, or its numbers are no brightness (negative, floats above 1).
     """
     try:
-        image.load()
-        image = _eight_bits(image, name)
+        tags = getattr(image, "tag_v2", {})  # of a TIFF
+        image = _eight_bits(as_stored(image), tags, name)
         image = image if image.mode == mode else image.convert(mode)
     except (MemoryError, UnirenderError):
         raise
@@ -104,7 +106,7 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
     return texels
 
 
-def _eight_bits(image: Image.Image, name: str) -> Image.Image:
+def _eight_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> Image.Image:
     """Grey of more bits: the upper 8 of whole numbers, 255 times floats in [0, 1]. Pillow would clip both."""
     if image.mode.startswith("I;16"):
         return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
@@ -118,7 +120,7 @@ def _eight_bits(image: Image.Image, name: str) -> Image.Image:
                 "as PNG"
             )
         return Image.fromarray(np.round(np.clip(values, 0, 1) * 255).astype(np.uint8))
-    tags = getattr(image, "tag_v2", {})  # of a TIFF; other formats have 16 bits
+    # Formats without tags have 16 bits.
     bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
     if bits == 32 and not signed:
         values = values.view(np.uint32)
