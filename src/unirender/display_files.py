@@ -11,7 +11,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
 from unirender.primaries import REC709, SAME_PRIMARIES
-from unirender.sixteen_bits import has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
+from unirender.sixteen_bits import as_stored, has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
@@ -48,8 +48,10 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                     )
                 _check_grey(file, str(path))
                 _scale_transparent_grey(file)
+                if not upright:
+                    return as_stored(file).copy()
                 file.load()
-                return ImageOps.exif_transpose(file) if upright else file.copy()
+                return ImageOps.exif_transpose(file)
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 OTHER_ORDER = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}  # N: this machine's own
 UNPACKED = {"RGB": "RGB", "RGBX": "RGBX", "RGBA": "RGBA", "RGBa": "RGBA"}  # as Pillow names them -> bytes as they are
@@ -19,6 +19,15 @@ PLANAR_CONFIGURATION, SEPARATE = 284, 2  # tags and values of TIFF
 COMPRESSION, UNCOMPRESSED = 259, 1
 BITS = 258
 PHOTOMETRIC, WHITE_IS_ZERO = 262, 0
+TURNED_BACK = {  # EXIF orientation -> what undoes its turn
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_90,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_270,
+}
 GREY_AND_ALPHA = "LA"  # four bytes a pixel: the grey's, then the alpha's
 
 
@@ -96,13 +105,26 @@ def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:
         picture.tile = [  # pyright: ignore[reportAttributeAccessIssue] - of a picture from a file
             tile._replace(args=name if isinstance(tile.args, str) else (name, *tile.args[1:])) for tile in picture.tile
         ]
-        return np.asarray(ImageOps.exif_transpose(picture) if upright else picture)
+        return np.asarray(ImageOps.exif_transpose(picture) if upright else as_stored(picture))
 
 
 def opened(path: Path) -> Any:
     """A picture file, not decoded yet; of its size nothing is said."""
     with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
         return Image.open(path)
+
+
+def as_stored(picture: Image.Image) -> Image.Image:
+    """A picture file, decoded, whose pixels lie as they are stored: Pillow turns a TIFF, and forgets its orientation.
+
+    Args:
+        picture: opened, and not decoded yet.
+    """
+    orientation = getattr(picture, "tag_v2", {}).get(ExifTags.Base.Orientation)
+    picture.load()
+    if orientation not in TURNED_BACK or ExifTags.Base.Orientation in getattr(picture, "tag_v2", {}):
+        return picture
+    return picture.transpose(TURNED_BACK[orientation])
 
 
 def _name(arguments: Any) -> str:

@@ -10,6 +10,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, resample_environment, rotate_environment, texel_solid_angles
 from unirender_evaluation import metrics
+from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.light_metrics import (
     SHAPE,
     brightest_direction,
@@ -40,7 +41,7 @@ def angle(a: np.ndarray, b: np.ndarray) -> float:
 def test_scale_is_free_and_colour_is_not() -> None:
     true = 2 + environment(3)  # bright against the epsilon of the logarithm
     assert scaled_log_rmse(7.3 * true, true) < 1e-4
-    assert scaled_log_rmse(0.02 * true, true) < 1e-4
+    assert max(scaled_log_rmse(k * true, true) for k in (0.02, 1e-7, 1e7)) < 1e-4
     tinted = true * np.array([2.0, 1.0, 0.5], np.float32)
     assert scaled_log_rmse(tinted, true) == pytest.approx(math.log(2) * math.sqrt(2 / 3), rel=0.02)
 
@@ -88,6 +89,29 @@ def test_a_lamp_counts_by_the_light_in_its_cone() -> None:
     found = brightest_direction(pole)
     assert found is not None
     assert angle(found, direction(7, 9)) < 5
+
+
+def test_the_brightest_direction_is_by_luminance_in_a_cone_of_10_degrees() -> None:
+    """Red of 10 against blue of 20; one lamp against two that are 24 degrees apart, each of two thirds of it."""
+    for lamps, brightest in (
+        (((20, (10, 0, 0)), (60, (0, 0, 20))), 20),
+        (((20, (0, 0, 20)), (60, (0, 4, 0))), 60),
+        (((20, (1, 1, 1)), (26, (1, 1, 1)), (60, (1.5, 1.5, 1.5))), 60),
+    ):
+        light = np.zeros((46, 90, 3), np.float32)
+        for column, colour in lamps:
+            light[22, column] = colour
+        found = brightest_direction(light)
+        assert found is not None
+        assert angle(found, environment_directions(46, 90)[22, brightest]) < 2
+
+
+def test_the_balls_are_scored_against_those_of_the_true_light() -> None:
+    """In parts of the true one: the wrong way round, an error would count as many times less."""
+    found, true = (Intrinsics(environment=light) for light in (3 * environment(4), environment(5)))
+    values = score_light(found, true)
+    expected = ball_values(found.require("environment")["environment"], true.require("environment")["environment"])
+    assert expected.items() <= values.items()
 
 
 def test_a_uniform_light_has_no_direction() -> None:

@@ -114,6 +114,7 @@ def test_what_both_files_say_of_each_scenes_pictures_stays() -> None:
     said = "inverse: 2 pictures of each scene only"
     halves = [noted(f"3 scenes only; {said}", (name,), f"{name}.json") for name in EVERY]
     assert merge(halves)[0].method("ours-mean").note == said
+    assert merge([*halves, noted("", (), "c.json")])[0].method("ours-mean").note == said  # c.json has no record of it
     other = noted(f"3 scenes only; {said.replace('2', '1')}", EVERY[1:], "b.json")
     assert merge([halves[0], other])[0].method("ours-mean").note == ""
 
@@ -135,6 +136,10 @@ def test_doubts_are_counted_over_all_files() -> None:
     said = "fast; its own mask misses the object on {} of {} pictures (is it 0?)"
     assert one.run.method("ours-mean").note == said.format(1, counts[0])
     assert merge([one, two])[0].method("ours-mean").note == said.format(3, sum(counts))
+    infos = (replace(two.run.methods[0], config={"checkpoint": "b"}), *two.run.methods[1:])
+    rivals, _ = merge([one, replace(two, run=replace(two.run, methods=infos))])
+    for key, missed, count in (("ours-mean", 1, counts[0]), ("ours-mean-from-ball-1", 2, counts[1])):
+        assert rivals.method(key).note == said.format(missed, count)
 
 
 def test_a_value_that_only_one_file_has_is_kept() -> None:
@@ -166,6 +171,30 @@ def test_files_of_one_name_are_told_apart_by_their_paths() -> None:
     assert "Ours (mean) (y/out.json)" in labels
 
 
+def test_every_row_has_a_key_of_its_own() -> None:
+    """Also where the names of two files differ in what a key has not."""
+    sources = ("z.json", "x/a.json", "x-a.json", "a.json")
+    run, records = merge([changed(small_results(), i, source) for i, source in enumerate(sources)])
+    keys = [info.key for info in run.methods if info.key.startswith("ours-mean")]
+    assert len(set(keys)) == len(keys) == len(sources)
+    assert {sum(r.method == key for r in records) for key in keys} == {8}
+
+
+def test_merged_records_are_a_runs_own_in_its_order() -> None:
+    """Two populations of a sample are two records. (The draws of intervals follow the order.)"""
+    full = small_results("b.json")
+    more = (*full.records, replace(full.records[0], subset="textured"))
+    _, records = merge([small_results("a.json", ("noise-ceiling",)), replace(full, records=more)])
+    assert records == sorted(more, key=lambda r: (r.table, r.protocol, r.method, r.sample))
+
+
+def test_a_stored_row_keeps_where_it_is_from() -> None:
+    once, records = merge([small_results("a.json", ("ours-mean",)), small_results("b.json", ("noise-ceiling",))])
+    again, _ = merge([replace(small_results("ab.json"), run=once, records=tuple(records)), small_results("c.json")])
+    assert again.method("ours-mean").stored == once.method("ours-mean").stored
+    assert (again.method("input-as-albedo").stored or "").startswith("c, ")
+
+
 def test_a_partial_run_watermarks_all() -> None:
     made = tables(small_results("a.json", ("ours-mean",)), small_results("b.json", ("input-as-albedo",), limit=2))
     assert all(table.watermark == "--limit 2: a partial run, not a result" for table in made)
@@ -176,6 +205,19 @@ def test_the_protocol_line_has_what_both_say() -> None:
     run, _ = merge([small_results("a.json", ("ours-mean",)), other])
     found = (run.code, run.date, run.seeds, run.lpips, run.limit)
     assert found == ("abc and def", "2026-01-31 and 2026-02-01", (0, 3), ("alex",), None)
+
+
+def test_of_partial_runs_the_widest_describes_the_scenes_and_the_smallest_is_the_mark() -> None:
+    """What is not so of all runs is not said of them together."""
+    said = ((3, 0.1, "1", ""), (None, 0.3, "2", "old"), (2, 0.2, "1", ""))
+    runs = [
+        small_results(
+            f"{i}.json", limit=limit, coverage=share, environment={"cpu": "x", "mitsuba": version}, carried=old
+        )
+        for i, (limit, share, version, old) in enumerate(said)
+    ]
+    run, _ = merge(runs)
+    assert (run.limit, run.coverage, run.environment, run.carried) == (2, 0.3, {"cpu": "x"}, "old")
 
 
 @pytest.mark.parametrize(
@@ -199,6 +241,9 @@ def test_other_definitions_and_other_code() -> None:
     protocols = {**b.definitions.protocols, "single-image": "two images"}
     other = replace(b, definitions=replace(b.definitions, protocols=protocols))
     assert obstacles(a, other) == ["the protocol 'single-image' is defined otherwise in the two files"]
+    metrics = {**b.definitions.metrics, "psnr": b.definitions.metrics["mse"]}
+    other = replace(b, definitions=replace(b.definitions, metrics=metrics))
+    assert obstacles(a, other) == ["the metric 'psnr' is defined otherwise in the two files"]
     assert obstacles(a, b) == []
     assert differences(a, b) == [
         "code: abc in a.json, def in b.json",
@@ -210,5 +255,9 @@ def test_other_definitions_and_other_code() -> None:
 def test_nothing_and_the_same_file_twice_are_refused() -> None:
     with pytest.raises(UnirenderError, match="got no results"):
         merge([])
-    with pytest.raises(UnirenderError, match=r"a\.json: given twice"):
-        check_comparable([small_results(), small_results()])
+    files = [small_results(name) for name in ("a.json", "b.json", "c.json")]
+    for twice in (0, 1):
+        with pytest.raises(UnirenderError, match=rf"{'ab'[twice]}\.json: given twice"):
+            check_comparable([*files, files[twice]])
+    with pytest.raises(UnirenderError, match=r"a\.json and d\.json cannot be compared"):
+        check_comparable([*files, small_results("d.json", resolution=64)])

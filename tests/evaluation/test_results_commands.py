@@ -161,6 +161,25 @@ def test_the_comparison_is_the_paired_one_on_shared_samples() -> None:
     assert (albedo.only_a, albedo.only_b) == (1, 0)
     assert albedo.mean_a - albedo.mean_b == pytest.approx(1)
     assert (albedo.verdict, albedo.rank_a) == ("A beats B", Rank(1, 2))
+    turned = next(iter(compare_pair(b, a, *pair, DEFAULT_VARIANT))).columns[0]
+    assert (turned.mean_a, turned.mean_b, turned.only_a, turned.only_b) == (albedo.mean_b, albedo.mean_a, 0, 1)
+    assert turned.verdict == "A is beaten by B"
+
+
+def test_each_row_is_ranked_in_its_own_run_and_populations_are_compared_apart() -> None:
+    a, b = small_results("a.json"), small_results("b.json")
+    worse = {"ours-mean": 5.0}  # there
+    b = replace(
+        b, records=tuple(replace(r, values={KEY: worse.get(r.method, 10.0)}) for r in b.records if KEY in r.values)
+    )
+    b = replace(b, records=(*b.records, *(replace(r, subset="textured") for r in b.records)))
+    (pair,) = chosen_pairs(a.run, b.run, ["input-as-albedo=ours-mean"])
+    (found,) = compare_pair(a, b, *pair, DEFAULT_VARIANT)  # A has no textured objects
+    assert (found.columns[0].rank_a, found.columns[0].rank_b) == (Rank(2, 2), Rank(2, 2))
+    assert found.heading == "inverse/single-image"
+    (pair,) = chosen_pairs(b.run, b.run, ["ours-mean"])
+    headings = [found.heading for found in compare_pair(b, b, *pair, DEFAULT_VARIANT)]
+    assert headings == ["inverse/single-image", "inverse/single-image (textured)"]
 
 
 def test_ranks_are_on_rounded_means_of_rows_on_all_samples() -> None:

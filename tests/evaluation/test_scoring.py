@@ -5,12 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from unirender.color import image_srgb, unpremultiply
+from unirender.color import image_srgb, srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
-from unirender_evaluation.metrics import OWN_MASK, SCALES
+from unirender_evaluation.metrics import FACING_AWAY, OWN_MASK, SCALES, TURNED, metric_key
+from unirender_evaluation.plausible import facing_away, picture_doubt, range_doubt
 from unirender_evaluation.scoring import over_white, score_image, score_maps
+from unirender_evaluation.suites import Scene
+from unirender_evaluation.suspicions import decoding_gain, suspicions, turning_gain
+from unirender_evaluation.task import Asked, Task
 
 SIZE = 32
 
@@ -47,6 +51,89 @@ def test_the_truth_scores_perfectly() -> None:
             assert value > 100 if tolerant else value == pytest.approx(metric.perfect, abs=1e-4), key
         else:
             assert value == metric.perfect, key
+
+
+def around(width: int) -> np.ndarray:
+    """A frame whose border of so many pixels is covered: around a hole, rings shrink."""
+    mask = np.ones((20, 20, 1), np.float32)
+    mask[width:-width, width:-width] = 0
+    return mask
+
+
+def test_a_picture_of_any_exposure_is_no_doubt_and_one_of_other_units_is() -> None:
+    mask, rng = disc(), np.random.default_rng(0)
+    noise = rng.random((SIZE, SIZE, 3)) * mask
+    assert picture_doubt(noise, mask) is None
+    assert "is 25, expected linear radiance with white at 1" in (picture_doubt(mask * 25 * np.ones(3), mask) or "")
+    assert picture_doubt(mask * 15 * np.ones(3), mask) is None
+    whole = np.ones_like(mask)
+    assert picture_doubt(whole * 1e4 * np.ones(3), whole) is None, "a photograph, of any exposure"
+    assert range_doubt(mask * 200 * np.ones(3), mask, 255.0) is None
+    assert "below -0.3" in (range_doubt(np.where(rng.random(noise.shape) < 0.15, -0.3, noise), mask) or "")
+    assert range_doubt(np.where(rng.random(noise.shape) < 0.05, -0.3, noise), mask) is None, "ringing"
+    assert range_doubt(noise, 0 * mask) is None
+
+
+def test_the_background_is_what_no_filter_of_the_object_reaches() -> None:
+    """Two pixels away from all that is covered, however little; what is negative there is no black."""
+    mask = around(6)  # rings of 28, 20, 12 and 4 pixels are not covered
+    picture = mask * np.ones(3)
+    for level, doubted in ((0.01, False), (0.03, True), (-0.03, True)):
+        found = picture_doubt(np.where(mask > 0, picture, level), mask)
+        assert (found is not None) == doubted, level
+        assert not doubted or f"radiance {abs(level)} (median) where no object is" in (found or "")
+    assert picture_doubt(np.maximum(picture, around(8)), mask) is None, "two pixels around the object"
+    assert picture_doubt(np.maximum(picture, around(9)), np.maximum(mask, 0.3 * around(7))) is None
+    assert picture_doubt(np.ones((20, 20, 3)), np.maximum(around(9), mask)) is None, "nothing is further away"
+
+
+def test_normals_that_face_away_or_lie_in_other_axes_are_told_apart() -> None:
+    """By the share of what is covered, and by the cosine, which gains 2 n_y^2 from the right sign of y."""
+    true, mask = intrinsics(0).require("normal")["normal"], disc()
+    inside = mask[..., 0] > 0
+    assert facing_away(true, mask) == (true[inside][:, 2] < 0).mean() < 0.1
+    assert facing_away(true, 0 * mask) == 0
+    weight = mask[..., 0] / mask.sum()
+    for signs in ((-1, 1, 1), (1, -1, 1), (-1, -1, 1)):
+        gain = 2 * sum((weight * true[..., axis] ** 2).sum() for axis in (0, 1) if signs[axis] < 0)
+        assert turning_gain(true * signs, true, mask) == pytest.approx(gain, rel=1e-4)
+    assert turning_gain(true, true, mask) < 0
+
+
+def asked(truth: Intrinsics, picture: np.ndarray | None = None) -> Task:
+    mask = truth.require("mask")["mask"]
+    known = Asked(mask, {}, truth_image=picture, truth_maps=truth)
+    scene = Scene("ball-0_l0", "ball-0", "ball", False, "sky", 0, 1.0, ())
+    return Task("inverse", "single-image", "s", scene, ("decompose",), "s", "intrinsics", lambda: known)
+
+
+def test_only_what_is_probably_in_other_conventions_is_suspicious() -> None:
+    truth = intrinsics(0)
+    mask, truth = truth.require("mask")["mask"], truth.replace(specular=truth.require("diffuse")["diffuse"])
+    picture = truth.require("albedo")["albedo"] * mask
+    task = asked(truth, picture)
+    assert suspicions(task, picture, truth) == suspicions(task, None, None) == {}
+    rng = np.random.default_rng(1)
+    worse = np.clip(truth.require("albedo")["albedo"] + rng.normal(0, 0.2, mask.shape), 0, 1)
+    assert suspicions(task, worse * mask, truth.replace(albedo=worse)) == {}, "errors are none"
+    encoded = {name: srgb_encode(value) for name, value in truth.require("albedo", "specular", "diffuse").items()}
+    found = suspicions(task, srgb_encode(unpremultiply(picture, mask)) * mask, truth.replace(**encoded))
+    assert found.keys() == {metric_key(name, "decoded") for name in (*encoded, "relit")}
+    assert min(found.values()) > 40
+    normal = truth.require("normal")["normal"]
+    down, back = (normal * np.array(signs, np.float32) for signs in ((1, -1, 1), (1, -1, -1)))
+    assert suspicions(task, None, truth.replace(normal=down)) == {TURNED: turning_gain(down, normal, mask)}
+    assert suspicions(task, None, truth.replace(normal=back)) == {FACING_AWAY: facing_away(back, mask)}
+
+
+def test_taken_for_display_values_colours_gain_what_is_nearer() -> None:
+    """In dB of the masked error of display values; nothing where they are linear."""
+    true, mask = np.linspace(0.05, 0.9, SIZE**2 * 3).reshape(SIZE, SIZE, 3), disc()
+    shown = image_srgb(true)
+    near = shown + 0.01
+    errors = [metrics.mse(p, shown, mask) for p in (image_srgb(near), near)]
+    assert decoding_gain(near, true, mask) == pytest.approx(10 * math.log10(errors[0] / errors[1]), abs=1e-3)
+    assert decoding_gain(true, true, mask) == 0
 
 
 def test_every_variant_of_every_map_is_there() -> None:

@@ -13,6 +13,7 @@ from unirender_evaluation.suites import (
     constant_mse,
     level_counts,
     load_suite,
+    material_key,
     read_spec,
     stratified_materials,
     suite_path,
@@ -26,12 +27,14 @@ def test_tiny_materials_are_stratified_and_independent() -> None:
     materials = spec.materials()
     flat = np.array([m for scene in materials for m in scene])
     assert flat.shape == (240, 2)
-    for mse in constant_mse(materials):
-        assert mse == pytest.approx(0.1, abs=0.002)
+    assert constant_mse(materials) == pytest.approx((0.1, 0.1), abs=1e-12)
     for counts in level_counts(materials):
         assert len(counts) == 11
         assert set(counts.values()) <= {21, 22}
     assert abs(np.corrcoef(flat.T)[0, 1]) < 0.02
+    metallic = np.sort(np.array(materials)[..., 0], axis=1)
+    assert (metallic[:, :-1].max(axis=0) <= metallic[:, 1:].min(axis=0)).all(), "one from each fifth"
+    assert abs(np.corrcoef(metallic[:, 0], metallic[:, 1])[0, 1]) < 0.6  # 4 standard errors
     assert materials == spec.materials(), "the assignment is a pure function of the suite file"
     assert all(len(set(scene)) == 5 for scene in materials)
 
@@ -52,10 +55,15 @@ def test_the_constant_scores_alike_on_suites_of_every_size(scenes: int, per_scen
             assert mse == pytest.approx(0.1, abs=0.00201)
 
 
-@pytest.mark.parametrize(("scenes", "per_scene", "levels"), [(4, 2, 11), (48, 5, 11), (10, 3, 5)])
+@pytest.mark.parametrize(("scenes", "per_scene", "levels"), [(4, 2, 11), (48, 5, 11), (10, 3, 5), (12, 3, 2)])
 def test_every_size_has_different_materials_in_a_scene(scenes: int, per_scene: int, levels: int) -> None:
     materials = stratified_materials(scenes, per_scene, levels, seed=1)
     assert [len(set(row)) for row in materials] == [per_scene] * scenes
+
+
+def test_a_material_is_named_in_percent() -> None:
+    """The nearest: 0.29 times 100 is a little less than 29."""
+    assert material_key((0.29, 0.57)) == "m029_r057"
 
 
 def test_changed_truth_is_refused(tmp_path: Path) -> None:

@@ -176,6 +176,7 @@ def test_the_n_behind_a_label_is_that_of_no_other_cell() -> None:
     assert labels(found) == ["a", "b (n = 4)"]
     assert to_markdown(found).count("(n = 1)") == 1
     assert fewer(found) == "b (n = 4, Metallic n = 1)."
+    assert labels(counted({"a": 8, "b": 4}, {"a": 4, "b": 4})) == ["a", "b (n = 4)"]  # of all of its cells
     mixed = counted({"a": 8, "b": 5}, {"a": 4, "b": 4})  # complete in metallic, where n is 4
     assert labels(mixed) == ["a", "b"]
     assert fewer(mixed) == "b (Albedo n = 5)."

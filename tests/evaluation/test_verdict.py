@@ -1,13 +1,24 @@
 """Claims and verdict: what holds, what fails, what was not run, and what a stranger's row is asked."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
-from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.claims import (
+    OPTIMISED,
+    OUR_CLAIMS,
+    REFINED,
+    SHADOWED,
+    Claim,
+    optimisation_claims,
+    run_claims,
+    stranger_claims,
+)
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.verdict import findings, verdict_text
+from unirender_evaluation.verdict import ceiling_breaches, findings, verdict_text
 
 CHECK = {
     "passed": True,
@@ -49,6 +60,7 @@ def test_verdict_states_claims_and_failures() -> None:
     assert [f.holds for f in found] == [True, False, None]
     assert "HOLDS" in str(found[0])
     assert "FAILS" in str(found[1])
+    assert str(found[2]).startswith("not run inverse/single-image albedo PSNR")
     same = [record("b", i, x + (-1) ** i) for i, x in enumerate(level)]
     assert str(findings(same + records[:12], claims[:1])[0]).startswith("HOLDS")
     assert str(findings(same + [record("a", i, x) for i, x in enumerate(level)], claims[:1])[0]).startswith("open")
@@ -58,6 +70,8 @@ def test_verdict_states_claims_and_failures() -> None:
     assert "x: z-test FAILED" in text
     assert "partial run" in text
     assert "chosen from" not in text
+    assert "makes other meshes of x" in text
+    assert "other meshes" not in verdict_text(records, RunInfo("t", "h", 64, ()), CHECK | {"other_objects": ["x"]})
     assert "chosen from 30 of 40 scenes" in verdict_text(
         records, RunInfo("t", "h", 64, ()), CHECK | {"chosen_from": [30, 40]}
     )
@@ -103,6 +117,39 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
     assert "FAILS  inverse/single-image albedo PSNR: theirs is beaten by mean-albedo" in text
     assert "theirs is beaten by noise-ceiling, difference -20" in text
     assert "ours" not in text
+
+
+def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
+    """And what depends on a light's level, on metallic or on closed forms is stated and no claim."""
+    claims = stranger_claims("theirs")
+    assert {c.a for c in claims} == {"theirs"}
+    bars = {c.b for c in claims if c.expected == "beats"}
+    assert {(c.quantity, c.b) for c in claims if c.table == "inverse"} == {
+        *(("albedo", bar) for bar in ("input-as-albedo", "mean-albedo")),
+        *(("normal", bar) for bar in ("mean-normal", "sphere-normal")),
+        *((material, "constant-0-5") for material in ("metallic", "roughness")),
+    }
+    assert {c.protocol for c in claims if c.b == SHADOWED} == {"given-light"}, "elsewhere there is nothing to derive"
+    assert {(c.key.partition(".")[2], c.expected) for c in claims if c.table == "light"} == {
+        ("log_rmse_scaled", "beats"),
+        ("rmse_relative@aligned", "beats"),
+        ("rmse_relative@raw", "stated"),
+    }
+    ceiling = {(c.protocol, c.quantity) for c in claims if c.b == "noise-ceiling" and c.table == "relighting"}
+    assert ceiling == {
+        *((protocol, "relit") for protocol in ("from-image-sd", "from-image-hdri")),
+        *(("from-image-sd", quantity) for quantity in ("specular", "diffuse")),
+    }
+    rows = {c.b for c in claims}
+    assert rows - bars == {"composite", "composite-split-sum", SHADOWED, "noise-ceiling"}
+    theirs = {(c.a, c.b, c.quantity): c for c in optimisation_claims() if c.table != "light"}
+    assert {key for key, c in theirs.items() if c.expected == "beats"} == {
+        *(("ours-mean", OPTIMISED, what) for what in ("edit_metallic", "edit_roughness", "albedo", "normal")),
+        *(("ours-mean", OPTIMISED, what) for what in ("roughness", "relit")),
+        *((f"{OPTIMISED}-multi-view", "constant-object", what) for what in ("albedo", "metallic", "roughness")),
+        *((f"{OPTIMISED}-multi-view", "constant-object", what) for what in ("relit", "novel")),
+    }
+    assert (REFINED, "ours-mean", "albedo") in theirs
 
 
 def test_our_claims_are_made_where_our_rows_ran() -> None:
@@ -158,10 +205,41 @@ def test_what_the_optimiser_does_not_look_for_is_said_beside_the_figure() -> Non
 
 def test_identical_pictures_do_not_end_the_run() -> None:
     """An infinite PSNR has no interval: said, not raised."""
-    records = [*rows("a", ALBEDO, np.array([20, math.inf])), *rows("b", ALBEDO, np.array([19, math.inf]))]
-    found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
-    assert found[0].comparison is None
-    assert "infinite PSNR, not compared inverse/single-image albedo PSNR: a against b" in str(found[0])
+    for a, b in ((math.inf, math.inf), (math.inf, 19), (20, math.inf)):
+        records = [*rows("a", ALBEDO, np.array([20, a])), *rows("b", ALBEDO, np.array([19, b]))]
+        found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
+        assert found[0].comparison is None
+        assert "infinite PSNR, not compared inverse/single-image albedo PSNR: a against b" in str(found[0])
+
+
+@pytest.mark.parametrize(("objects", "sign"), [(18, "open"), (20, "FAILS")])
+def test_what_few_objects_leave_undecided_is_open(objects: int, sign: str) -> None:
+    level, swing = np.linspace(15, 20, 2 * objects), np.repeat((-1.0) ** np.arange(objects), 2)
+    records = [*rows("a", ALBEDO, level + swing), *rows("b", ALBEDO, level)]
+    (found,) = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
+    assert str(found).startswith(sign)
+
+
+def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> None:
+    """Not where samples alone would say so, nor on one object, nor where the truth has no noise; in PSNR alone."""
+    ceiling = np.linspace(40, 45, 16)
+    by_object = np.repeat([2.0, -0.5], 2)
+    values = {
+        "noise-ceiling": np.append(ceiling, [math.inf, math.inf]),
+        "below": np.append(ceiling - 3, [50, 50]),
+        "above": np.append(ceiling + 1, [99, 99]),
+        "by-object": ceiling + np.tile(by_object, 4),
+        "one-object": ceiling[:2] + 9,
+        "exact": np.append(ceiling[:3], math.inf),
+        "noise-free": np.array([]),
+    }
+    records = [r for method, level in values.items() for r in rows(method, ALBEDO, level)]
+    records += [Record("inverse", "single-image", "noise-free", "s16", "o8", {ALBEDO: math.inf})]
+    ssim = [replace(r, values={"albedo.ssim@masked-srgb-raw": 1 - (r.method == "noise-ceiling") / 2}) for r in records]
+    records = [replace(r, values={**r.values, **other.values}) for r, other in zip(records, ssim, strict=True)]
+    found = {(b.method, b.key): b.low_db for b in ceiling_breaches(records)}
+    assert found == {("above", ALBEDO): pytest.approx(1), ("exact", ALBEDO): math.inf}
+    assert [b.method for b in ceiling_breaches(records, exempt=("above",))] == ["exact"]
 
 
 def test_one_object_decides_nothing() -> None:

@@ -22,7 +22,7 @@ from gltf_files import (
     write_metallic_roughness,
     write_normal_mapped,
 )
-from PIL import Image
+from PIL import ExifTags, Image
 from trimesh.visual.gloss import specular_to_pbr
 
 from unirender.color import srgb_decode
@@ -404,6 +404,19 @@ def test_strips_are_the_whole_picture(monkeypatch):
         assert np.abs(found - expected).max() < 1e-6
     same = images.texels_of(Image.fromarray(stored), "a", 301, "RGB", srgb_decode)
     assert np.abs(same - linear_light).max() < 1e-6
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_texels_lie_as_they_are_stored_in_every_format(orientation):
+    """As other programs take them; Pillow turns a TIFF as its EXIF says."""
+    stored, exif = random_pixels(0, 7, 5), Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    for kind in ("PNG", "TIFF"):
+        data = io.BytesIO()
+        Image.fromarray(stored).save(data, kind, exif=exif)
+        image = images.ImageBudget().open(data.getvalue(), "a")
+        texels = images.texels_of(image, "a", 99, "RGB", images.linear)
+        np.testing.assert_allclose(texels, stored / 255, atol=1e-6, err_msg=kind)
 
 
 def test_only_textured_materials_share_the_atlas(tmp_path):

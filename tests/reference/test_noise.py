@@ -2,19 +2,23 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from inline_executor import Inline
 from reference_scenes import light, sphere
 
 from unirender.color import display_slope, image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference.adaptive import render_sample_to_floor
+from unirender_reference.measure import noise_floor
 from unirender_reference.measure.noise_floor import FloorRow, NoiseFloor, summary
 from unirender_reference.noise import (
     FLOOR_BATCHES,
     FloorEstimate,
     combined,
+    floor_provenance,
     floor_range,
     full_spp,
     measured_floor_db,
@@ -111,6 +115,27 @@ def test_combined_estimates_are_weighted_by_their_samples() -> None:
     assert np.abs((a.mean + b.mean) / 2 - samples.mean(0)).max() > 0.01
 
 
+@pytest.mark.parametrize("premultiplied", [True, False])
+def test_the_measured_floor_is_the_error_less_what_the_long_render_has_left(premultiplied: bool) -> None:
+    """Weighted by coverage; nothing is left where noise explains it all."""
+    mask = np.where(np.arange(64)[:, None, None] < 32, 1, 0.25).astype(np.float32) * WHOLE
+    scale = mask if premultiplied else WHOLE
+    level = np.where(mask == 1, 0.41, 0.43) * np.ones(3)
+    picture = Estimate((level * scale).astype(np.float32), None)
+    converged = Estimate(
+        (0.4 * scale * np.ones(3)).astype(np.float32), (1e-6 * scale**2 * np.ones(3)).astype(np.float32)
+    )
+    shown = image_srgb(np.array([0.4, 0.41, 0.43]))
+    error = np.average(np.square(shown[1:] - shown[0]), weights=[1, 0.25])
+    left = float(display_slope(np.array(0.4))) ** 2 * 1e-6
+    found = measured_floor_db(picture, converged, mask, premultiplied)
+    assert found == pytest.approx(-10 * math.log10(error - left), abs=2e-3)
+    assert abs(-10 * math.log10(error) - found) > 0.01  # the twin: the long render taken for exact
+    assert measured_floor_db(converged, converged, mask, premultiplied) == math.inf
+    with pytest.raises(UnirenderError, match="without variance"):
+        measured_floor_db(converged, picture, mask, premultiplied)
+
+
 @pytest.mark.parametrize("wanted", [1, 9, 256, 1000, 20_000, 60_000])
 @pytest.mark.parametrize("batches", [1, 8, 16])
 def test_sample_counts_make_full_passes(wanted: int, batches: int) -> None:
@@ -145,6 +170,21 @@ def test_sampling_goes_on_until_the_floor_is_reached() -> None:
     assert found.nan_pixels == 2 * len(calls)
     np.testing.assert_allclose(found.variance, unit / found.spp, rtol=1e-4)
     assert np.abs((found.mean - 0.5) / np.sqrt(unit / found.spp)).max() < 6
+
+
+def test_a_floor_is_that_of_the_colours_or_what_it_is_measured_by() -> None:
+    """Noise of the coverage does not count; a measure of one's own decides alone."""
+    unit, calls = np.full((64, 64, 4), 0.01), []
+    unit[..., 3] = 1e3
+    assert render_to_floor(simulated(unit, calls), WHOLE, 30, premultiplied=True, spp=64).spp == 64
+    calls.clear()
+    found = render_to_floor(
+        simulated(unit, calls), WHOLE, 80, premultiplied=True, spp=64, measure=lambda mean, variance: (90.0, 85.0)
+    )
+    assert (len(calls), found.floor_db, found.sure_db, found.reached) == (1, 90.0, 85.0, True)
+    unsure = replace(found, sure_db=79.0)
+    assert not unsure.reached, "it takes the floor that is sure"
+    assert floor_provenance({"image": found, "diffuse": unsure})["floor_reached"] == "no"
 
 
 def test_a_floor_that_is_not_reached_is_reported() -> None:
@@ -233,6 +273,31 @@ def test_the_command_judges_what_it_measured(measured: tuple[float, ...], status
     assert found == status
     assert said in lines[-1]
     assert f"min {min(measured):.2f} dB" in lines[0]
+
+
+class Here(Inline):
+    """A pool whose tasks run at once, in the process of the test."""
+
+    def __enter__(self) -> "Here":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("reaching", [(0, 1, 2), (1, 5, 6), (12, 13, 14), (14,), ()])
+def test_images_are_drawn_until_enough_are_measured_or_none_is_left(
+    reaching: tuple[int, ...], workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 15 candidates for 3 images those that reach the floor, the last of all included, and the ones before them."""
+    monkeypatch.setattr(noise_floor, "WorkerPool", lambda *options: Here())
+    monkeypatch.setattr(
+        noise_floor, "measure_floor", lambda job: measured_row(job.number, 45, 45 if job.number in reaching else None)
+    )
+    rows = list(NoiseFloor(images=3, workers=workers)._rows())
+    assert [row.number for row in rows if row.measured_db is not None] == list(reaching)
+    assert [row.number for row in rows] == list(range(reaching[-1] + 1 if len(reaching) == 3 else 15))
 
 
 @pytest.mark.long

@@ -15,8 +15,11 @@ from unirender_reference.integrators import path_integrator, python_integrator
 from unirender_reference.passes import (
     MOST_KEPT,
     MOST_SPLITS,
+    NAN_ATTEMPTS,
+    PIXELS_PER_BLOCK,
     Counters,
     derive_seed,
+    finite_pass,
     group_means,
     integrator_passes,
     kept_passes,
@@ -102,6 +105,33 @@ def test_nan_of_any_integrator_is_rendered_again_and_counted(scene) -> None:
         integrator_passes(scene, broken(0.5), SPP, 3, BATCHES, counters)
 
 
+def test_only_the_pixels_that_are_not_finite_are_taken_from_other_draws() -> None:
+    """One broken channel breaks a pixel; the last of the attempts counts, too."""
+
+    def drawn(attempt: int) -> np.ndarray:
+        picture = np.full((2, 2, 3), float(attempt))
+        picture[0, 0, 1] = np.nan if attempt < last else attempt
+        picture[1, 1, 2] = np.inf if attempt == 0 else attempt
+        return picture
+
+    counters, last = Counters(nan_pixels=5), NAN_ATTEMPTS
+    assert finite_pass(drawn, counters, "render").tolist() == [[[last] * 3, [0] * 3], [[0] * 3, [1] * 3]]
+    assert counters.nan_pixels == 5 + 2
+    last += 1
+    with pytest.raises(UnirenderError, match="render: 1 pixels stay NaN after 8 seeds"):
+        finite_pass(drawn, counters, "render")
+
+
+def test_the_variance_of_two_passes_is_that_of_their_mean() -> None:
+    tall = np.ones((PIXELS_PER_BLOCK + 3, 2, 3), np.float32)  # several blocks of rows
+    estimate = mean_estimate([tall, 3 * tall], 4, 2)
+    assert estimate.variance is not None
+    assert (estimate.mean == 2).all()
+    assert (estimate.variance == 1).all()
+    assert estimate.nan_pixels == 4
+    assert mean_estimate([tall], 0, 1).variance is None
+
+
 def test_weighted_estimate_divides_by_the_weights_of_each_channel() -> None:
     """The variance is that of the ratio: light and weight vary together, and so their ratio varies less."""
     rng = np.random.default_rng(0)
@@ -160,6 +190,21 @@ def test_passes_come_in_numbers_that_make_groups() -> None:
                 kept = kept_passes(count, batches, 64**2)
                 assert batches <= kept <= max(MOST_KEPT, MOST_SPLITS * batches)
                 assert count % kept == spp % count == 0
+
+
+def test_samples_are_divided_into_the_fewest_full_grids() -> None:
+    """40 in 4 batches: 10 are no grid, 8 are 2 x 4. A seed is the same in every process."""
+    assert [pass_count(*asked) for asked in ((40, 4, 64), (100, 1, 64), (13, 8, 64))] == [5, 4, 13]
+    assert next_spp(3, 8, 64) == 8
+    for spp, batches, said in (
+        (67, 1, "use 64 or 70"),
+        (5, 0, "5 in 0 batches"),
+        (0, 0, "0 in 0 batches"),
+        (7, 8, "at least one sample in each"),
+    ):
+        with pytest.raises(UnirenderError, match=said):
+            pass_count(spp, batches, 1 << 20)
+    assert derive_seed(7, "pass", 0, 1) == 17919641
 
 
 def test_groups_are_means_of_successive_passes() -> None:

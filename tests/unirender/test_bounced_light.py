@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from seen_shapes import SIZE, as_maps, ball, gutter
 
+from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.bounced_light import AROUND, REFLECTED, _mean_radiance, bounced_light
 from unirender.pipelines.derived_light import derived_light
@@ -63,7 +64,12 @@ def test_how_far_around_a_pixel_goes_with_the_size_of_the_object(side: int) -> N
     mask[:side, :side] = 1
     specular[side // 2, side // 2] = 1
     facing = (mask * np.array([0, 0, 1])).astype(np.float32)
-    seen = _mean_radiance(painted(facing, mask, 1.0, 1.0).replace(specular=specular, diffuse=0 * specular))[..., 0]
+    maps = painted(facing, mask, 1.0, 1.0)
+    even = lit(maps)
+    image, mean = split_sum_image(even)[mask[..., 0] > 0], _mean_radiance(even)
+    assert (mean[mask[..., 0] > 0] >= image.min(axis=0) - 1e-5).all(), "what is beside the object is not dark"
+    assert not mean[mask[..., 0] == 0].any()
+    seen = _mean_radiance(maps.replace(specular=specular, diffuse=0 * specular))[..., 0]
     away = np.arange(96) - side // 2
     for axis in (0, 1):
         spread = np.sqrt((seen.sum(axis=axis) * away**2).sum() / seen.sum())

@@ -40,9 +40,16 @@ def test_a_calibration_projects_to_its_pixels() -> None:
         assert np.abs(middle - point).max() <= 0.5 / focal * point[2] + 1e-6  # half a pixel
     assert camera.focal(height) == pytest.approx(focal, rel=1e-12)
     assert Camera.from_focal(focal, height, width).principal == (0.5, 0.5)
-    for bad in (0.0, -3.0, math.nan, math.inf):
+    for bad in ((0.0, 9, 9), (-3.0, 9, 9), (math.nan, 9, 9), (math.inf, 9, 9), (9.0, 0, 9), (9.0, 9, 0)):
         with pytest.raises(UnirenderError, match="expected numbers above 0"):
-            Camera.from_focal(bad, height, width)
+            Camera.from_focal(*bad)
+
+
+def test_a_square_part_has_the_pictures_rays() -> None:
+    """Of a picture that is no square, beyond whose left border the part reaches."""
+    camera, top, left, side = Camera(50, (0.3, 0.6)), 2, -1, 5
+    whole, part = camera.rays(9, 14), camera.of_square(top, left, side, 9, 14).rays(side, side)
+    np.testing.assert_allclose(part[:, 1:], whole[top : top + side, : left + side], atol=1e-6)
 
 
 @pytest.mark.parametrize(("fov", "fill"), [(36, 0.9), (60, 0.5), (20, 1.0)])
@@ -67,9 +74,11 @@ def test_impossible_principal_point(principal: tuple[float, float]) -> None:
         Camera(principal=principal)
 
 
-@pytest.mark.parametrize("camera", [Camera(), Camera(1 / 3 * 100, (-1e-7, 2 / 3)), Camera(50, (0.4, 0.6))])
+@pytest.mark.parametrize(
+    "camera", [Camera(), Camera(1 / 3 * 100, (-1e-7, 2 / 3)), Camera(50, (0.4, 0.6)), Camera(50, (1e20, 0.5))]
+)
 def test_a_described_camera_reads_back(camera: Camera) -> None:
-    assert Camera.parse(camera.describe()) == camera
+    assert Camera.parse(f" {camera.describe()}\n") == camera
 
 
 def test_the_description_is_that_of_rendered_files() -> None:

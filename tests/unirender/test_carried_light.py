@@ -1,9 +1,11 @@
 """What s and d have beyond their own light, under another one."""
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
+from seen_shapes import as_maps, gutter
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
@@ -27,6 +29,7 @@ def lamp(x: float, y: float, z: float, colour: tuple[float, float, float] = (1.0
 
 
 OWN = lamp(1, 1, 1)
+BESIDE = lamp(1, 0.6, 1.3)
 OPPOSITE = lamp(-1, -1, 0.4)
 
 
@@ -64,10 +67,20 @@ def test_under_its_own_light_an_object_gets_its_own_light_back() -> None:
     assert error(carried, before) < 0.02
 
 
+def test_where_s_and_d_are_what_their_own_light_gives_nothing_is_carried() -> None:
+    """Through a camera that is not the default one, of a surface that hides its own light."""
+    normal, mask, _ = gutter(16)
+    maps = as_maps(normal, mask, 0.3).replace(camera=Camera(70, (0.1, 0.8)), environment=OWN)
+    own, beside = (maps.replace(**derived_light(maps, light, NAMES)) for light in (OWN, BESIDE))
+    carried = with_carried_light(own, beside, NAMES, OWN, shadows=True)
+    for name in NAMES:
+        np.testing.assert_allclose(getattr(carried, name), getattr(beside, name), rtol=1e-5)
+    assert error(with_carried_light(own, beside, NAMES, OWN), beside) > 0.01  # the twin: as if it hid none
+
+
 def test_a_shadow_is_carried_to_a_light_from_the_same_side_and_not_to_the_opposite_one() -> None:
     before = found()
-    beside = lamp(1, 0.6, 1.3)
-    without, carried = relit(before, beside)
+    without, carried = relit(before, BESIDE)
     middle = np.s_[SIDE // 2 - 2 : SIDE // 2 + 2, SIDE // 3 : 2 * SIDE // 3]
     change = carried.require("diffuse")["diffuse"][middle] / without.require("diffuse")["diffuse"][middle]
     assert 0.5 < change.mean() < 0.9
@@ -149,6 +162,16 @@ def test_lights_agree_whatever_their_power_and_tint_and_not_where_they_come_from
     assert agreement(even, 3 * even, mask) > 0.99, "two even lights do the same"
     assert agreement(own, even, mask) < 0.15
     assert agreement(own, own, 0 * mask) == 0, "of nothing"
+
+
+def test_agreement_has_its_closed_form() -> None:
+    """Log light of +-a and of +-b about its mean; a spread of 0.05 is in all light. Half coverage counts half."""
+    for a, b, sign in ((0.1, 0.02, 1), (0.3, 0.3, 1), (0.1, 0.04, -1)):
+        logs = (np.array([[[a], [-a], [a]]]), sign * np.array([[[b], [-b], [b]]]))
+        one, other = (np.repeat(np.exp(log) - 0.02, 3, axis=-1).astype(np.float32) for log in logs)
+        mask = np.array([[[0.5], [1], [0.5]]], np.float32)
+        alike = (sign * a * b + 0.05**2) / math.sqrt((a**2 + 0.05**2) * (b**2 + 0.05**2))
+        assert agreement(one, other, mask) == pytest.approx(max(alike, 0), abs=1e-5)
 
 
 def test_the_finer_detail_is_carried_only_between_lights_that_agree() -> None:

@@ -29,7 +29,9 @@ def test_true_maps_are_a_fixed_point() -> None:
 def test_the_rendering_becomes_the_picture_within_bounds() -> None:
     maps = random_maps()
     picture = composite_image(maps) * RNG.uniform(0.7, 1.4, (*SIZE, 3)).astype(np.float32)
+    picture[0] = 0.7  # without coverage
     closed = close_decomposition(maps, picture, composite_image(maps))
+    picture[0] = 0
     before, after = (np.abs(composite_image(x) - picture).max() for x in (maps, closed))
     assert after < 0.05
     assert before > 3 * after
@@ -61,3 +63,6 @@ def test_a_clipped_picture_is_only_a_lower_bound() -> None:
     bright = composite_image(maps) >= maps.require("mask")["mask"]
     assert bright[2:].any()
     np.testing.assert_allclose(composite_image(closed)[bright], composite_image(maps)[bright], atol=1e-5)
+    near = 0.97 * maps.require("mask")["mask"] * np.ones(3, np.float32)  # below it, a channel is what it shows
+    darker = close_decomposition(maps, near, composite_image(maps)).require("albedo")["albedo"]
+    assert (darker < maps.require("albedo")["albedo"])[1:][bright[1:]].all()

@@ -17,8 +17,11 @@ from unirender.errors import UnirenderError
 # --- schedule
 
 
-def test_both_ends_are_exact() -> None:
-    alpha_bar = make_scheduler().alphas_cumprod
+@pytest.mark.parametrize("timesteps", [1000, 50])
+def test_both_ends_are_exact(timesteps: int) -> None:
+    scheduler = make_scheduler(timesteps)
+    alpha_bar = scheduler.alphas_cumprod
+    assert last_timestep(scheduler) == len(alpha_bar) - 1 == timesteps - 1
     assert alpha_bar[0] == 1.0
     assert alpha_bar[-1] == 0.0
     assert (alpha_bar.diff() < 0).all()
@@ -191,10 +194,13 @@ def test_noise_of_a_row_does_not_depend_on_the_batch() -> None:
 
 def test_modes() -> None:
     assert (steps_of("mean", None), steps_of("sample", None), steps_of("sample", 4)) == (1, 20, 4)
+    assert (steps_of("mean", 1), steps_of("sample", 500)) == (1, 500)
     for mode, steps, words in (
         ("mode", None, "'sample'"),
-        ("mean", 5, "takes 1 step"),
+        ("mean", 2, "takes 1 step"),
         ("sample", 0, "expected 1 to 500"),
+        ("sample", 501, "expected 1 to 500"),
+        ("sample", True, "expected 1 to 500"),
     ):
         with pytest.raises(UnirenderError, match=words):
             steps_of(mode, steps)

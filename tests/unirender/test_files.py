@@ -14,7 +14,7 @@ from PIL import Image
 from unirender.camera import Camera
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
-from unirender.exr import image_channels, intrinsics_channels, read_exr, write_environment, write_exr
+from unirender.exr import image_channels, intrinsics_channels, on_pole_grid, read_exr, write_environment, write_exr
 from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_sha256
@@ -72,6 +72,35 @@ def test_radiance_of_any_scale_is_stored(tmp_path: Path, scale: float, half: boo
     assert channels["specular.R"].pixels.dtype == (np.float16 if half else np.float32)
     image, _ = read_exr(tmp_path / "out/image.exr")
     np.testing.assert_allclose(image["R"], light[..., 0], rtol=1e-3 if half else 0, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("channels", "said"),
+    [
+        ({}, r"expected one common \[height, width\]"),
+        ({"R": np.zeros((2, 2)), "G": np.zeros((2, 3))}, "expected one common"),
+        ({"R": np.zeros((2, 2, 1))}, "expected one common"),
+        ({"R": np.array([[0, np.nan]])}, "EXR channel R: got NaN or infinity"),
+        ({"R": np.array([[0, np.inf]])}, "EXR channel R: got NaN or infinity"),
+        ({"R": np.array([[0, 65600.0]])}, "got 6.56e"),
+        ({"R": np.array([[0, -65600.0]])}, "half precision ends at 65504"),
+    ],
+)
+def test_what_an_exr_cannot_hold_is_refused(channels: dict[str, np.ndarray], said: str, tmp_path: Path) -> None:
+    with pytest.raises(UnirenderError, match=said):
+        write_exr(tmp_path / "a.exr", channels)
+    assert not any(tmp_path.iterdir())
+
+
+def test_only_what_says_so_is_on_the_pole_grid() -> None:
+    """The mark of an environment, or the exposure factor of a data set's."""
+    for attributes, found in (
+        ({"grid": "poles"}, True),
+        ({"exposure_factor": "0.3"}, True),
+        ({"grid": "areas"}, False),
+        ({}, False),
+    ):
+        assert on_pole_grid(attributes) == found, attributes
 
 
 def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path) -> None:

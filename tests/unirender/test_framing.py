@@ -34,7 +34,7 @@ def test_a_small_object_is_cut_out_and_put_back(size: tuple[int, int], where: tu
     assert square.sum() == pytest.approx(mask.sum() * (SIZE / frame.side) ** 2, rel=0.05)
     value = 0.7 * (mask > 0).astype(np.float32)
     back = frame.leave_map(frame.enter_map(value, mask), mask)
-    np.testing.assert_allclose(back[mask > 0.5], 0.7, rtol=1e-3)
+    np.testing.assert_allclose(back[mask > 0], 0.7, rtol=1e-3)
     assert not back[mask == 0].any()
     camera = Camera(50, (0.4, 0.6))
     top, left = frame.corner
@@ -48,6 +48,20 @@ def test_what_fills_the_picture_or_has_the_networks_size_is_left_as_it_is() -> N
     assert Frame.around(disc(64, 64, 32, 32, 25), SIZE) == Frame(64, 64, SIZE)
     assert Frame.around(disc(SIZE, SIZE, 16, 16, 4), SIZE).identity
     assert Frame.around(np.zeros((64, 64, 1), np.float32), SIZE) == Frame(64, 64, SIZE)
+    for side, cut in ((33, True), (34, False)):  # 0.8 of a square of 42, and of 43 pixels: two thirds of 64 are 42.7
+        box = np.zeros((64, 64, 1), np.float32)
+        box[3 : 3 + side, 9:20] = 1
+        assert (Frame.around(box, SIZE).cut is not None) == cut
+
+
+def test_a_picture_that_is_no_square_is_in_the_middle_of_one() -> None:
+    wide = np.ones((20, 50, 1), np.float32)
+    for picture, corner in ((wide, (-15, 0)), (wide.transpose(1, 0, 2), (0, -15))):
+        frame, rows = Frame.around(picture, 50), np.zeros((50, 50), bool)
+        rows[15:35] = True
+        assert frame.corner == corner
+        np.testing.assert_array_equal(frame.enter(picture)[..., 0], rows if corner[0] else rows.T)
+        np.testing.assert_array_equal(frame.leave(frame.enter(picture)), picture)
 
 
 def test_a_cut_out_object_is_reduced_and_not_enlarged() -> None:
@@ -113,6 +127,7 @@ def test_one_pixel_in_a_corner_is_seen() -> None:
     mask = np.zeros((300, 200, 1), np.float32)
     mask[299, 0] = 1
     frame = Frame.around(mask, SIZE)
+    assert frame.side == 8
     assert frame.enter(mask).max() > 0.5
     assert frame.leave_map(np.ones((SIZE, SIZE, 1), np.float32), mask)[299, 0] == pytest.approx(1)
 

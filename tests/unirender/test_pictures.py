@@ -8,11 +8,11 @@ import numpy as np
 import OpenEXR
 import pytest
 from icc_profiles import SRGB_D50, matrix_profile
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
-from unirender.display_files import MAX_PIXELS, display_values
+from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import read_input
@@ -117,6 +117,26 @@ def test_a_transparent_grey_is_alpha(bits: int, tmp_path: Path) -> None:
     assert picture.mask is not None
     np.testing.assert_array_equal(picture.mask[..., 0], values != transparent)
     np.testing.assert_allclose(picture.image_srgb[..., 0], values / (2**bits - 1), rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_pixels_of_posed_pictures_lie_as_they_are_stored(orientation: int, tmp_path: Path) -> None:
+    """Of every format, with 8 bits or 16; Pillow turns a TIFF while it decodes it."""
+    values = RNG.integers(0, 65536, (8, 9, 3))
+    write_tiff16(tmp_path / "a.tif", values, "<", orientation=orientation)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    eight = Image.fromarray((values >> 8).astype(np.uint8))
+    for name in ("b.tif", "b.png"):
+        eight.save(tmp_path / name, exif=exif)
+    eight.save(tmp_path / "c.tif", exif=exif, compression="tiff_lzw")
+    for name in ("a.tif", "b.tif", "b.png", "c.tif"):
+        stored = values / 65535 if name == "a.tif" else (values >> 8) / 255
+        colours, _ = srgb_values_and_remarks(tmp_path / name, name, upright=False)
+        for found in (colours, stored_values(tmp_path / name, upright=False)):
+            np.testing.assert_allclose(found, stored, atol=1e-6, err_msg=name)
+        turned = stored_values(tmp_path / name)
+        assert (turned.shape == stored.shape and np.allclose(turned, stored, atol=1e-6)) == (orientation == 1), name
 
 
 def test_sixteen_bits_that_are_converted_lose_half_of_them_which_is_told(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from unirender.camera import Camera
 from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions, resample_environment
@@ -60,11 +61,13 @@ def test_it_is_nearer_to_the_true_light_also_for_lobes_it_was_not_fitted_to(roug
     assert distance(found, roughness) < 0.6 * distance(blurred(lamp()), roughness)
 
 
-def test_a_light_that_explains_s_stays() -> None:
-    given = ball().replace(environment=lamp())
-    change = np.abs(revealed_light(given) - lamp()).sum() / lamp().sum()
+@pytest.mark.parametrize("camera", [Camera(), Camera(70, (0.1, 0.8))])
+def test_a_light_that_explains_s_stays(camera: Camera) -> None:
+    """As the camera sees it."""
+    seen = ball().replace(camera=camera)
+    given = seen.replace(environment=lamp(), specular=derived_specular(seen, lamp()))
     before = np.abs(blurred(lamp()) - lamp()).sum() / lamp().sum()
-    assert change < 0.1 * before
+    assert np.abs(revealed_light(given) - lamp()).sum() / lamp().sum() < 0.1 * before
 
 
 def test_what_no_lobe_sees_stays_as_predicted() -> None:
@@ -128,6 +131,8 @@ def test_the_agreeing_light_lights_the_ball_as_its_s_and_d_say() -> None:
         before, after = (np.abs(of(given, light) - wanted).sum() for light in (get(given, "environment"), found))
         assert after < most * before, name
     assert distance(found, WIDER) < 0.1 * distance(get(given, "environment"), WIDER)
+    shorter = given.replace(normal=np.float32(0.7) * get(given, "normal"))  # of a normal the direction counts
+    np.testing.assert_allclose(agreeing_light(shorter), found, rtol=1e-3)
 
 
 def test_d_says_left_from_right_where_s_is_black() -> None:

@@ -14,7 +14,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide, unit_normal
-from unirender.pipelines.tiling import TILED, add_detail, blend_tiles, tiles, tiles_of, window
+from unirender.pipelines.tiling import TILED, TILES_AT_ONCE, add_detail, blend_tiles, tiles, tiles_of, window
 from unirender.remarks import frame_remarks
 
 TILE = 16
@@ -79,8 +79,15 @@ def test_a_tile_larger_than_the_picture_is_padded() -> None:
 def test_what_is_local_is_exact(size: tuple[int, int]) -> None:
     """The pass over the whole picture loses the detail; the tiles bring it back, whatever their windows."""
     image, mask = picture(*size)
-    camera, frame = Camera(), Frame(*size, TILE)
-    (blended,) = blend_tiles(image, mask, camera, TILE, predict_locally)
+    camera, frame, batches = Camera(), Frame(*size, TILE), list[int]()
+
+    def predict(images: Sequence[Any], masks: Sequence[Any], cameras: Sequence[Camera]) -> list:
+        batches.append(len(images))
+        return predict_locally(images, masks, cameras)
+
+    (blended,) = blend_tiles(image, mask, camera, TILE, predict)
+    assert sum(batches) == len(tiles_of(mask, TILE)), "each tile once"
+    assert max(batches) <= TILES_AT_ONCE
     truth = local_maps(image, mask)
     inside = mask[..., 0] > 1e-2
     for name in TILED:
@@ -89,6 +96,8 @@ def test_what_is_local_is_exact(size: tuple[int, int]) -> None:
     maps: dict[str, Any] = {name: frame.leave_map(value, mask) for name, value in coarse.items()}
     whole = Intrinsics(mask=mask, albedo=maps["albedo"], normal=unit_normal(maps["normal"]))
     detailed = add_detail(whole, blended, frame).require("albedo", "normal")
+    longer = add_detail(whole, blended | {"normal": 2 * blended["normal"]}, frame).require("normal")["normal"]
+    np.testing.assert_allclose(longer, detailed["normal"], atol=1e-5)  # of a normal the direction counts
     np.testing.assert_allclose(detailed["albedo"][inside], truth["albedo"][inside], rtol=0, atol=1e-4)
     assert np.abs(maps["albedo"] - truth["albedo"])[inside].mean() > 0.02  # the twin: without tiles
     assert not detailed["albedo"][mask[..., 0] == 0].any()

@@ -5,6 +5,7 @@ of its own. The masked sRGB error between the two, less what noise the long rend
 a noise-free prediction would score.
 """
 
+import itertools
 import math
 import os
 from collections import deque
@@ -154,7 +155,7 @@ class NoiseFloor:
         return status
 
     def _rows(self) -> Iterator[FloorRow]:
-        """Rows in the order of their numbers, until enough are measured."""
+        """Rows in the order of their numbers, until enough are measured or all candidates have been tried."""
         from concurrent.futures import Future
 
         workers = self.workers or os.cpu_count() or 1
@@ -165,15 +166,14 @@ class NoiseFloor:
         with WorkerPool(workers, start_worker) as pool:
             under_way: deque[Future[FloorRow]] = deque()
             measured = 0
-            for job in jobs:
-                under_way.append(pool.submit(measure_floor, job))
-                if len(under_way) < min(workers, self.images - measured):
-                    continue
+            while measured < self.images:
+                free = min(workers, self.images - measured) - len(under_way)
+                under_way.extend(pool.submit(measure_floor, job) for job in itertools.islice(jobs, max(free, 0)))
+                if not under_way:
+                    break  # no candidate is left
                 row = under_way.popleft().result()
                 measured += row.measured_db is not None
                 yield row
-                if measured == self.images:
-                    break
             for future in under_way:
                 future.cancel()
 

@@ -3,13 +3,15 @@
 import io
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
+from unirender.sixteen_bits import as_stored
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
@@ -82,8 +84,8 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         UnirenderError: the image is cut off or damaged, or its numbers are no brightness (negative, floats above 1).
     """
     try:
-        image.load()
-        image = _eight_bits(image, name)
+        tags = getattr(image, "tag_v2", {})  # of a TIFF
+        image = _eight_bits(as_stored(image), tags, name)
         image = image if image.mode == mode else image.convert(mode)
     except (MemoryError, UnirenderError):
         raise
@@ -105,17 +107,16 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
     return texels
 
 
-def _eight_bits(image: Image.Image, name: str) -> Image.Image:
+def _eight_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> Image.Image:
     """Grey of more bits: the upper 8 of whole numbers, 255 times floats in [0, 1]. Pillow would clip both, and leaves
     those of a TIFF whose 0 is white inverted."""
     if image.mode[0] not in "IF":
         return image
-    upper = _upper_bits(image, name)
-    inverted = getattr(image, "tag_v2", {}).get(PHOTOMETRIC) == WHITE_IS_ZERO
-    return Image.fromarray(255 - upper if inverted else upper)
+    upper = _upper_bits(image, tags, name)
+    return Image.fromarray(255 - upper if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO else upper)
 
 
-def _upper_bits(image: Image.Image, name: str) -> UInt8[np.ndarray, "h w"]:
+def _upper_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> UInt8[np.ndarray, "h w"]:
     values = np.asarray(image)
     if image.mode == "F":
         if not (values.min() >= -SLACK and values.max() <= 1 + SLACK):  # NaN is neither
@@ -124,7 +125,7 @@ def _upper_bits(image: Image.Image, name: str) -> UInt8[np.ndarray, "h w"]:
                 "as PNG"
             )
         return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    tags = getattr(image, "tag_v2", {})  # of a TIFF; other formats have 16 bits
+    # Formats without tags have 16 bits.
     bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
     if image.mode != "I":
         return (values >> (bits - 8)).astype(np.uint8)

@@ -23,7 +23,6 @@ FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
 STRAY = 0.001  # of what counts: parts of the mask that together hold less are not looked for
-MOST_LEFT_OUT = 0.01  # of what counts, whose maps nobody needs
 THUMBNAIL_SIDE = 32  # pixels
 
 
@@ -69,9 +68,7 @@ class Frame:
         side = max(math.ceil(max(bottom - top, right - left) / FILL), LEAST_CUT)
         if side > SMALL * whole.side:
             return whole
-        cut = cls(height, width, size, ((top + bottom - side) // 2, (left + right - side) // 2, side))
-        inside = visible[cut._slices()[0]].sum(dtype=np.float64)
-        return cut if inside >= (1 - MOST_LEFT_OUT) * visible.sum(dtype=np.float64) else whole
+        return cls(height, width, size, ((top + bottom - side) // 2, (left + right - side) // 2, side))
 
     @classmethod
     def reduced(cls, mask: Float[np.ndarray, "h w 1"], most: int) -> "Frame":
