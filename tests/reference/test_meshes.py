@@ -233,6 +233,7 @@ PURPLE = srgb_decode(np.array([128, 64, 255]) / 255)
 OFF_FILES = {  # the header, what stands behind each vertex and each face, the colours, what is ignored
     "whole numbers": ("COFF", " 128 64 255 255", "", PURPLE, ""),
     "floats": ("COFF", " 0.50196 0.25098 1.0", "", PURPLE, ""),
+    "floats without points": ("COFF", " 1 0 0 1", "", np.array([1, 0, 0]), ""),
     "of faces": ("OFF", "", " 128 64 255", PURPLE, ""),
     "none": ("OFF", "", "", np.full(3, 0.5), ""),
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
@@ -255,6 +256,70 @@ def test_colors_of_off_files(tmp_path, kind):
         np.broadcast_to(expected, obj.albedo.reshape(-1, 3).shape), abs=1e-4
     )
     assert obj.provenance["ignored"] == ignored
+
+
+def write_colored_ply(path, types, color, faces="3 0 1 2\n3 0 2 3\n"):
+    names = ["x", "y", "z", "red", "green", "blue", "alpha"]
+    kinds = ["float"] * 3 + types
+    head = ["ply", "format ascii 1.0", "element vertex 4"]
+    head += [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=False)]
+    head += [f"element face {len(faces.splitlines())}", "property list uchar int vertex_indices", "end_header"]
+    path.write_text("\n".join([*head, *(f"{line} {color}" for line in CORNER_LINES), faces]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("types", "color"),
+    [
+        (["uchar"] * 3, "128 64 255"),
+        (["uchar"] * 3 + ["float"], "128 64 255 1"),
+        (["float"] * 3, "128 64 255"),
+        (["float"] * 3, "0.50196 0.25098 1.00001"),
+        (["ushort"] * 3, "32896 16448 65535"),
+        (["ushort"] * 3, "32900 16450 65500"),
+    ],
+)
+def test_colors_of_a_ply_are_in_the_range_of_their_type(tmp_path, types, color):
+    """They were white where one number was a float and of 255, and their low bytes where they had 16 bits."""
+    obj = load_mesh(write_colored_ply(tmp_path / "a.ply", types, color))
+    found = obj.albedo.reshape(-1, 3)
+    np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=2e-3)
+
+
+def test_colors_of_an_obj_that_miss_one_by_rounding(tmp_path):
+    """They counted as of 255: the object was black."""
+    lines = [*(f"v {line} 0.50196 0.25098 1.00001" for line in CORNER_LINES), "f 1 2 3 4"]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    found = load_mesh(tmp_path / "a.obj").albedo.reshape(-1, 3)
+    np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=1e-4)
+
+
+def test_colors_of_a_ply_s_quads_are_said_to_be_left_out(tmp_path):
+    """The object was white, and nothing said so; beside triangles it was no PLY."""
+    path = write_colored_ply(tmp_path / "a.ply", [], "", "4 0 1 2 3 255 0 0\n3 0 1 2 0 255 0\n")
+    types = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    path.write_text(path.read_text().replace("end_header", types + "end_header"))
+    obj = load_mesh(path)
+    assert obj.provenance["ignored"] == "colours"
+    assert obj.albedo == pytest.approx(0.5)
+
+
+def test_stl_that_goes_on_behind_its_facets(tmp_path):
+    """It was called a point cloud; colours in the facets were left out, and nothing said so."""
+    trimesh.creation.box().export(tmp_path / "a.stl")
+    data = (tmp_path / "a.stl").read_bytes()
+    (tmp_path / "a.stl").write_bytes(data + bytes(10))
+    obj = load_mesh(tmp_path / "a.stl")
+    assert (len(obj.faces), obj.provenance["ignored"]) == (12, "")
+    (tmp_path / "a.stl").write_bytes(data[:-2] + b"\x1f\x80")
+    assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "attributes of facets"
+
+
+def test_stl_in_capitals(tmp_path):
+    """It was taken for a binary one that is cut off."""
+    text = str(trimesh.creation.box().export(file_type="stl_ascii")).upper()
+    (tmp_path / "a.stl").write_text(text)
+    assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 
 def test_each_face_of_an_off_file_has_its_color(tmp_path):

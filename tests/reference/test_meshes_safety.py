@@ -379,6 +379,8 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
         ("a.off", b"off\n3 1 0\n", "expected OFF"),
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),
         ("a.ply", PLY + b"comment TextureFile ../a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "'../a.png' lies outside"),
+        ("a.ply", PLY + b"comment TextureFile a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "texture 'a.png' is missing"),
+        ("a.ply", PLY + b"comment TextureFile a\ncomment TextureFile b\n" + PLY_TRIANGLE + b"3 0 1 2\n", "names 2"),
         ("a.ply", PLY + b"comment\n" * 9000 + PLY_TRIANGLE + b"3 0 1 2\n", "header does not end within 65,536 bytes"),
         ("a.ply", PLY + PLY_TRIANGLE + b"3 0 1 7\n", "outside the 3 vertices|cannot be read"),
     ],

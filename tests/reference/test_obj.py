@@ -311,3 +311,9 @@ def test_tiff_of_whole_numbers(tmp_path, kind, bits, black, value):
     obj = write(tmp_path, "map_Pr a.tiff")
     assert obj.roughness is not None
     assert obj.roughness == pytest.approx(np.full_like(obj.roughness, 0.25), abs=0.5 / 255 + 1e-6)
+
+
+def test_comment_behind_a_face(tmp_path):
+    """The line was refused."""
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 # lid\n")
+    assert len(load_mesh(tmp_path / "a.obj").faces) == 1

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender_reference.meshes.colors import unit_colors
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.limits import (
     MAX_LINE_BYTES,
@@ -88,7 +89,7 @@ class _Lines:
             )
             _check_vertices(len(self.normals) // 3, "normals")
         elif keyword == b"f":
-            self._face(rest.split())
+            self._face(rest.partition(b"#")[0].split())
         elif keyword == b"usemtl":
             self._current = self.names.setdefault(rest.decode("utf-8", "surrogateescape").strip(), len(self.names))
             check_materials(len(self.names))
@@ -224,10 +225,8 @@ def _colors(lines: _Lines, count: int) -> Float[np.ndarray, "n 3"] | None:
     """Linear colours of the points, NaN where one has none; None where none has."""
     if not lines.colored:
         return None
-    stored = np.array(lines.colors).reshape(-1, 3)
     colors = np.full((count, 3), np.nan)
-    linear = srgb_decode(np.clip(np.nan_to_num(stored / (255 if stored.max() > 1 else 1)), 0, 1))
-    colors[np.array(lines.colored)] = linear
+    colors[np.array(lines.colored)] = srgb_decode(unit_colors(np.array(lines.colors).reshape(-1, 3)))
     return colors
 
 

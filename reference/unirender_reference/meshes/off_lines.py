@@ -2,7 +2,7 @@
 
 Behind the three coordinates of a vertex stand its normal (N), its colour (C) and its texture coordinates (ST), as far
 as the header's letters name them; behind the indices of a face may stand a colour. Colours are three or four numbers,
-sRGB-coded: whole ones of 255, others of 1; the fourth is alpha. A single number behind a face is an index into a table
+sRGB-coded, of 255 or of 1 (`colors`); the fourth is alpha. A single number behind a face is an index into a table
 that the file does not hold.
 """
 
@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender_reference.meshes.colors import unit_colors
 
 LETTERS = "CNST"
 
@@ -87,9 +88,8 @@ def read_off_lines(path: Path) -> OffLines:
 def _linear(numbers: list[list[str]]) -> Float[np.ndarray, "n 3"] | None:
     if not numbers or {len(words) for words in numbers} - {3, 4}:
         return None
-    whole = all(word.isdigit() for words in numbers for word in words[:3])
     try:
-        colors = np.array([words[:3] for words in numbers], np.float64) / (255 if whole else 1)
+        stored = np.array([words[:3] for words in numbers], np.float64)
     except ValueError:  # words
         return None
-    return srgb_decode(np.clip(np.nan_to_num(colors), 0, 1).astype(np.float32)).astype(np.float64)
+    return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64)

@@ -16,6 +16,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender_reference.meshes.colors import unit_colors
 from unirender_reference.meshes.folder import FolderResolver, ModelFolder
 from unirender_reference.meshes.images import ImageBudget, texels_of
 from unirender_reference.meshes.limits import (
@@ -37,6 +38,8 @@ DOUBLE = re.compile(rb"^format ascii|^property (double|float64) x", re.MULTILINE
 PLY_COLOR = re.compile(rb"^(property\s+\w+\s+)((?:diffuse_)?(?:red|green|blue)|[rgb])(?=\s*$)", re.MULTILINE)
 PLY_COLORS = ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")
 USUAL = {b"r": b"red", b"g": b"green", b"b": b"blue"}
+STL_HEADER, STL_FACET = 84, 50  # bytes of a binary file: its header with the count, and each facet
+FACET_ATTRIBUTES = "attributes of facets"  # among what is ignored
 WHITE = Material({"albedo": np.ones(3, np.float32)})
 TEXTURE_COMMENT = re.compile(rb"^comment\s+TextureFile\s+(.+?)\s*$", re.MULTILINE)
 
@@ -57,16 +60,21 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
         head = file.read(65536)
     _check_claims(path.suffix.lower(), head, length)
     _check_end(path, head)
+    texture = _texture(folder, head)
     off = read_off_lines(path) if path.suffix.lower() == ".off" else OffLines()
     resolver = FolderResolver(folder)
-    renamed = _with_usual_colors(path, head) if path.suffix.lower() == ".ply" else None
-    if renamed is None:
+    kind, rewritten, ignored = path.suffix.lower()[1:], None, {"colours"} if off.left_out else set[str]()
+    if kind == "ply":
+        rewritten = _with_usual_colors(path, head)
+    elif kind == "stl" and not _is_text(head):
+        rewritten = _whole_facets(path, head)
+        ignored |= {FACET_ATTRIBUTES} if _has_attributes(rewritten) else set()
+    if rewritten is None:
         scene = trimesh.load_scene(path, process=False, resolver=resolver)
     else:
-        scene = trimesh.load_scene(renamed, file_type="ply", process=False, resolver=resolver)
+        scene = trimesh.load_scene(rewritten, file_type=kind, process=False, resolver=resolver)
     if resolver.error:
         raise resolver.error
-    texture = _texture(folder, head)
     pieces = []
     for mesh in scene.geometry.values():
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
@@ -75,12 +83,36 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
                 raise UnirenderError(f"its faces index outside the {len(mesh.vertices):,} vertices; export it again")
             step = 0.0 if DOUBLE.search(head) or path.suffix.lower() == ".off" else float32_step(mesh.vertices)
             piece = _piece(mesh, texture, step)
+            if piece.colors is None and not piece.uv and _stored_colors(mesh, "face") is not None:
+                ignored.add("colours")
             if off.normals is not None:
                 piece = replace(piece, normals=off.normals[piece.faces])
             if off.colored:
                 piece = replace(piece, colors=off.corners(piece.faces), material=WHITE)
             pieces.append(piece)
-    return Model(pieces, frozenset({"colours"} if off.left_out else ()))
+    return Model(pieces, frozenset(ignored))
+
+
+def _is_text(head: bytes) -> bool:
+    """Whether an STL is one of words; in the count of facets and behind each of them a binary one has zeros."""
+    return b"\0" not in head and re.search(rb"facet|endsolid", head, re.IGNORECASE) is not None
+
+
+def _facets(head: bytes) -> int:
+    """How many facets a binary STL claims."""
+    return int.from_bytes(head[80:STL_HEADER], "little")
+
+
+def _whole_facets(path: Path, head: bytes) -> io.BytesIO:
+    """A binary STL without what follows its last facet, which trimesh takes for a sign that it is none."""
+    with path.open("rb") as file:
+        return io.BytesIO(file.read(STL_HEADER + STL_FACET * _facets(head)))
+
+
+def _has_attributes(stl: io.BytesIO) -> bool:
+    """Whether a facet has attributes: the two last bytes of each, where some exporters keep a colour."""
+    facets = np.frombuffer(stl.getbuffer(), np.uint8, offset=STL_HEADER).reshape(-1, STL_FACET)
+    return bool(facets[:, -2:].any())
 
 
 def _with_usual_colors(path: Path, head: bytes) -> io.BytesIO | None:
@@ -105,12 +137,11 @@ def _check_claims(suffix: str, head: bytes, length: int) -> None:
     elif suffix == ".off":
         numbers = re.findall(rb"\d+", re.sub(rb"#[^\n]*", b"", head).partition(b"OFF")[2])[:2]
         claims = dict(zip(("vertex", "face"), map(int, numbers), strict=False))
-    elif suffix == ".stl" and not re.search(b"facet|endsolid", head[:1024]):
-        count = int.from_bytes(head[80:84], "little")
-        if len(head) < 84 or length < 84 + 50 * count:
-            raise UnirenderError(
-                f"truncated: claims {count:,} triangles in {length:,} bytes, expected {84 + 50 * count:,}"
-            )
+    elif suffix == ".stl" and not _is_text(head):
+        count = _facets(head)
+        expected = STL_HEADER + STL_FACET * count
+        if length < expected:
+            raise UnirenderError(f"truncated: claims {count:,} triangles in {length:,} bytes, expected {expected:,}")
     for name, count in claims.items():
         limit = MAX_FACES if name == "face" else MAX_VERTICES
         if count > limit:
@@ -134,7 +165,7 @@ def _check_end(path: Path, head: bytes) -> None:
             raise UnirenderError(
                 f"truncated: its last face has {len(last) - 1} of {int(last[0])} corners; copy it again"
             )
-    elif path.suffix.lower() == ".stl" and b"facet" in head and b"\0" not in head:
+    elif path.suffix.lower() == ".stl" and _is_text(head):
         with path.open("rb") as file:
             file.seek(-min(path.stat().st_size, 1024), io.SEEK_END)
             if b"endsolid" not in file.read().lower():
@@ -143,10 +174,14 @@ def _check_end(path: Path, head: bytes) -> None:
 
 def _texture(folder: ModelFolder, head: bytes) -> Texture | None:
     """The picture that a PLY header names, as MeshLab writes it."""
-    found = TEXTURE_COMMENT.search(head.partition(b"end_header")[0])
-    if found is None:
+    names = list(dict.fromkeys(TEXTURE_COMMENT.findall(head.partition(b"end_header")[0])))
+    if not names:
         return None
-    name = found[1].decode("utf-8", "surrogateescape")
+    if len(names) > 1:
+        raise UnirenderError(
+            f"names {len(names)} textures, expected one: which of them a face has is not read; export it as OBJ or GLB"
+        )
+    name = names[0].decode("utf-8", "surrogateescape")
     image = ImageBudget().open(folder.read(name, "texture"), repr(name))
     return Texture(texels_of(image, repr(name), MAX_TEXTURE, "RGB", srgb_decode))
 
@@ -179,10 +214,21 @@ def _piece(mesh: trimesh.Trimesh, texture: Texture | None, step: float) -> Piece
 
 def _colors(mesh: trimesh.Trimesh, faces: np.ndarray) -> Float[np.ndarray, "m 3 3"] | None:
     """Linear colours of the corners, from the vertices or the faces."""
-    visual: Any = mesh.visual
-    if getattr(visual, "kind", None) == "vertex" and len(visual.vertex_colors) == len(mesh.vertices):
-        return srgb_decode(np.asarray(visual.vertex_colors, np.float32)[:, :3] / 255)[faces].astype(np.float64)
-    if getattr(visual, "kind", None) == "face":
-        linear = srgb_decode(np.asarray(visual.face_colors, np.float32)[:, :3] / 255)
-        return np.repeat(linear[:, None], 3, axis=1).astype(np.float64)
-    return None
+    kind = getattr(mesh.visual, "kind", None)
+    stored = _stored_colors(mesh, kind) if kind in ("vertex", "face") else None
+    if stored is None:
+        return None
+    linear = srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64)
+    if kind == "vertex":
+        return linear[faces] if len(linear) == len(mesh.vertices) else None
+    # Of polygons with more corners trimesh makes triangles in another order.
+    return np.repeat(linear[:, None], 3, axis=1) if len(linear) == len(faces) else None
+
+
+def _stored_colors(mesh: trimesh.Trimesh, element: str) -> np.ndarray | None:
+    """Red, green and blue of a PLY's vertices or faces in the type that the file has; trimesh takes floats as of 1."""
+    data = mesh.metadata.get("_ply_raw", {}).get(element, {}).get("data")
+    names = data.dtype.names or () if isinstance(data, np.ndarray) else data or ()
+    if data is None or not {"red", "green", "blue"} <= set(names):
+        return None
+    return np.stack([np.asarray(data[name]).reshape(-1) for name in ("red", "green", "blue")], axis=-1)
