@@ -58,6 +58,7 @@ RESULTS = Path(__file__).parents[1] / "evaluation" / "results"
 
 _CODE = re.compile(r"(``.+?``|`[^`]+`)")
 _OVERLINE = re.compile(r'<mover accent="false">((?:(?!<mover).)*?)<mo accent="true">_</mo>\s*</mover>', re.DOTALL)
+_COUNT = re.compile(r"\(n = (\d+)\)")
 _EMPHASIS = re.compile(r"(?<![\w*])\*(?=[^\s*])([^*]*[^\s*])\*(?![\w*])")
 
 
@@ -113,10 +114,11 @@ def _tables(folder: Path) -> str:
 
 
 def _intervals(app: Sphinx, doctree: nodes.document) -> None:
-    """Half an interval stays on one line with its sign: a column of a table may be narrower than both."""
+    """Half an interval stays on one line with its sign, and a row's count with its `n`: a column may be narrower."""
     for text in list(doctree.findall(nodes.Text)):
-        if "± " in text and not isinstance(text.parent, (nodes.literal, nodes.literal_block)):
-            text.parent.replace(text, nodes.Text(text.replace("± ", "±\N{NO-BREAK SPACE}")))
+        kept = _COUNT.sub("(n\N{NO-BREAK SPACE}=\N{NO-BREAK SPACE}\\1)", text.replace("± ", "±\N{NO-BREAK SPACE}"))
+        if kept != text and not isinstance(text.parent, (nodes.literal, nodes.literal_block)):
+            text.parent.replace(text, nodes.Text(kept))
 
 
 def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:

@@ -5,6 +5,7 @@ import itertools
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light, refuse
+from unirender.command_line import parse
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
@@ -676,6 +678,31 @@ def test_help_loads_nothing_heavy() -> None:
         "assert not heavy, heavy\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@dataclass(frozen=True)
+class Described:
+    """A command."""
+
+    size: int = 8
+    """One sentence that runs
+    over a line end, with `code`
+    `at` the start of a line.
+
+    A paragraph:
+    - an item
+    """
+
+
+def test_help_breaks_no_sentence_of_an_option_where_the_source_does(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit):
+        parse(Described, ["--help"], "described", "")
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    assert "--size INT  One sentence that runs over a line end, with `code` `at` the start of a line." in lines
+    assert {"A paragraph:", "- an item (default: 8)"} <= set(lines)
 
 
 def test_train_writes_a_pipeline_that_decompose_loads(

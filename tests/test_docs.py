@@ -220,11 +220,14 @@ def test_a_bar_over_a_formula_is_left_to_the_style_sheet() -> None:
     assert "math .overline {" in (ROOT / "docs" / "_static" / "narrow.css").read_text(encoding="utf-8")
 
 
-def test_an_interval_is_not_broken_behind_its_sign_but_in_code() -> None:
+def test_an_interval_and_a_count_are_not_broken_but_in_code() -> None:
     page = nodes.section()
-    page += [nodes.paragraph("", "1.5 ± 0.2"), nodes.literal_block("", "1.5 ± 0.2")]
+    page += [nodes.paragraph("", "Ours (n = 48) 1.5 ± 0.2"), nodes.literal_block("", "(n = 48) 1.5 ± 0.2")]
     site_settings()._intervals(None, page)
-    assert [each.astext() for each in page.children] == ["1.5 ±\N{NO-BREAK SPACE}0.2", "1.5 ± 0.2"]
+    assert [each.astext().replace("\N{NO-BREAK SPACE}", "_") for each in page.children] == [
+        "Ours (n_=_48) 1.5 ±_0.2",
+        "(n = 48) 1.5 ± 0.2",
+    ]
 
 
 def executed(page: Path) -> Iterator[tuple[str, str]]:

@@ -93,7 +93,7 @@ def build_rows(config: BenchConfig) -> list[Row]:
         from unirender.models.precision import resolve_device
 
         folder, device = config.weights(), str(resolve_device(config.device))
-        pipeline = LazyPipeline(lambda: _load_pipeline(folder, device))
+        pipeline = LazyPipeline(lambda: load_pipeline(folder, device))
         rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
     if "optimisation" in config.methods and config.subsets.optimise != 0:
         main = next((row.method for row in rows if row.info.key == OURS), None)
@@ -107,9 +107,13 @@ def build_rows(config: BenchConfig) -> list[Row]:
     return check_rows(rows + strangers, BOUNDS)
 
 
-def _load_pipeline(folder: Path, device: str) -> Any:
+def load_pipeline(folder: Path, device: str) -> Any:
+    """Our model from its folder, silent, on that device."""
+    import diffusers
+
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
+    diffusers.utils.logging.disable_progress_bar()  # of loading: two small files, and a bar for each worker
     pipeline = UniRenderPipeline.from_pretrained(folder).to(device)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline

@@ -1,8 +1,10 @@
 """`unirender bench run`: its options, and what it refuses of them. Light to import."""
 
 import sys
+import textwrap
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -11,6 +13,11 @@ from unirender.option_checks import at_least
 from unirender.options import Device
 from unirender_evaluation.results_commands import asked_variants
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+CLAIM = 9  # columns before a claim of the verdict: whether it holds
 
 
 @dataclass(frozen=True)
@@ -130,9 +137,20 @@ class BenchRun:
             return 1
         for table in result.tables:
             print_table(console, table)
-        console.print(result.verdict, markup=False, highlight=False)
+        print_verdict(console, result.verdict)
         console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
         return 0 if result.truth_check.get("passed") else 1
+
+
+def print_verdict(console: "Console", verdict: str) -> None:
+    """A claim on each line; at a terminal that is narrower the rest of it is set below its beginning."""
+    for line in verdict.splitlines():
+        shown = (
+            textwrap.fill(line, console.width, subsequent_indent=CLAIM * " ", break_on_hyphens=False)
+            if console.is_terminal
+            else line
+        )
+        console.print(shown, markup=False, highlight=False, soft_wrap=True)
 
 
 def named_folders(pairs: tuple[str, ...]) -> dict[str, Path]:

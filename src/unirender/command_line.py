@@ -7,11 +7,13 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import docstring_parser
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
+LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
 OUT_OF_MEMORY = re.compile(r"can't allocate memory|out of memory", re.IGNORECASE)
 
 
@@ -29,7 +31,11 @@ def parse(commands: Any, argv: Sequence[str], prog: str, description: str) -> An
         UsageError: the command has no such option.
         SystemExit: help was asked for (0), or something else is wrong (2); tyro has printed it.
     """
-    words = list(argv)
+    with _sentences_of_options():
+        return _parsed(commands, list(argv), prog, description)
+
+
+def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any:
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             command, unknown = tyro.cli(
@@ -46,6 +52,28 @@ def parse(commands: Any, argv: Sequence[str], prog: str, description: str) -> An
     if unknown:
         raise UsageError(_unknown_words(command, words, unknown, prog))
     return command
+
+
+@contextlib.contextmanager
+def _sentences_of_options() -> Iterator[None]:
+    """Makes help of options that break where the terminal ends, not also where the source does.
+
+    docstring_parser leaves the indentation in the docstrings of attributes, so tyro takes each of their lines for a
+    paragraph and keeps the breaks.
+    """
+    read = docstring_parser.parse_from_object
+
+    def joined(described: object) -> docstring_parser.Docstring:
+        parsed = read(described)
+        for option in parsed.params:
+            option.description = LINE_BREAK.sub(" ", option.description or "") or None
+        return parsed
+
+    docstring_parser.parse_from_object = joined
+    try:
+        yield
+    finally:
+        docstring_parser.parse_from_object = read
 
 
 def _unknown_words(command: Any, argv: Sequence[str], unknown: Sequence[str], prog: str) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import diffusers
 import numpy as np
 import pytest
 from rich.console import Console
@@ -16,7 +17,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
-from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
+from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows, load_pipeline
 from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import ALL_VARIANTS
@@ -46,6 +47,13 @@ def test_without_a_checkpoint_ours_is_the_one_for_the_suites_pictures(suite: str
     rows = build_rows(BenchConfig(suite=suite, methods=("ours",)))
     found = {row.info.config["weights"] for row in rows if row.info.key == OURS}
     assert found == {checkpoint_sha256(checkpoint_folder(name))}
+
+
+def test_loading_our_model_draws_no_bar(capfd: pytest.CaptureFixture[str]) -> None:
+    """One of each worker would be what a log begins with."""
+    diffusers.utils.logging.enable_progress_bar()
+    load_pipeline(checkpoint_folder("tiny"), "cpu")
+    assert capfd.readouterr().err == ""
 
 
 def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """`unirender bench ...` with arguments that cannot be right: one line and status 2, before anything is done."""
 
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.benchmark import run
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.run_command import BenchRun, print_verdict
 from unirender_evaluation.truth import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 
@@ -135,3 +136,19 @@ def test_repeated_options_add_up(tmp_path: Path) -> None:
     words = ["--predictions", "a=x", "--method", "m:A", "--predictions", "b=y", "--method", "m:B"]
     command = tyro.cli(BenchRun, args=words)
     assert (command.predictions, command.method) == (("a=x", "b=y"), ("m:A", "m:B"))
+
+
+@pytest.mark.parametrize(
+    ("terminal", "expected"),
+    [
+        (False, ["verdict", "  HOLDS  a claim of many words beats another"]),
+        (True, ["verdict", "  HOLDS  a claim of many", "         words beats", "         another"]),
+    ],
+)
+def test_the_verdict_has_a_line_for_each_claim_or_is_set_below_its_beginning(
+    terminal: bool, expected: list[str]
+) -> None:
+    out = StringIO()
+    console = Console(file=out, width=24, force_terminal=terminal, color_system=None)
+    print_verdict(console, "verdict\n  HOLDS  a claim of many words beats another")
+    assert out.getvalue().splitlines() == expected

@@ -88,6 +88,21 @@ def test_a_long_name_breaks_and_covers_no_number(tmp_path: Path) -> None:
             assert opened.ask(covered) > 0, "the twin"
 
 
+def test_a_phone_breaks_no_word_of_the_published_names(page: Path, tmp_path: Path) -> None:
+    """Each word of a row's name is on one line: IntrinsicAnything, GaussianShader, Decomposition."""
+    broken = """return [...document.querySelectorAll('#tables tbody th')].flatMap(cell => {
+        const text = cell.lastChild, words = [...text.textContent.matchAll(/[^\\s-]+/g)];
+        return words.filter(word => {
+            const range = document.createRange();
+            range.setStart(text, word.index); range.setEnd(text, word.index + word[0].length);
+            return range.getClientRects().length > 1; }).map(word => word[0]) })"""
+    with Browser.start(tmp_path, PHONE, 844) as phone:
+        phone.open(page)
+        assert phone.ask(broken) == []
+        phone.ask("document.querySelectorAll('#tables th').forEach(cell => { cell.style.overflowWrap = 'anywhere'; })")
+        assert "GaussianShader" in phone.ask(broken), "the twin"
+
+
 def test_on_paper_every_column_is_within_the_page(tmp_path: Path) -> None:
     wide = """return [...document.querySelectorAll('table')].filter(table =>
         table.getBoundingClientRect().right > document.documentElement.clientWidth + 1).length"""

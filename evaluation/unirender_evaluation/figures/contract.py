@@ -103,8 +103,8 @@ def _from_above(axes: "Axes", camera: Camera) -> None:
         places = " and ".join(f"{u:g}" for u, _ in texel_of(name))
         axes.plot([1.47 * x, 1.63 * x], [1.47 * z, 1.63 * z], color=SOFT, linewidth=1)
         axes.text(2.25 * x, 1.85 * z, f"u = {places}", fontsize=8, color=SOFT, ha="center", va="center")
-    _axis(axes, "+x", (1, 0))
-    _axis(axes, "+z", (0, 1))
+    _axis(axes, "+x", (0.55, 0))  # its name ends before the edge of the view
+    _axis(axes, "+z", (0, 0.55))
     axes.text(0, -0.3, "+y: towards you", fontsize=8, color=AXIS_COLOURS["+y"], ha="center")
     axes.set(xlim=(-2.8, 2.8), ylim=(far + 0.4, -2.1), aspect="equal")
     axes.set_title("from above; u: columns of the light", fontsize=10)
@@ -116,7 +116,7 @@ def _picture(axes: "Axes", camera: Camera) -> None:
     side = 192
     normal = ball(camera, side)
     axes.imshow(over_white(map_picture("normal", normal), np.any(normal != 0, axis=-1, keepdims=True) * np.float32(1)))
-    middle, reach = camera.principal[0] * side, 0.38 * side
+    middle, reach = camera.principal[0] * side, 0.34 * side
     _axis(axes, "+x", (middle + reach, middle), (middle, middle))
     _axis(axes, "+y", (middle, middle - reach), (middle, middle))
     axes.text(middle + 4, middle + 12, "+z: towards you", fontsize=8, color=INK)
@@ -158,5 +158,6 @@ def texel_of(direction: str) -> list[tuple[float, float]]:
 def _axis(axes: "Axes", name: str, end: tuple[float, float], start: tuple[float, float] = (0, 0)) -> None:
     colour = AXIS_COLOURS[name]
     axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2})
-    x, y = (b + 0.13 * (b - a) for a, b in zip(start, end, strict=True))
-    axes.text(x, y, name, color=colour, fontsize=11, weight="bold", ha="center", va="center")
+    x, y = np.subtract(end, start) * 13 / np.hypot(*np.subtract(end, start))
+    beside = {"xytext": (x, -y), "textcoords": "offset points"}  # of the tip; these axes have y downwards
+    axes.annotate(name, end, **beside, color=colour, fontsize=11, weight="bold", ha="center", va="center")
