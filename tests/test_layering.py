@@ -33,6 +33,7 @@ VOCABULARY = {
         "sixteen_bits",
         "surface_light",
         "symmetries",
+        "vectors",
         "whole_files",
         "worker_pool",
         "writing",

@@ -60,6 +60,15 @@ def values_of(records: Iterable[Record], method: str, key: str) -> dict[str, flo
     return {record.sample: record.values[key] for record in records if record.method == method and key in record.values}
 
 
+def values_by_method(records: Iterable[Record], key: str) -> dict[str, dict[str, float]]:
+    """`values_of` for every method that has the metric key, in one pass."""
+    found: dict[str, dict[str, float]] = {}
+    for record in records:
+        if key in record.values:
+            found.setdefault(record.method, {})[record.sample] = record.values[key]
+    return found
+
+
 def exact_fit(key: str, value: float) -> bool:
     """Whether a value, or a mean of values, is infinite because a fitted factor made a picture the truth itself.
 
@@ -125,10 +134,10 @@ def verdicts(
     found = []
     for column in spec.columns:
         key = column.key(variant)
-        values = {method: values_of(records, method, key) for method in (*ours, *others)}
+        values = values_by_method(records, key)
         for a in ours:
             for b in others:
-                common = values[a].keys() & values[b].keys()
+                common = values.get(a, {}).keys() & values.get(b, {}).keys()
                 if common and all(math.isfinite(values[a][s] - values[b][s]) for s in common):
                     found.append((column, compare(records, column.metric, key, a, b)))
     return found

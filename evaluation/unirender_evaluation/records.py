@@ -56,7 +56,8 @@ class Record:
             if not isinstance(value, str) or not value:
                 raise UnirenderError(f"record field {name!r}: got {value!r}, expected a non-empty string")
         for metric, value in self.values.items():
-            _check_value(f"{self.table}/{self.method}/{self.sample}/{metric}", value)
+            if not _is_number(value):
+                raise _no_number(f"{self.table}/{self.method}/{self.sample}/{metric}", value)
         object.__setattr__(self, "values", dict(self.values))
 
     @property
@@ -246,12 +247,16 @@ def _decode_values(values: Any) -> dict[str, float]:
         name: infinities.get(value, value) if isinstance(value, str) else value for name, value in values.items()
     }
     for name, value in decoded.items():
-        _check_value(name, value)
+        if not _is_number(value):
+            raise _no_number(name, value)
     return decoded
 
 
-def _check_value(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
-        raise UnirenderError(
-            f"value of {name!r} is {value!r}, expected a number that is not NaN; leave out what does not exist"
-        )
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isnan(value)
+
+
+def _no_number(name: str, value: Any) -> UnirenderError:
+    return UnirenderError(
+        f"value of {name!r} is {value!r}, expected a number that is not NaN; leave out what does not exist"
+    )

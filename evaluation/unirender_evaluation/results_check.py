@@ -111,7 +111,8 @@ def _definition_problems(results: Results) -> Iterator[Problem]:
     taken: dict[str, tuple[Any, Any, str]] = {
         key: (meaning.protocols.get(key), protocol_definition(key), "protocols") for key in sorted(used)
     }
-    names = {metric_name(key) for r in results.records for key in r.values} & ALL_METRICS.keys()
+    keys = {key for r in results.records for key in r.values}
+    names = {metric_name(key) for key in keys} & ALL_METRICS.keys()
     for name in sorted(names):
         taken[name] = (meaning.metrics.get(name), metric_definition(ALL_METRICS[name]), "metrics")
     for name, (there, here, kind) in taken.items():
@@ -141,16 +142,18 @@ def _value_problems(backbones: Iterable[str]) -> Callable[[Record], Iterator[tup
         for key, value in record.values.items():
             if key not in known:
                 known[key] = _key_problem(key, backbones)
-            place = f".values[{key!r}]"
             if known[key]:
-                yield place, known[key]
+                yield f".values[{key!r}]", known[key]
             else:
                 metric = ALL_METRICS[metric_name(key)]
                 sign = 1 if metric.higher_is_better else -1
                 if metric.name not in NO_BOUND and sign * value > sign * metric.perfect + TOLERANCE:
-                    yield place, f"a {metric.label} is better than a perfect one ({metric.perfect:g})"
+                    yield f".values[{key!r}]", f"a {metric.label} is better than a perfect one ({metric.perfect:g})"
                 elif value == -sign * float("inf"):
-                    yield place, f"a {metric.label} of {value} is infinitely bad; leave out what does not exist"
+                    yield (
+                        f".values[{key!r}]",
+                        f"a {metric.label} of {value} is infinitely bad; leave out what does not exist",
+                    )
 
     return check
 

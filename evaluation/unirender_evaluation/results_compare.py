@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.comparisons import Comparison, Selection, compare, exact_fit, values_of
+from unirender_evaluation.comparisons import Comparison, Selection, compare, exact_fit, values_by_method, values_of
 from unirender_evaluation.metrics import Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results_data import Results
@@ -136,9 +136,10 @@ def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, meth
         key: metric key.
         method: the row.
     """
-    values = {info.key: values_of(records, info.key, key) for info in run.methods}
+    values = values_by_method(records, key)
     fullest = max(map(len, values.values()), default=0)
-    competing = [info.key for info in run.methods if info.kind in RANKED_KINDS and len(values[info.key]) == fullest > 0]
+    ranked = [info.key for info in run.methods if info.kind in RANKED_KINDS]
+    competing = [row for row in ranked if row in values and len(values[row]) == fullest]
     means = {row: mean for row in competing if not exact_fit(key, mean := sum(values[row].values()) / fullest)}
     if method not in means:
         return None

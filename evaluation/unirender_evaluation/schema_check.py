@@ -5,6 +5,8 @@ check that is silently left out.
 """
 
 import difflib
+import functools
+import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -41,69 +43,107 @@ class Problem:
 
 
 def schema_problems(document: Any, schema: Mapping[str, Any]) -> list[Problem]:
-    """Everything in a document that a schema does not allow; empty for a valid one."""
-    return list(_check(document, schema, schema, ""))
+    """Everything in a document that a schema does not allow; empty for a valid one.
+
+    Raises:
+        NotImplementedError: the schema has a keyword that is not understood here.
+    """
+    _check_keywords(schema)
+    return list(_check(document, _resolved(schema, schema), schema, ""))
+
+
+def _check_keywords(schema: Mapping[str, Any]) -> None:
+    if unknown := schema.keys() - KEYWORDS:
+        raise NotImplementedError(f"schema keywords {sorted(unknown)}: teach them to `schema_check`")
+    named = [schema.get(key, {}).values() for key in ("properties", "$defs")]
+    alone = [schema[key] for key in ("items", "additionalProperties", "propertyNames") if key in schema]
+    for part in itertools.chain(*named, schema.get("anyOf", ()), alone):
+        if isinstance(part, Mapping):  # `additionalProperties` may be a truth value
+            _check_keywords(part)
+
+
+def _resolved(schema: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The schema that a `$ref` stands for; any other as it is."""
+    while "$ref" in schema:
+        schema = root["$defs"][schema["$ref"].removeprefix("#/$defs/")]
+    return schema
 
 
 def _check(value: Any, schema: Mapping[str, Any], root: Mapping[str, Any], place: str) -> Iterator[Problem]:
-    if "$ref" in schema:
-        name = schema["$ref"].removeprefix("#/$defs/")
-        yield from _check(value, root["$defs"][name], root, place)
-        return
-    unknown = schema.keys() - KEYWORDS
-    if unknown:
-        raise NotImplementedError(f"schema keywords {sorted(unknown)}: teach them to `schema_check`")
     if not _fits(value, schema):
         yield Problem(place, f"got {quoted(value)}, expected {expected(schema)}")
     elif isinstance(value, dict):
         yield from _check_object(value, schema, root, place)
     elif isinstance(value, list):
+        items = _resolved(schema.get("items", {}), root)
         for i, item in enumerate(value):
-            yield from _check(item, schema.get("items", {}), root, f"{place}[{i}]")
+            if not _is_done(item, items):
+                yield from _check(item, items, root, f"{place}[{i}]")
 
 
 def _check_object(
     value: dict[str, Any], schema: Mapping[str, Any], root: Mapping[str, Any], place: str
 ) -> Iterator[Problem]:
     known, others = schema.get("properties", {}), schema.get("additionalProperties", {})
+    others = others if others is False else _resolved(others, root)
+    pattern = schema.get("propertyNames", {}).get("pattern", "")
     for name in schema.get("required", ()):
         if name not in value:
             yield Problem(place, f"field {name!r} is missing, expected {expected(known[name], root)}")
     for name, item in value.items():
-        inner = f"{place}.{name}" if place else name
         if name in known:
-            yield from _check(item, known[name], root, inner)
+            own = _resolved(known[name], root)
+            if not _is_done(item, own):
+                yield from _check(item, own, root, f"{place}.{name}" if place else name)
         elif others is False:
             yield Problem(place, f"unknown field {name!r}{did_you_mean(name, known)}")
         else:
-            pattern = schema.get("propertyNames", {}).get("pattern")
-            if pattern and not re.search(pattern, name):
+            if not _matches(pattern, name):
                 yield Problem(place, f"got the name {name!r}, expected {expected(schema)}")
-            yield from _check(item, others, root, f"{place}[{quoted(name)}]")
+            if not _is_done(item, others):
+                yield from _check(item, others, root, f"{place}[{quoted(name)}]")
+
+
+def _is_done(value: Any, schema: Mapping[str, Any]) -> bool:
+    """Whether a value is allowed and contains no others: a file has a million, most of which end here."""
+    return not isinstance(value, (dict, list)) and _fits(value, schema)
 
 
 def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
     """Whether a value by itself, without what it contains, is allowed."""
-    kinds = schema.get("type", list(TYPES))
-    kinds = [kinds] if isinstance(kinds, str) else kinds
-    numeric = isinstance(value, int | float) and not isinstance(value, bool)
-    return all(
-        (
-            any(_is(value, kind) for kind in kinds),
-            "enum" not in schema or value in schema["enum"],
-            "const" not in schema or (value == schema["const"] and not isinstance(value, bool)),
-            "anyOf" not in schema or any(_fits(value, choice) for choice in schema["anyOf"]),
-            not isinstance(value, str) or re.search(schema.get("pattern", ""), value) is not None,
-            not isinstance(value, str) or len(value) >= schema.get("minLength", 0),
-            not numeric or schema.get("minimum", value) <= value <= schema.get("maximum", value),
-        )
-    )
-
-
-def _is(value: Any, kind: str) -> bool:
-    if isinstance(value, int | float) and not isinstance(value, bool) and not -LARGEST <= value <= LARGEST:
+    kinds, wanted = _kinds(type(value)), schema.get("type")
+    if not kinds or (
+        wanted is not None and (wanted not in kinds if isinstance(wanted, str) else kinds.isdisjoint(wanted))
+    ):
         return False
-    return isinstance(value, TYPES[kind]) and (kind == "boolean" or not isinstance(value, bool))
+    if "number" in kinds:
+        if not -LARGEST <= value <= LARGEST or not schema.get("minimum", value) <= value <= schema.get(
+            "maximum", value
+        ):
+            return False
+    elif "string" in kinds and not (
+        len(value) >= schema.get("minLength", 0) and ("pattern" not in schema or re.search(schema["pattern"], value))
+    ):
+        return False
+    if "enum" in schema and value not in schema["enum"]:
+        return False
+    if "const" in schema and (value != schema["const"] or "boolean" in kinds):
+        return False
+    return "anyOf" not in schema or any(_fits(value, choice) for choice in schema["anyOf"])
+
+
+@functools.cache
+def _kinds(of: type) -> frozenset[str]:
+    """The names in a schema of the type of a value; a truth value is no number."""
+    if issubclass(of, bool):
+        return frozenset(["boolean"])
+    return frozenset(kind for kind, types in TYPES.items() if issubclass(of, types))
+
+
+@functools.lru_cache(maxsize=1024)
+def _matches(pattern: str, name: str) -> bool:
+    """Whether the name of a field has a pattern; thousands of records have the same few names."""
+    return re.search(pattern, name) is not None
 
 
 def expected(schema: Mapping[str, Any], root: Mapping[str, Any] | None = None) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.vectors import lengths
 
 DEFAULT_FOV_DEG = 36.0
 DEFAULT_FILL = 0.9
@@ -96,7 +97,7 @@ class Camera:
         x = (np.arange(width) + 0.5 - self.principal[0] * width) * pixel
         y = -(np.arange(height) + 0.5 - self.principal[1] * height) * pixel
         directions = np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], axis=-1)
-        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        directions /= lengths(directions)
         return directions.astype(np.float32)
 
     def view_directions(self, height: int, width: int) -> Float[np.ndarray, "h w 3"]:

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
 from unirender.surface_light import MIN_ALPHA
+from unirender.vectors import dots
 
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
 COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced over [0, 1]
@@ -66,7 +67,7 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     """
     maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
-    n_v = np.sum(unit_normals(maps["normal"]) * view, axis=-1, keepdims=True)
+    n_v = dots(unit_normals(maps["normal"]), view)
     reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
     radiance = lobes(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"], reflectance)
     return (radiance * maps["mask"]).astype(np.float32)
@@ -93,13 +94,10 @@ def environment_brdf(
     y = np.clip(roughness, 0, 1) * (ROUGHNESSES - 1)
     i, j = (np.minimum(p.astype(np.int64), n - 2) for p, n in ((x, COSINES), (y, ROUGHNESSES)))
     fx, fy = x - i, y - j
-    corners = [
-        ((1 - fx) * (1 - fy), i, j),
-        (fx * (1 - fy), i + 1, j),
-        ((1 - fx) * fy, i, j + 1),
-        (fx * fy, i + 1, j + 1),
-    ]
-    a, b = (sum(weight * table[p, q] for weight, p, q in corners) for table in environment_brdf_tables())
+    first = i * ROUGHNESSES + j  # in the flat table; the other corners follow it by a row, by one, and by both
+    weights = ((1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy)
+    corners = list(zip(weights, (first, first + ROUGHNESSES, first + 1, first + ROUGHNESSES + 1), strict=True))
+    a, b = (sum(weight * table.take(at) for weight, at in corners) for table in environment_brdf_tables())
     return np.asarray(a, np.float32), np.asarray(b, np.float32)
 
 

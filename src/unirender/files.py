@@ -38,6 +38,7 @@ from unirender.exr import (
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.vectors import nonzero
 from unirender.whole_files import move_into_place
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
@@ -139,7 +140,7 @@ def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
 def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
     """A map as people look at it: colours and light through sRGB, normals as (n + 1) / 2, the others as they are."""
     if name == "normal":
-        return np.where(np.any(value != 0, axis=-1, keepdims=True), value * 0.5 + 0.5, 0)
+        return np.where(nonzero(value)[..., None], value * 0.5 + 0.5, 0)
     return value if name in ("roughness", "metallic", "mask") else image_srgb(value)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.vectors import lengths
 
 MAPS: dict[str, int] = {
     "albedo": 3,
@@ -198,7 +199,7 @@ def check_radiance(name: str, value: Any) -> None:
 
 def unit_normals(normal: Float[np.ndarray, "*size 3"]) -> Float[np.ndarray, "*size 3"]:
     """Normals of length 1; unit ones stay as they are, to the bit, and 0, no surface, stays 0."""
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = lengths(normal)
     known = length > SHORTEST_NORMAL
     off = np.where(known, np.abs(length - 1) > UNIT_TOLERANCE, length > 0)
     if not off.any():
@@ -215,7 +216,7 @@ def _check_range(name: str, value: Float[np.ndarray, "..."]) -> None:
         raise UnirenderError(f"{name}: got an empty array of shape {value.shape}, expected at least one pixel")
     low, high = float(value.min()), float(value.max())
     if name == "normal":
-        longest = float(np.sqrt(np.square(value).sum(axis=-1).max()))
+        longest = float(lengths(value).max())
         if longest > 1 + NORMAL_TOLERANCE:
             raise UnirenderError(
                 f"normal: longest vector has length {longest:.3f}, expected unit vectors (0 outside the mask); "

@@ -19,6 +19,7 @@ from unirender.ggx import facing_normal, halton, mirror_direction, unit
 from unirender.intrinsics import RANGE_TOLERANCE, as_numbers, unit_normals
 from unirender.lobes import TAIL_SHAPE, grid_lobes, sampled_cores, texels
 from unirender.subpixel import MEAN_WEIGHTS, MIRRORED, Surroundings, inside
+from unirender.vectors import nonzero
 
 QUADRATURE_SHAPE = (32, 64)  # resolution at which d and wide lobes are integrated
 SHARP_ROUGHNESS = 0.45  # below it a grazing lobe is too narrow for `QUADRATURE_SHAPE`: energy would be made of nothing
@@ -35,7 +36,7 @@ def diffuse_light(
     """d without shadows: irradiance / pi at each normal, whose direction counts; 0 where the normal is 0."""
     normal = unit_normals(normal)
     directions, radiance = texels(environment, QUADRATURE_SHAPE)
-    there = np.any(normal != 0, axis=-1)
+    there = nonzero(normal)
     n = normal[there]
     out = np.zeros((*normal.shape[:-1], 3), dtype=np.float32)
     lit = np.empty((len(n), 3), dtype=np.float32)
@@ -68,7 +69,7 @@ def specular_light(
     normal = unit_normals(normal)
     height, width = normal.shape[:2]
     view = (camera or Camera()).view_directions(height, width)
-    there = np.any(normal != 0, axis=-1)
+    there = nonzero(normal)
     lit = there if where is None else there & where
     rough = _checked_roughness(roughness, (height, width, 1))[lit, 0]
     surroundings = Surroundings(normal, there, lit)

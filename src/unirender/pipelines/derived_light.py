@@ -21,6 +21,7 @@ from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import unit_normal
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
+from unirender.vectors import lengths, nonzero
 
 LIGHT_SIDE = 256  # pixels along the longer side up to which every pixel is lit by itself
 NORMAL_DETAIL = 0.03  # distance of unit vectors, 1.7 degrees
@@ -107,11 +108,11 @@ def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | boo
     frame = Frame.reduced(mask, LIGHT_SIDE)
     small = frame.enter_intrinsics(surface)
     maps = {name: frame.leave_map(value, mask) for name, value in small.maps.items() if name != "mask"}
-    distance = np.linalg.norm(unit_normal(maps["normal"]) - normal, axis=-1)
+    distance = lengths(unit_normal(maps["normal"]) - normal)[..., 0]
     exact = sharp | (distance > NORMAL_DETAIL)
     if surface.roughness is not None:
         exact |= (np.abs(maps["roughness"] - surface.roughness) > ROUGHNESS_DETAIL)[..., 0]
-    seen = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
+    seen = (mask[..., 0] > 0) & nonzero(normal)
     exact &= seen
     interpolated = np.where(seen[..., None], frame.leave_map(light(small, None), mask), 0)
     if not exact.any():

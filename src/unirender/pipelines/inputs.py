@@ -19,6 +19,7 @@ from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.results import Decomposition
 from unirender.pipelines.settings import TAKING_APART
+from unirender.vectors import dots, nonzero
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
 DERIVABLE = ("specular", "diffuse")  # from a light
@@ -236,7 +237,7 @@ def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     """The intrinsics with a mask: where none is known, the surface that has a normal, else the whole frame."""
     if intrinsics.mask is not None:
         return intrinsics
-    surface = np.zeros(0) if intrinsics.normal is None else intrinsics.normal.any(axis=-1, keepdims=True)
+    surface = np.zeros(0) if intrinsics.normal is None else nonzero(intrinsics.normal)[..., None]
     if not surface.any():
         surface = np.ones((intrinsics.height, intrinsics.width, 1))
     return intrinsics.replace(mask=surface.astype(np.float32))
@@ -245,7 +246,7 @@ def with_mask(intrinsics: Intrinsics) -> Intrinsics:
 def facing_away(intrinsics: Intrinsics) -> float:
     """Share of the coverage whose normals face away from the camera; normal and mask have to be known."""
     maps = intrinsics.require("normal", "mask")
-    towards = (maps["normal"] * intrinsics.camera.rays(intrinsics.height, intrinsics.width)).sum(axis=-1)
+    towards = dots(maps["normal"], intrinsics.camera.rays(intrinsics.height, intrinsics.width))[..., 0]
     return float((maps["mask"][..., 0] * (towards > 0)).sum() / max(float(maps["mask"].sum()), 1.0))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.intrinsics import SHORTEST_NORMAL
+from unirender.vectors import lengths
 
 MIN_COVERAGE = 1e-3  # below it a resampled pixel carries no colour
 
@@ -27,5 +28,5 @@ def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h
 
 def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Normals of length 1, also of those that `unirender.intrinsics.unit_normals` takes for unit ones; 0 stays 0."""
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = lengths(normal)
     return np.where(length > SHORTEST_NORMAL, normal / np.maximum(length, SHORTEST_NORMAL), 0).astype(np.float32)

@@ -26,6 +26,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender.lobes import LOBE_WIDTH, cosine_matrix, lobe_matrix
 from unirender.pipelines.framing import Frame
+from unirender.vectors import nonzero
 
 STEPS, AGREEING_STEPS = 6, 12  # for s alone; for s and d
 DIFFUSE_WEIGHT = 3.0  # c: a cosine tells directions apart less than a lobe does, and takes more steps
@@ -64,7 +65,7 @@ def _revealed(intrinsics: Intrinsics, by: tuple[str, ...], steps: int) -> Float[
     environment = intrinsics.require("environment")["environment"]
     rows, columns = environment.shape[:2]
     shape = min(rows, MOST_SHAPE[0]), min(columns, MOST_SHAPE[1])
-    there = (maps["mask"][..., 0] > 0.5) & np.any(maps["normal"] != 0, axis=-1)
+    there = (maps["mask"][..., 0] > 0.5) & nonzero(maps["normal"])
     if not there.any():
         return environment
     view = given.camera.view_directions(given.height, given.width)[there].T

@@ -22,6 +22,7 @@ from scipy.ndimage import distance_transform_edt
 
 from unirender.camera import Camera
 from unirender.pipelines.normal_integration import integrate_normals
+from unirender.vectors import nonzero
 
 HALF_PLANES = 32  # evenly around the viewer's direction
 SECTORS = 64  # of theta, from 0 to pi: the bits of a mask
@@ -63,7 +64,7 @@ class SelfShadow:
             mask: coverage.
             camera: that took it.
         """
-        surface = (mask[..., 0] >= COVERED) & np.any(normal != 0, axis=-1)
+        surface = (mask[..., 0] >= COVERED) & nonzero(normal)
         rays = camera.rays(*surface.shape)
         rays = rays / -rays[..., 2:]
         depth = integrate_normals(normal, surface, camera)
