@@ -4,10 +4,11 @@ The import hook comes first: it instruments the three packages as they are impor
 annotation in a signature is checked by beartype at each call. A wrong shape in the code under test fails the test.
 """
 
+import gc
 import os
 import signal
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 
 import shape_checks
 
@@ -46,6 +47,18 @@ def pytest_configure(config: pytest.Config) -> None:
         raise pytest.UsageError(
             "--regenerate: refused when CI=true: a reference is rewritten by a person, who looks at it"
         )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported stays: Python's search for garbage looks at none of it, while it is made or while tests run."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
 
 
 # Markers of what takes long, or needs a program or a machine that not everybody has: such tests never skip; they run by

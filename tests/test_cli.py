@@ -3,6 +3,7 @@
 import importlib.metadata
 import itertools
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -52,6 +53,14 @@ def run(*arguments: str | Path) -> int:
     return int(stop.value.code or 0)
 
 
+@pytest.fixture(scope="module")
+def decomposed(ball: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ball as `unirender decompose` wrote it, seen at 30 degrees; to be read alone."""
+    folder = tmp_path_factory.mktemp("decomposed") / "maps"
+    assert run("decompose", ball, "--output", folder, "--fov", "30") == 0
+    return folder
+
+
 def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
     assert run("decompose", ball, "--output", tmp_path / "out") == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == DECOMPOSED
@@ -76,9 +85,8 @@ def test_decompose_a_picture_with_alpha(ball: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-def test_render_takes_what_decompose_wrote(ball: Path, tmp_path: Path) -> None:
-    assert run("decompose", ball, "--output", tmp_path / "maps", "--fov", "30") == 0
-    assert run("render", tmp_path / "maps", "--output", tmp_path / "out") == 0
+def test_render_takes_what_decompose_wrote(ball: Path, decomposed: Path, tmp_path: Path) -> None:
+    assert run("render", decomposed, "--output", tmp_path / "out") == 0
     channels, _ = read_exr(tmp_path / "out" / "image.exr")
     rendered = np.array(Image.open(tmp_path / "out" / "image.png"), dtype=np.float32) / 255
     original = np.array(Image.open(ball), dtype=np.float32) / 255
@@ -91,9 +99,9 @@ def test_render_takes_what_decompose_wrote(ball: Path, tmp_path: Path) -> None:
 
 
 def test_render_takes_one_file_and_the_camera_in_its_header(
-    ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    decomposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("decompose", ball, "--output", tmp_path / "maps", "--fov", "30") == 0
+    shutil.copytree(decomposed, tmp_path / "maps")
     (tmp_path / "maps" / "meta.json").unlink()
     capsys.readouterr()
     for name in ("maps", "maps/intrinsics.exr"):
@@ -136,9 +144,8 @@ def test_a_picture_that_was_written_here_brings_its_camera(
     assert "is a result with another fov" in capsys.readouterr().err
 
 
-def test_render_takes_maps_without_a_mask_under_a_new_light(ball: Path, tmp_path: Path) -> None:
-    assert run("decompose", ball, "--output", tmp_path / "maps") == 0
-    maps = read_result(tmp_path / "maps")
+def test_render_takes_maps_without_a_mask_under_a_new_light(decomposed: Path, tmp_path: Path) -> None:
+    maps = read_result(decomposed)
     bare = intrinsics_channels(maps.replace(mask=None, environment=None, specular=None, diffuse=None))
     write_exr(tmp_path / "bare.exr", bare)
     lights = {"dim": 0.2, "bright": 0.9}

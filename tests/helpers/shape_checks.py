@@ -40,20 +40,28 @@ def checked(*, typechecker: Any) -> Callable[[Any], Any]:
         arrays = [array for hint in hints.values() for array in _arrays(hint)]
         if any("{" in array.dim_str for array in arrays):  # sizes by the values of other arguments
             return _jaxtyped(typechecker=typechecker)(found)
-        call = _beartype(_with_hints(found, hints))
-        return _in_context(found, call) if arrays else functools.wraps(found)(call)
+        return _checked_call(found, hints, in_context=bool(arrays))
 
     return decorate
 
 
-def _in_context(function: Callable[..., Any], call: Callable[..., Any]) -> Callable[..., Any]:
-    """A name of an axis has one size in all arguments and the result of a call, and is forgotten after it."""
+def _checked_call(function: types.FunctionType, hints: dict[str, Any], in_context: bool) -> Callable[..., Any]:
+    """The function, checked. Its check is made at the first call: one process never calls most functions.
+
+    With `in_context`, a name of an axis has one size in all arguments and the result of a call, and is forgotten after.
+    """
+
+    @functools.cache
+    def call() -> Callable[..., Any]:
+        return _beartype(_with_hints(function, hints))
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
+        if not in_context:
+            return call()(*args, **kwargs)
         with _jaxtyped("context"):  # pyright: ignore[reportArgumentType] - as its documentation says
-            return call(*args, **kwargs)
+            return call()(*args, **kwargs)
 
     return wrapper
 
