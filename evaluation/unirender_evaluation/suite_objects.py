@@ -27,10 +27,12 @@ class ObjectSource:
     Attributes:
         split: of the generator's seeds.
         origin: a seed of the generator; or a file, named by its path below the folder of objects.
+        as_fans: how concave polygons of a file are cut (`load_mesh`).
     """
 
     split: Literal["train", "test"]
     origin: int | MeshFile
+    as_fans: bool = False
 
     @property
     def name(self) -> int | str:
@@ -47,7 +49,7 @@ class ObjectSource:
             return make_object(self.origin, self.split)
         from unirender_reference.meshes import load_mesh
 
-        obj = load_mesh(self.origin.path, root=self.origin.folder)
+        obj = load_mesh(self.origin.path, root=self.origin.folder, as_fans=self.as_fans)
         return replace(obj, name=self.origin.key, roughness=None, metallic=None)
 
     def provenance(self) -> dict[str, int | str]:
@@ -70,7 +72,7 @@ def suite_sources(spec: SuiteSpec) -> list[ObjectSource]:
         listed = _listed(folder)
         for group in spec.meshes:
             try:
-                sources += [ObjectSource(spec.split, file) for file in _chosen(listed, group, spec)]
+                sources += [ObjectSource(spec.split, file, spec.as_fans) for file in _chosen(listed, group, spec)]
             except UnirenderError as error:
                 problems.append(str(error))
     elif spec.meshes:
@@ -182,7 +184,7 @@ def scene_object(suite: Suite, scene: Scene) -> MeshObject:
             f"{where}: {path} is another file than the truth was rendered from; restore it, or make the truth again "
             "with `unirender bench truth`"
         )
-    return ObjectSource(spec.split, MeshFile(path, name)).load()
+    return ObjectSource(spec.split, MeshFile(path, name), spec.as_fans).load()
 
 
 def bare_mesh(obj: MeshObject) -> MeshObject:

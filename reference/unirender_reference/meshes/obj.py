@@ -1,7 +1,7 @@
 """Wavefront OBJ: polygons of any size, absolute and relative indices, materials, vertex colours.
 
-Polygons are cut into fans. Curves, points, lines and smoothing groups are left out: faces without normals get creased
-ones (`normals`).
+Concave polygons are filled (`polygons`). Curves, points, lines and smoothing groups are left out: faces without
+normals get creased ones (`normals`).
 """
 
 import codecs
@@ -31,6 +31,7 @@ from unirender_reference.meshes.limits import (
 )
 from unirender_reference.meshes.mtl import MtlEntry, MtlMaterials, parse_mtl
 from unirender_reference.meshes.normals import piece_normals
+from unirender_reference.meshes.polygons import fans, triangulate
 from unirender_reference.meshes.surface import BARE, Material, Model, Piece
 
 
@@ -131,12 +132,13 @@ def _short(rest: bytes) -> tuple[float, ...]:
     raise ValueError(f"expected 3 numbers, got {rest.strip()[:40]!r}")
 
 
-def read_obj(path: Path, folder: ModelFolder) -> Model:
+def read_obj(path: Path, folder: ModelFolder, *, as_fans: bool = False) -> Model:
     """Reads an OBJ file and the MTL files and textures that its faces use.
 
     Args:
         path: the file.
         folder: where its MTL files and textures may lie.
+        as_fans: cut also concave polygons into fans, which reach beyond them.
 
     Raises:
         UnirenderError: no faces, a line cannot be read, an index or a file is missing, or a limit is exceeded.
@@ -153,7 +155,9 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
     coordinates = np.array(lines.coordinates).reshape(-1, 2)
     normals = np.array(lines.normals).reshape(-1, 3)
     corners = np.array(lines.corners, np.int64).reshape(-1, 3)
-    triangles, polygon = _fans(np.array(lines.sizes, np.int64))
+    sizes = np.array(lines.sizes, np.int64)
+    at_corners = points[np.clip(corners[:, 0], 1, len(points)) - 1] if len(points) else None  # checked below
+    triangles, polygon = fans(sizes) if as_fans or at_corners is None else triangulate(at_corners, sizes)
     owner = np.array(lines.materials, np.int64)[polygon]
     points_of, coordinates_of, normals_of = np.moveaxis(corners[triangles], -1, 0)  # (m, 3 corners) each, from 1
     colors = _colors(lines, len(points))
@@ -243,15 +247,6 @@ def _libraries(folder: ModelFolder, names: Iterable[str]) -> dict[str, MtlEntry]
             entries |= parse_mtl(text.decode("utf-8", "surrogateescape"))
             check_materials(len(entries))
     return entries
-
-
-def _fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
-    """Triangles of polygons as positions in their list of corners, and the polygon of each."""
-    count = sizes - 2
-    polygon = np.repeat(np.arange(len(sizes)), count)
-    first = (np.cumsum(sizes) - sizes)[polygon]
-    step = np.arange(len(polygon)) - np.repeat(np.cumsum(count) - count, count)
-    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
 def _lacking(index: Int[np.ndarray, "m 3"], values: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " m"]:

@@ -1,0 +1,85 @@
+"""Polygons cut into triangles: into fans from their first corner, and where a fan would reach beyond a concave polygon,
+along other diagonals.
+"""
+
+import mapbox_earcut
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+FOLDED = 1e-3  # a triangle turned against its polygon by more than this share of the polygon's area
+SAME_AREA = 1e-3  # by which the area of a cut may miss the polygon's
+
+
+def triangulate(
+    points: Float[np.ndarray, "k 3"], sizes: Int[np.ndarray, " p"]
+) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+    """Triangles of polygons, in the polygons' order and turned as they are.
+
+    Args:
+        points: the corners of all polygons, one polygon after the other.
+        sizes: corners of each polygon, 3 and more.
+
+    Returns:
+        The triangles' corners as rows of `points`, and the polygon of each triangle. A polygon that cuts itself, which
+        no cut fills, remains a fan.
+    """
+    triangles, polygon = fans(sizes)
+    first = np.cumsum(sizes) - sizes
+    cuts = {p: _other_cut(points[first[p] : first[p] + sizes[p]]) for p in _folded(points, sizes, triangles, polygon)}
+    found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
+    if not found:
+        return triangles, polygon
+    kept = ~np.isin(polygon, list(found))
+    triangles = np.concatenate([triangles[kept], *found.values()])
+    polygon = np.concatenate([polygon[kept], *(np.full(len(cut), p) for p, cut in found.items())])
+    order = np.argsort(polygon, kind="stable")
+    return triangles[order], polygon[order]
+
+
+def fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+    """The same for convex polygons, whose corners need not be looked at."""
+    count = sizes - 2
+    polygon = np.repeat(np.arange(len(sizes)), count)
+    first = (np.cumsum(sizes) - sizes)[polygon]
+    step = np.arange(len(polygon)) - np.repeat(np.cumsum(count) - count, count)
+    return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
+
+
+def _folded(
+    points: Float[np.ndarray, "k 3"],
+    sizes: Int[np.ndarray, " p"],
+    triangles: Int[np.ndarray, "m 3"],
+    polygon: Int[np.ndarray, " m"],
+) -> Int[np.ndarray, " q"]:
+    """Polygons of four corners and more of whose fan a triangle is turned against the whole."""
+    several: Bool[np.ndarray, " m"] = sizes[polygon] > 3
+    areas, owner = _doubled_areas(points, triangles[several]), polygon[several]
+    whole = np.zeros((len(sizes), 3))
+    np.add.at(whole, owner, areas)
+    with np.errstate(over="ignore", invalid="ignore"):  # broken coordinates are refused later
+        turned = (areas * whole[owner]).sum(-1) < -FOLDED * (whole[owner] ** 2).sum(-1)
+    return np.unique(owner[turned])
+
+
+def _other_cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"] | None:
+    """The triangles that fill one concave polygon, by rows of its corners; None where none do."""
+    fan, _ = fans(np.array([len(points)]))
+    normal = _doubled_areas(points, fan).sum(0)
+    area = float(np.linalg.norm(normal))
+    if not (np.isfinite(area) and area > 0):
+        return None
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    flat = (points - points[0]) @ np.stack([across, np.cross(normal, across) / area], axis=1)
+    cut = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), np.array([len(flat)], np.uint32))
+    triangles = cut.reshape(-1, 3).astype(np.int64)
+    turned = (_doubled_areas(points, triangles) * normal).sum(-1) < 0
+    triangles[turned] = triangles[turned, ::-1]
+    filled = np.abs((_doubled_areas(points, triangles) * normal).sum(-1)).sum() / area
+    return triangles if abs(filled - area) <= SAME_AREA * area else None
+
+
+def _doubled_areas(points: Float[np.ndarray, "k 3"], triangles: Int[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
+    """Normals as long as twice the triangles' areas."""
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.cross(b - a, c - a)
