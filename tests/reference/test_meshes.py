@@ -234,6 +234,8 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "whole numbers": ("COFF", " 128 64 255 255", "", PURPLE, ""),
     "floats": ("COFF", " 0.50196 0.25098 1.0", "", PURPLE, ""),
     "floats without points": ("COFF", " 1 0 0 1", "", np.array([1, 0, 0]), ""),
+    "nearly black": ("COFF", " 1 0 1 255", "", srgb_decode(np.array([1, 0, 1]) / 255), ""),
+    "floats beside an alpha of 255": ("COFF", " 0.50196 0.25098 1.0 255", "", PURPLE, ""),
     "of faces": ("OFF", "", " 128 64 255", PURPLE, ""),
     "none": ("OFF", "", "", np.full(3, 0.5), ""),
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
