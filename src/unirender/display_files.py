@@ -1,7 +1,6 @@
 """Picture files of Pillow's and PIL pictures as display values in [0, 1]: colours in sRGB, data as it is stored."""
 
 import struct
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -34,25 +33,23 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     if Path(path).suffix.lower() in RAW_SUFFIXES:
         raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as file:
-                width, height = file.size
-                if width * height > MAX_PIXELS:
-                    raise UnirenderError(
-                        f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
-                    )
-                if misread(file):
-                    raise UnirenderError(
-                        f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
-                        "cannot be read; save it as PNG, or with interleaved channels"
-                    )
-                _check_grey(file, str(path))
-                _scale_transparent_grey(file)
-                if not upright:
-                    return as_stored(file).copy()
-                file.load()
-                return ImageOps.exif_transpose(file)
+        with opened(Path(path)) as file:
+            width, height = file.size
+            if width * height > MAX_PIXELS:
+                raise UnirenderError(
+                    f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
+                )
+            if misread(file):
+                raise UnirenderError(
+                    f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
+                    "cannot be read; save it as PNG, or with interleaved channels"
+                )
+            _check_grey(file, str(path))
+            _scale_transparent_grey(file)
+            if not upright:
+                return as_stored(file).copy()
+            file.load()
+            return ImageOps.exif_transpose(file)
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:

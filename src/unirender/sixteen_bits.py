@@ -109,9 +109,16 @@ def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:
 
 
 def opened(path: Path) -> Any:
-    """A picture file, not decoded yet; of its size nothing is said."""
+    """A picture file, not decoded yet; of its size nothing is said.
+
+    Pillow maps uncompressed pixels of a file whose name it knows into memory, and takes those of a TIFF that lies on
+    its side for as wide as the turned picture is: of a TIFF it is told no name.
+    """
     with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
-        return Image.open(path)
+        picture = Image.open(path)
+    if hasattr(picture, "tag_v2"):
+        picture.filename = ""
+    return picture
 
 
 def as_stored(picture: Image.Image) -> Image.Image:
