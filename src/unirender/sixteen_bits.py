@@ -84,9 +84,10 @@ def planar(picture: Image.Image) -> bool:
 
 
 def misread(picture: Image.Image) -> bool:
-    """Whether Pillow makes noise of it: such a TIFF, uncompressed and of more than 8 bits."""
+    """Whether Pillow makes noise of it, or nothing: such a TIFF, uncompressed and of 16 bits. One channel of 32 is read."""
     tags = getattr(picture, "tag_v2", {})
-    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and max(tags.get(BITS, (8,))) > 8
+    deep = max(tags.get(BITS, (8,))) > 8 and picture.mode not in ("I", "F")
+    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and deep
 
 
 def unheeded_grey(picture: Image.Image) -> str:
