@@ -84,7 +84,7 @@ def planar(picture: Image.Image) -> bool:
 
 
 def misread(picture: Image.Image) -> bool:
-    """Whether Pillow makes noise of it, or nothing: such a TIFF, uncompressed and of 16 bits. One channel of 32 is read."""
+    """Whether Pillow makes noise of it, or nothing: such a TIFF, uncompressed, of 16 bits. Grey of 32 it reads."""
     tags = getattr(picture, "tag_v2", {})
     deep = max(tags.get(BITS, (8,))) > 8 and picture.mode not in ("I", "F")
     return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and deep
