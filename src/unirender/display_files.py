@@ -1,7 +1,6 @@
 """Picture files of Pillow's and PIL pictures as display values in [0, 1]: colours in sRGB, data as it is stored."""
 
 import struct
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
 GREY_STEPS = {"L;2": 255 // 3, "L;4": 255 // 15}  # grey of 2 and 4 bits as Pillow names it: a step in 8 bits
+GREYS = ("1", "L", "I")  # first bands of modes without colour; of a palette it is P
 PNG_POINTS, PNG_SRGB = ("white", "red", "green", "blue"), (*REC709[6:], *REC709[:6])  # of the cHRM chunk
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
@@ -33,25 +33,23 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     if Path(path).suffix.lower() in RAW_SUFFIXES:
         raise UnirenderError(f"{path}: a camera's raw file, expected {FORMATS}; develop it first")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(path) as file:
-                width, height = file.size
-                if width * height > MAX_PIXELS:
-                    raise UnirenderError(
-                        f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
-                    )
-                if misread(file):
-                    raise UnirenderError(
-                        f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
-                        "cannot be read; save it as PNG, or with interleaved channels"
-                    )
-                _check_grey(file, str(path))
-                _scale_transparent_grey(file)
-                if not upright:
-                    return as_stored(file).copy()
-                file.load()
-                return ImageOps.exif_transpose(file)
+        with opened(Path(path)) as file:
+            width, height = file.size
+            if width * height > MAX_PIXELS:
+                raise UnirenderError(
+                    f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
+                )
+            if misread(file):
+                raise UnirenderError(
+                    f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
+                    "cannot be read; save it as PNG, or with interleaved channels"
+                )
+            _check_grey(file, str(path))
+            _scale_transparent_grey(file)
+            if not upright:
+                return as_stored(file).copy()
+            file.load()
+            return ImageOps.exif_transpose(file)
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
@@ -122,7 +120,8 @@ def _png_remarks(image: Image.Image) -> dict[str, str]:
     if gamma is not None and abs(gamma - SRGB_GAMMA) > SAME_GAMMA:
         said = f"the file states a gamma of {gamma:.3g} (gAMA; sRGB: {SRGB_GAMMA:.3g}), its values are taken as sRGB"
         remarks["gamma"] = f"{said}: if they are linear, save the picture as EXR" if gamma > 0.9 else said
-    stated, ours = (np.reshape(points, (4, 2)) for points in (image.info.get("chromaticity", PNG_SRGB), PNG_SRGB))
+    points = PNG_SRGB if image.getbands()[0] in GREYS else image.info.get("chromaticity", PNG_SRGB)
+    stated, ours = (np.reshape(each, (4, 2)) for each in (points, PNG_SRGB))
     farthest = int(np.abs(stated - ours).max(axis=1).argmax())
     if np.abs(stated - ours).max() > SAME_PRIMARIES:
         (x, y), (our_x, our_y) = stated[farthest], ours[farthest]

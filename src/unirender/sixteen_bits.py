@@ -84,9 +84,10 @@ def planar(picture: Image.Image) -> bool:
 
 
 def misread(picture: Image.Image) -> bool:
-    """Whether Pillow makes noise of it: such a TIFF, uncompressed and of more than 8 bits."""
+    """Whether Pillow makes noise of it, or nothing: such a TIFF, uncompressed, of 16 bits. Grey of 32 it reads."""
     tags = getattr(picture, "tag_v2", {})
-    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and max(tags.get(BITS, (8,))) > 8
+    deep = max(tags.get(BITS, (8,))) > 8 and picture.mode not in ("I", "F")
+    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and deep
 
 
 def unheeded_grey(picture: Image.Image) -> str:
@@ -109,9 +110,16 @@ def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:
 
 
 def opened(path: Path) -> Any:
-    """A picture file, not decoded yet; of its size nothing is said."""
+    """A picture file, not decoded yet; of its size nothing is said.
+
+    Pillow maps uncompressed pixels of a file whose name it knows into memory, and takes those of a TIFF that lies on
+    its side for as wide as the turned picture is: of a TIFF it is told no name.
+    """
     with warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning):
-        return Image.open(path)
+        picture = Image.open(path)
+    if hasattr(picture, "tag_v2"):
+        picture.filename = ""
+    return picture
 
 
 def as_stored(picture: Image.Image) -> Image.Image:

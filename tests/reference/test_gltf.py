@@ -23,6 +23,7 @@ from gltf_files import (
     write_normal_mapped,
 )
 from PIL import ExifTags, Image
+from sixteen_bit_files import write_tiff16
 from trimesh.visual.gloss import specular_to_pbr
 
 from unirender.color import srgb_decode
@@ -417,6 +418,20 @@ def test_texels_lie_as_they_are_stored_in_every_format(orientation):
         image = images.ImageBudget().open(data.getvalue(), "a")
         texels = images.texels_of(image, "a", 99, "RGB", images.linear)
         np.testing.assert_allclose(texels, stored / 255, atol=1e-6, err_msg=kind)
+
+
+def test_a_texture_of_which_noise_would_be_made_is_refused(tmp_path):
+    """As a picture is; the compressed one loses its low bytes alone."""
+    stored = np.random.default_rng(0).integers(0, 65536, (8, 9, 3))
+    for compressed in (True, False):
+        write_tiff16(tmp_path / "a.tif", stored, planar=True, compressed=compressed)
+        image = images.ImageBudget().open((tmp_path / "a.tif").read_bytes(), "a")
+        if compressed:
+            texels = images.texels_of(image, "a", 99, "RGB", images.linear)
+            np.testing.assert_allclose(texels, stored / 65535, rtol=0, atol=0.5 / 128)
+        else:
+            with pytest.raises(UnirenderError, match="texture a: its channels are stored one after the other"):
+                images.texels_of(image, "a", 99, "RGB", images.linear)
 
 
 def test_only_textured_materials_share_the_atlas(tmp_path):

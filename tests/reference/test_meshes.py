@@ -234,6 +234,8 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "whole numbers": ("COFF", " 128 64 255 255", "", PURPLE, ""),
     "floats": ("COFF", " 0.50196 0.25098 1.0", "", PURPLE, ""),
     "floats without points": ("COFF", " 1 0 0 1", "", np.array([1, 0, 0]), ""),
+    "nearly black": ("COFF", " 1 0 1 255", "", srgb_decode(np.array([1, 0, 1]) / 255), ""),
+    "floats beside an alpha of 255": ("COFF", " 0.50196 0.25098 1.0 255", "", PURPLE, ""),
     "of faces": ("OFF", "", " 128 64 255", PURPLE, ""),
     "none": ("OFF", "", "", np.full(3, 0.5), ""),
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
@@ -315,10 +317,12 @@ def test_stl_that_goes_on_behind_its_facets(tmp_path):
     assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "attributes of facets"
 
 
-def test_stl_in_capitals(tmp_path):
+@pytest.mark.parametrize("padding", ["in capitals", "a name", "the end"])
+def test_stl_of_words_in_capitals_or_with_zeros(tmp_path, padding):
     """It was taken for a binary one that is cut off."""
     text = str(trimesh.creation.box().export(file_type="stl_ascii")).upper()
-    (tmp_path / "a.stl").write_text(text)
+    text = text.replace("\n", "\0\n", 1) if padding == "a name" else text
+    (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"))
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 

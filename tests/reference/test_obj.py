@@ -313,7 +313,11 @@ def test_tiff_of_whole_numbers(tmp_path, kind, bits, black, value):
     assert obj.roughness == pytest.approx(np.full_like(obj.roughness, 0.25), abs=0.5 / 255 + 1e-6)
 
 
-def test_comment_behind_a_face(tmp_path):
-    """The line was refused."""
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 # lid\n")
-    assert len(load_mesh(tmp_path / "a.obj").faces) == 1
+def test_comments_behind_numbers(tmp_path):
+    """The line was refused, where its words counted as numbers; the name of a material may hold the sign."""
+    text = "v 0 0 0 # the lower left\nv 1 0 0\nv 0 1 0\nvt 0 # left\nvn 0 0 1#up\nusemtl #1\nf 1/1/1 2/1/1 3/1/1 # f\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{text}")
+    (tmp_path / "a.mtl").write_text("newmtl #1\nKd 0 1 0\n")
+    obj = load_mesh(tmp_path / "a.obj")
+    assert len(obj.faces) == 1
+    assert obj.albedo.reshape(-1, 3) == pytest.approx(np.array([[0, 1, 0]]))

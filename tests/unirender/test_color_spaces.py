@@ -92,6 +92,8 @@ def test_a_png_of_other_primaries_is_told(
     np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=1e-6)
     assert ("green at 0.21, 0.71; sRGB: 0.3, 0.6" in picture.remarks.get("primaries", "")) == told
     assert ("primaries" in picture.remarks) == told
+    Image.fromarray(PIXELS[..., 0]).save(tmp_path / "a.png", pnginfo=chunks)
+    assert "primaries" not in read_picture(tmp_path / "a.png").remarks, "grey has none"
 
 
 def test_alpha_and_palettes_go_through_a_profile(tmp_path: Path) -> None:

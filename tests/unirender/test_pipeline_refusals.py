@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import pickle
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,7 @@ def test_an_array_of_pictures_or_masks_is_a_batch(shape: tuple[int, ...], channe
     assert as_list("maps", unlike, channels) == list(unlike)
 
 
-def test_a_turned_photograph_is_said_to_be_so(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_turned_photograph_is_said_to_be_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     photograph = Image.new("RGB", (2 * SIZE, SIZE), "grey")
     as_picture(photograph)
     assert not caplog.records
@@ -138,6 +139,10 @@ def test_a_turned_photograph_is_said_to_be_so(caplog: pytest.LogCaptureFixture) 
     assert "EXIF orientation is not applied" in caplog.text
     caplog.clear()
     assert as_picture(ImageOps.exif_transpose(photograph))[0].shape == (2 * SIZE, SIZE, 3)
+    photograph.save(tmp_path / "a.tif", exif=photograph.getexif())
+    caplog.clear()
+    assert as_picture(Image.open(tmp_path / "a.tif"))[0].shape == (2 * SIZE, SIZE, 3), "Pillow turns it"
+    assert not caplog.text
     damaged = Image.new("RGB", (2 * SIZE, SIZE), "grey")
     damaged.info["exif"] = b"Exif\0\0no TIFF"
     assert as_picture(damaged)[0].shape == (SIZE, 2 * SIZE, 3)

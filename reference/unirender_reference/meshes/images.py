@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
-from unirender.sixteen_bits import as_stored
+from unirender.sixteen_bits import as_stored, misread
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
@@ -81,8 +81,14 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         curve: stored values in [0, 1] -> linear ones, each channel by itself.
 
     Raises:
-        UnirenderError: the image is cut off or damaged, or its numbers are no brightness (negative, floats above 1).
+        UnirenderError: the image is cut off or damaged, a TIFF that Pillow makes noise of, or its numbers are no
+            brightness (negative, floats above 1).
     """
+    if misread(image):
+        raise UnirenderError(
+            f"texture {name}: its channels are stored one after the other, uncompressed, with 16 bits, which cannot be "
+            "read; export it as PNG"
+        )
     try:
         tags = getattr(image, "tag_v2", {})  # of a TIFF
         image = _eight_bits(as_stored(image), tags, name)

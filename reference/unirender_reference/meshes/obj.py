@@ -34,6 +34,8 @@ from unirender_reference.meshes.normals import piece_normals
 from unirender_reference.meshes.polygons import fans, triangulate
 from unirender_reference.meshes.surface import BARE, Material, Model, Piece
 
+NAMING = (b"usemtl", b"mtllib")  # keywords whose text may hold a #; elsewhere a comment begins there
+
 
 class _Lines:
     """What the lines of a file say, in flat arrays."""
@@ -70,6 +72,8 @@ class _Lines:
         if len(parts) < 2:
             return
         keyword, rest = parts
+        if b"#" in rest and keyword not in NAMING:
+            rest = rest.partition(b"#")[0]
         if keyword == b"v":
             values = rest.split()
             self.points.extend(
@@ -90,7 +94,7 @@ class _Lines:
             )
             _check_vertices(len(self.normals) // 3, "normals")
         elif keyword == b"f":
-            self._face(rest.partition(b"#")[0].split())
+            self._face(rest.split())
         elif keyword == b"usemtl":
             self._current = self.names.setdefault(rest.decode("utf-8", "surrogateescape").strip(), len(self.names))
             check_materials(len(self.names))

@@ -88,8 +88,11 @@ def read_off_lines(path: Path) -> OffLines:
 def _linear(numbers: list[list[str]]) -> Float[np.ndarray, "n 3"] | None:
     if not numbers or {len(words) for words in numbers} - {3, 4}:
         return None
+    have_alpha = all(len(words) == 4 for words in numbers)
     try:
-        stored = np.array([words[:3] for words in numbers], np.float64)
+        stored = np.array([words if have_alpha else words[:3] for words in numbers], np.float64)
     except ValueError:  # words
         return None
+    if (stored % 1).any():
+        stored = stored[:, :3]  # of floats, alpha may be of another range
     return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64)

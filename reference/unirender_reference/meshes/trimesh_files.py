@@ -38,6 +38,7 @@ DOUBLE = re.compile(rb"^format ascii|^property (double|float64) x", re.MULTILINE
 PLY_COLOR = re.compile(rb"^(property\s+\w+\s+)((?:diffuse_)?(?:red|green|blue)|[rgb])(?=\s*$)", re.MULTILINE)
 PLY_COLORS = ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")
 USUAL = {b"r": b"red", b"g": b"green", b"b": b"blue"}
+HEAD = 65536  # bytes that are looked at before trimesh reads the file
 STL_HEADER, STL_FACET = 84, 50  # bytes of a binary file: its header with the count, and each facet
 FACET_ATTRIBUTES = "attributes of facets"  # among what is ignored
 WHITE = Material({"albedo": np.ones(3, np.float32)})
@@ -57,7 +58,7 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     length = path.stat().st_size
     check_bytes(length, "the file")
     with path.open("rb") as file:
-        head = file.read(65536)
+        head = file.read(HEAD)
     _check_claims(path.suffix.lower(), head, length)
     _check_end(path, head)
     texture = _texture(folder, head)
@@ -94,8 +95,8 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
 
 
 def _is_text(head: bytes) -> bool:
-    """Whether an STL is one of words; in the count of facets and behind each of them a binary one has zeros."""
-    return b"\0" not in head and re.search(rb"facet|endsolid", head, re.IGNORECASE) is not None
+    """Whether an STL is one of words, whose name or end may be padded; a binary one's count of facets has a zero."""
+    return b"\0" not in head[80:STL_HEADER] and re.search(rb"facet|endsolid", head, re.IGNORECASE) is not None
 
 
 def _facets(head: bytes) -> int:
@@ -167,7 +168,7 @@ def _check_end(path: Path, head: bytes) -> None:
             )
     elif path.suffix.lower() == ".stl" and _is_text(head):
         with path.open("rb") as file:
-            file.seek(-min(path.stat().st_size, 1024), io.SEEK_END)
+            file.seek(-min(path.stat().st_size, HEAD), io.SEEK_END)  # zeros may follow
             if b"endsolid" not in file.read().lower():
                 raise UnirenderError("truncated: its last solid does not end, expected 'endsolid'; copy it again")
 

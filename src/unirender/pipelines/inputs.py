@@ -60,6 +60,7 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         UnirenderError: wrong type, shape or range, NaN, or an empty mask.
     """
     if isinstance(image, Image.Image):
+        image.load()  # a TIFF is turned by Pillow then
         if is_turned(image):
             logger.warning("image: its EXIF orientation is not applied; PIL.ImageOps.exif_transpose(image) turns it")
         values = display_colors(image, "image")
