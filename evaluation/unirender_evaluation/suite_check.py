@@ -74,7 +74,6 @@ RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("ceiling_factor", _integer(2), "a whole number, at least 2"),
     ("batches", _integer(8), "a whole number, at least 8: fewer do not tell the noise"),
     ("target_db light_target_db", _number(10, 80), "decibels from 10 to 80"),
-    ("polygons", lambda v: v in ("filled", "fans"), "'filled' or 'fans'"),
     ("ceiling_scenes", _list(_scene), "a list of [object, number of the light]"),
 )
 FILES_RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (

@@ -27,12 +27,10 @@ class ObjectSource:
     Attributes:
         split: of the generator's seeds.
         origin: a seed of the generator; or a file, named by its path below the folder of objects.
-        as_fans: how concave polygons of a file are cut (`load_mesh`).
     """
 
     split: Literal["train", "test"]
     origin: int | MeshFile
-    as_fans: bool = False
 
     @property
     def name(self) -> int | str:
@@ -49,7 +47,7 @@ class ObjectSource:
             return make_object(self.origin, self.split)
         from unirender_reference.meshes import load_mesh
 
-        obj = load_mesh(self.origin.path, root=self.origin.folder, as_fans=self.as_fans)
+        obj = load_mesh(self.origin.path, root=self.origin.folder)
         return replace(obj, name=self.origin.key, roughness=None, metallic=None)
 
     def provenance(self) -> dict[str, int | str]:
@@ -72,7 +70,7 @@ def suite_sources(spec: SuiteSpec) -> list[ObjectSource]:
         listed = _listed(folder)
         for group in spec.meshes:
             try:
-                sources += [ObjectSource(spec.split, file, spec.as_fans) for file in _chosen(listed, group, spec)]
+                sources += [ObjectSource(spec.split, file) for file in _chosen(listed, group, spec)]
             except UnirenderError as error:
                 problems.append(str(error))
     elif spec.meshes:
@@ -184,7 +182,7 @@ def scene_object(suite: Suite, scene: Scene) -> MeshObject:
             f"{where}: {path} is another file than the truth was rendered from; restore it, or make the truth again "
             "with `unirender bench truth`"
         )
-    return ObjectSource(spec.split, MeshFile(path, name), spec.as_fans).load()
+    return ObjectSource(spec.split, MeshFile(path, name)).load()
 
 
 def bare_mesh(obj: MeshObject) -> MeshObject:

@@ -55,7 +55,6 @@ class SuiteSpec:
         ceiling_scenes: (object, number of the light) of the scenes whose members have such a twin; the object by its
             seed, or its path below the folder of objects.
         truth_cost: how long making the truth takes, in words; empty: not stated.
-        polygons: of OBJ files: "filled" also where they are concave; "fans" reach beyond concave ones.
         objects_folder, lights_folder: relative to the TOML file; empty: the file names none.
         objects_from, lights_from: where to get such a folder, in words.
     """
@@ -90,7 +89,6 @@ class SuiteSpec:
     truth_cost: str = ""
     meshes: tuple[Files, ...] = ()
     light_files: Files | None = None
-    polygons: Literal["filled", "fans"] = "filled"
     objects_folder: str = ""
     lights_folder: str = ""
     objects_from: str = ""
@@ -101,11 +99,6 @@ class SuiteSpec:
     def camera(self) -> Camera:
         """Of all pictures."""
         return Camera(fov_deg=self.fov_deg)
-
-    @property
-    def as_fans(self) -> bool:
-        """How concave polygons are cut, as `load_mesh` takes it."""
-        return self.polygons == "fans"
 
     @property
     def truth_path(self) -> Path:
@@ -211,7 +204,7 @@ def parse_spec(text: str, path: Path) -> SuiteSpec:
 
 
 _OPTIONAL = {
-    *("truth_cost", "meshes", "light_files", "polygons"),
+    *("truth_cost", "meshes", "light_files"),
     *("objects_folder", "lights_folder", "objects_from", "lights_from"),
 }
 

@@ -69,7 +69,6 @@ def test_standard_is_a_third_real_and_its_constant_scores_a_tenth() -> None:
     assert len(spec.objects) + meshes == 100
     assert meshes >= 34
     assert spec.split == "test"
-    assert spec.as_fans, "as its truth was rendered"
     assert spec.resolution == 128
     assert not set(spec.objects) & set(read_spec("tiny").objects)
     for mse in constant_mse(spec.materials(meshes)):
@@ -126,19 +125,6 @@ def test_lights_of_an_object_differ_whatever_their_number(lights: int) -> None:
     assert all(a[0] != b[0] for a, b in zip(assigned[::2], assigned[1::2], strict=True))
     counts = [sum(light == name for light, _ in assigned) for name in names]
     assert max(counts) - min(counts) <= 1
-
-
-@pytest.mark.parametrize(("said", "area"), [("", 4), ("\npolygons = 'filled'", 4), ("\npolygons = 'fans'", 12)])
-def test_a_suite_says_how_concave_polygons_are_cut(said: str, area: float, tmp_path: Path) -> None:
-    """A quad with a notch: filled, or a fan that covers the notch twice."""
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "a.obj").write_text("v 0 0 0\nv 4 0 0\nv 4 4 0\nv 3 1 0\nf 1 2 3 4\n")
-    spec = spec_with(tmp_path, MESHES, objects="[]", ceiling_scenes="[]", assignment_seed=f"0{said}")
-    (source,) = suite_sources(spec)
-    found = source.load()
-    a, b, c = np.moveaxis(found.vertices[found.faces], 1, 0)
-    scale = np.ptp(found.vertices[:, 0]) / 4
-    assert np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 == pytest.approx(area * scale**2, rel=1e-5)
 
 
 def test_meshes_are_drawn_by_pattern_split_and_seed(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ format, in which colour space, what is ignored, and every reason for a refusal.
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +31,13 @@ SMALLER = "sharpness of smaller textures"  # among what is ignored
 READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 
 
-def load_mesh(path: str | Path, root: Path | None = None, *, as_fans: bool = False) -> MeshObject:
+def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
     """Loads a mesh, moved and scaled into the unit sphere; its own normals are kept where it has them.
 
     Args:
         path: a GLB, glTF, OBJ, PLY, STL or OFF file; +y is up and +z faces the camera, as in glTF.
         root: a folder of models that may share textures: what the file names is read from there and from the file's
             own folder, and from nowhere else. None: from its own folder alone.
-        as_fans: cut also concave polygons of an OBJ into fans, which reach beyond them: as truths of before have them.
 
     Returns:
         The object. glTF objects always have roughness and metallic of their own, OBJ objects where their MTL has the
@@ -49,13 +47,13 @@ def load_mesh(path: str | Path, root: Path | None = None, *, as_fans: bool = Fal
         UnirenderError: one sentence with the reason: a missing, damaged or dangerous file (see `limits`), no faces,
             broken coordinates, a missing texture.
     """
-    return load_mesh_placed(path, root, as_fans=as_fans)[0]
+    return load_mesh_placed(path, root)[0]
 
 
-def load_mesh_placed(path: str | Path, root: Path | None = None, *, as_fans: bool = False) -> tuple[MeshObject, Sphere]:
+def load_mesh_placed(path: str | Path, root: Path | None = None) -> tuple[MeshObject, Sphere]:
     """Loads a mesh like `load_mesh`, and says where it stood: cameras in the file's units move along with it."""
     with _one_sentence(Path(path)):
-        return _assembled(Path(path), _read(Path(path), root, as_fans=as_fans))
+        return _assembled(Path(path), _read(Path(path), root))
 
 
 def read_model(path: str | Path, root: Path | None = None) -> Model:
@@ -66,7 +64,7 @@ def read_model(path: str | Path, root: Path | None = None) -> Model:
         return model
 
 
-def _read(path: Path, root: Path | None, *, as_fans: bool = False) -> Model:
+def _read(path: Path, root: Path | None) -> Model:
     """The pieces that have faces; at least one."""
     if not path.is_file():
         raise UnirenderError(f"no such file; expected one of {', '.join(SUFFIXES)}")
@@ -74,10 +72,7 @@ def _read(path: Path, root: Path | None, *, as_fans: bool = False) -> Model:
         raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
     if path.stat().st_size == 0:
         raise UnirenderError("is empty; copy it again")
-    read = READERS.get(path.suffix.lower(), read_through_trimesh)
-    if read is read_obj:
-        read = partial(read_obj, as_fans=as_fans)
-    model = read(path, ModelFolder(path, root))
+    model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
     pieces = [piece for piece in model.pieces if len(piece.faces)]
     if not pieces:
         raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")

@@ -136,13 +136,12 @@ def _short(rest: bytes) -> tuple[float, ...]:
     raise ValueError(f"expected 3 numbers, got {rest.strip()[:40]!r}")
 
 
-def read_obj(path: Path, folder: ModelFolder, *, as_fans: bool = False) -> Model:
+def read_obj(path: Path, folder: ModelFolder) -> Model:
     """Reads an OBJ file and the MTL files and textures that its faces use.
 
     Args:
         path: the file.
         folder: where its MTL files and textures may lie.
-        as_fans: cut also concave polygons into fans, which reach beyond them.
 
     Raises:
         UnirenderError: no faces, a line cannot be read, an index or a file is missing, or a limit is exceeded.
@@ -161,7 +160,7 @@ def read_obj(path: Path, folder: ModelFolder, *, as_fans: bool = False) -> Model
     corners = np.array(lines.corners, np.int64).reshape(-1, 3)
     sizes = np.array(lines.sizes, np.int64)
     at_corners = points[np.clip(corners[:, 0], 1, len(points)) - 1] if len(points) else None  # checked below
-    triangles, polygon = fans(sizes) if as_fans or at_corners is None else triangulate(at_corners, sizes)
+    triangles, polygon = fans(sizes) if at_corners is None else triangulate(at_corners, sizes)
     owner = np.array(lines.materials, np.int64)[polygon]
     points_of, coordinates_of, normals_of = np.moveaxis(corners[triangles], -1, 0)  # (m, 3 corners) each, from 1
     colors = _colors(lines, len(points))
