@@ -19,6 +19,8 @@ NOT_RUN = {
     "physics.md": ["pseudo-code; unirender_evaluation/physics/ambiguity.py is the code"],
 }
 """All there is of blocks that are not run; a reason stands above its block as `<!-- not run: reason -->`."""
+LONG = {"optimization.md", "tour.md"}
+"""Pages whose Python takes ten seconds and more."""
 
 
 def shown(page: Path, *languages: str) -> list[Block]:
@@ -63,7 +65,11 @@ def working(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=pytest.mark.long if page.name in LONG else ()) for page in PYTHON],
+    ids=lambda page: page.name,
+)
 def test_python_blocks_run(page: Path, working: Path) -> None:
     if page.name not in EXAMPLES:
         pytest.fail(

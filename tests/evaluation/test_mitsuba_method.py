@@ -69,6 +69,7 @@ def test_foreign_objects_have_no_values(tmp_path: Path) -> None:
     assert list(mitsuba_jobs(foreign, scenes, scenes[1], key_of, (), 0)) == []
 
 
+@pytest.mark.long
 def test_its_closed_loop_is_that_of_the_true_maps(mitsuba: MitsubaScene, suite: Suite) -> None:
     """Its own buffers, shaded again, are as near the truth as the stored ones."""
     stage = Stage(suite, mitsuba.scene)

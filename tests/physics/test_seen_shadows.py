@@ -52,6 +52,7 @@ def gain(scene: Intrinsics, left: dict[str, np.ndarray]) -> list[float]:
     return np.subtract(scores[0], scores[1]).tolist()
 
 
+@pytest.mark.long
 def test_s_and_d_are_nearer_to_what_mitsuba_renders(scenes: list[Intrinsics]) -> None:
     found = np.array([gain(scene, shares(scene)) for scene in scenes])
     assert found.mean(axis=0).min() > LEAST_GAIN, found

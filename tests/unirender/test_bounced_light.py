@@ -76,6 +76,7 @@ def test_how_far_around_a_pixel_goes_with_the_size_of_the_object(side: int) -> N
         assert spread == pytest.approx(AROUND * side, rel=0.05)
 
 
+@pytest.mark.long
 def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:
     normal, mask, _ = ball()
     found = bounced_light(lit(painted(normal, mask)), LIGHT)
@@ -89,6 +90,7 @@ def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:
     assert all(np.array_equal(unknown[name], direct[name]) for name in LIGHT)
 
 
+@pytest.mark.long
 def test_rendering_adds_it_to_what_is_derived_and_to_nothing_that_is_given() -> None:
     maps = painted(*gutter()[:2]).replace(environment=SKY)
     direct = derived_light(maps, SKY, LIGHT)
@@ -114,6 +116,7 @@ def test_a_given_map_says_what_the_object_sends_out() -> None:
     assert (bright["diffuse"] - dim["diffuse"])[MIDDLE, MIDDLE].mean() > 0.1
 
 
+@pytest.mark.long
 def test_what_is_kept_is_direct_light_and_knows_no_material() -> None:
     """An edit keeps its light, its exposure included: `docs/data_contract.md`."""
     dark, light = (painted(*gutter()[:2], albedo=a) for a in (0.05, 0.9))

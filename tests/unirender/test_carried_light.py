@@ -78,6 +78,7 @@ def test_where_s_and_d_are_what_their_own_light_gives_nothing_is_carried() -> No
     assert error(with_carried_light(own, beside, NAMES, OWN), beside) > 0.01  # the twin: as if it hid none
 
 
+@pytest.mark.long
 def test_a_shadow_is_carried_to_a_light_from_the_same_side_and_not_to_the_opposite_one() -> None:
     before = found()
     without, carried = relit(before, BESIDE)

@@ -243,6 +243,7 @@ def test_what_is_hardly_covered_has_the_shadow_beside_it(size: int) -> None:
     assert visible_shares(as_maps(normal, speck), sky())["diffuse"][-1, -1].min() > 0.9
 
 
+@pytest.mark.long
 def test_a_picture_is_looked_at_once_for_all_its_materials(monkeypatch: pytest.MonkeyPatch) -> None:
     """And anew for another picture: one value or the camera differs. What is found is what a fresh look finds."""
     normal, mask, _ = gutter()

@@ -66,6 +66,7 @@ def test_a_sphere_is_lit_as_mitsuba_lights_it(records: list[Record]) -> None:
     assert len(records) == 5 + 4
 
 
+@pytest.mark.long
 def test_a_second_run_measures_nothing_and_a_longer_one_what_is_missing(
     what: DerivedLight, records: list[Record]
 ) -> None:

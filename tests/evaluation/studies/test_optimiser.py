@@ -176,6 +176,7 @@ def test_rows_share_the_start_that_they_have_in_common() -> None:
     assert starts.of(dataclasses.replace(SMALL, transport=other)) is not first
 
 
+@pytest.mark.long
 def test_nothing_is_measured_twice(measured: tuple[Path, list[Record]]) -> None:
     """Seconds are a wall clock's: equal ones were read, not measured."""
     folder, before = measured
@@ -187,6 +188,7 @@ def test_nothing_is_measured_twice(measured: tuple[Path, list[Record]]) -> None:
     assert measure_all(study, rows, folder, QUIET) == before  # those that one run did not ask for are kept
 
 
+@pytest.mark.long
 def test_other_code_and_other_settings_are_measured_anew(measured: tuple[Path, list[Record]]) -> None:
     folder, before = measured
     newer = small_study(folder, OWN, versions=Versions("test", {**VERSIONS.parts, OPTIMIZER: "2"}))
@@ -241,6 +243,7 @@ def test_a_terminal_shows_every_figure_whole(width: int) -> None:
         assert len(re.findall(rf"(?<![\d.]){re.escape(number)}(?!\d)", printed.getvalue())) == expected
 
 
+@pytest.mark.long
 def test_the_markdown_has_measured_figures_only(measured: tuple[Path, list[Record]]) -> None:
     """Every figure of the table's cells is a mean over the records, or a difference of two."""
     folder, records = measured

@@ -141,6 +141,7 @@ def test_the_plain_loops_are_those_of_the_tutorials(raced: tuple[Path, list[Obje
         assert race.loops[1].points[-1].psnr == albedo_psnr(scene, found)
 
 
+@pytest.mark.long
 def test_no_object_races_twice(raced: tuple[Path, list[ObjectRace]]) -> None:
     """Seconds are a wall clock's: equal ones were read, not measured."""
     folder, before = raced

@@ -83,6 +83,7 @@ def test_a_perfect_prediction_is_a_better_start_than_none(records: list[Record])
             assert np.isfinite([cold.values[key], warm.values[key]]).all()
 
 
+@pytest.mark.long
 def test_a_second_run_measures_nothing(what: WarmStart, records: list[Record]) -> None:
     asked = what.base.asked
     again = list(measure(what, what.suite.scenes[::2]))
@@ -110,6 +111,7 @@ def test_keys_follow_what_a_record_depends_on(what: WarmStart) -> None:
     assert len(keys) == len(what.suite.scenes), "two lights of one object are two pictures"
 
 
+@pytest.mark.long
 def test_identical_methods_differ_by_exactly_nothing(records: list[Record]) -> None:
     """The twin: a decibel more on one of the two scenes is half a decibel, with an interval."""
     cold = named(records, COLD)
@@ -126,6 +128,7 @@ def test_identical_methods_differ_by_exactly_nothing(records: list[Record]) -> N
     assert found.low < 0.5 < found.high
 
 
+@pytest.mark.long
 def test_tables_show_both_starts_and_their_difference(what: WarmStart, records: list[Record]) -> None:
     table = tables(records, (GEOMETRY,))[0]
     assert table.title.endswith("n = 2")

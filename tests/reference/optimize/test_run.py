@@ -79,6 +79,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(whole: Path, tmp_path: Path):
     assert [line["seconds"] for line in lines(out)] == sorted(line["seconds"] for line in lines(out))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_that_loses_what_it_saved_ends_elsewhere(whole: Path, tmp_path: Path):
     """The twin: the saved state is what the run goes on from."""

@@ -97,6 +97,7 @@ def test_a_prediction_is_refined_and_what_is_not_trusted_stays(
         np.testing.assert_allclose(same.maps[name], prediction.maps[name], rtol=0, atol=2e-4)
 
 
+@pytest.mark.long
 def test_the_result_renders_to_the_picture(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
     mask = truth.require("mask")["mask"]
 
@@ -109,6 +110,7 @@ def test_the_result_renders_to_the_picture(truth: Intrinsics, picture: np.ndarra
     assert error(prediction) > 0.06
 
 
+@pytest.mark.long
 def test_a_known_mesh_gives_normals_and_needs_no_start(truth: Intrinsics, picture: np.ndarray) -> None:
     maps = truth.require("mask", "normal")
     found = optimize_image(picture, maps["mask"], CAMERA, QUICK, geometry=scenes.sphere())
@@ -123,6 +125,7 @@ def test_a_known_mesh_gives_normals_and_needs_no_start(truth: Intrinsics, pictur
     assert object_value(flat, "roughness") == 0.5
 
 
+@pytest.mark.long
 def test_a_start_without_a_prediction_keeps_its_level_and_metallic_and_finds_the_rest(
     truth: Intrinsics, picture: np.ndarray
 ) -> None:
@@ -162,6 +165,7 @@ def test_a_silhouette_is_enough_for_a_picture_of_any_size(picture: np.ndarray, t
     assert found.require("albedo")["albedo"].shape == image.shape
 
 
+@pytest.mark.long
 def test_the_scale_of_a_linear_picture_is_the_lights_alone(truth: Intrinsics, prediction: Intrinsics) -> None:
     """A picture eight times as bright (a power of two: no rounding), most of it above a display's 1, has the same maps
     under eight times the light, and renders to itself; the same values as a display shows them, clipped, do not."""

@@ -56,6 +56,7 @@ def test_every_solve_is_a_step(found) -> None:
     assert all(step.stage == "transport" and np.isfinite(list(step.values.values())).all() for step in steps)
 
 
+@pytest.mark.long
 def test_equal_seeds_give_equal_solutions(views, found) -> None:
     def solved(seed: int) -> list[np.ndarray]:
         again = solve_appearance(views, cases.bare(), CONFIG, texture_size=TEXELS, light_rows=ROWS, seed=seed)
@@ -69,6 +70,7 @@ def test_equal_seeds_give_equal_solutions(views, found) -> None:
         assert not np.allclose(other, first, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.long
 def test_highlights_that_no_light_can_make_are_outvoted(views) -> None:
     """A white disc stands at another place of every picture: `sharpen` keeps it out of light and materials."""
     rng = np.random.default_rng(3)

@@ -71,7 +71,9 @@ def test_unseen_texels_are_the_mean_of_the_seen_ones() -> None:
     np.testing.assert_allclose(texels[unseen], np.broadcast_to(values.mean(axis=0), texels[unseen].shape), rtol=1e-5)
 
 
-@pytest.mark.parametrize(("texture", "noise", "smooth"), [("plain", 0.3, 60), ("checks", 0.01, 15)])
+@pytest.mark.parametrize(
+    ("texture", "noise", "smooth"), [pytest.param("plain", 0.3, 60, marks=pytest.mark.long), ("checks", 0.01, 15)]
+)
 def test_held_out_pixels_tell_how_smooth_a_texture_is(texture: str, noise: float, smooth: float) -> None:
     """Noise on one colour asks for more smoothness than a clean pattern does, and gets it."""
     obj, camera = cases.bare(texture_size=SIZE), Camera()
