@@ -143,7 +143,7 @@ def denoise(
     if steps == 1:
         t = torch.full((len(noise),), last_timestep(scheduler), device=noise.device)
         return predict(noise, t)
-    scheduler.set_timesteps(steps, device=noise.device)
+    set_timesteps(scheduler, steps, noise.device)
     x_t = noise * scheduler.init_noise_sigma
     uneven = _strides_unevenly(scheduler, steps)
     following = [*scheduler.timesteps[1:], None]
@@ -154,6 +154,20 @@ def denoise(
         else:
             x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
     return x_t
+
+
+def set_timesteps(scheduler: Any, steps: int, device: torch.device) -> None:
+    """Sets the timesteps of a diffusers scheduler: as many as there are steps.
+
+    diffusers counts trailing ones down in floating point. For 29 numbers of steps up to 500 (61 is the first) it ends
+    with one too many: -1, the index of pure noise.
+    """
+    scheduler.set_timesteps(steps, device=device)
+    if len(scheduler.timesteps) > steps:
+        scheduler.timesteps = scheduler.timesteps[:steps]
+        scheduler.num_inference_steps = steps
+        if hasattr(scheduler, "sigmas"):  # of every timestep, and of the end
+            scheduler.sigmas = torch.cat([scheduler.sigmas[:steps], scheduler.sigmas[-1:]])
 
 
 def _strides_unevenly(scheduler: Any, steps: int) -> bool:
