@@ -14,6 +14,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from PIL import Image, ImageOps
 from tiny_models import SIZE, make_pipeline
 
@@ -205,6 +206,14 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
         (
             lambda config: DDIMScheduler.from_config(config, rescale_betas_zero_snr=False, trained_betas=None),
             "got a DDIMScheduler with rescale_betas_zero_snr=False",
+        ),
+        (
+            lambda config: UniPCMultistepScheduler.from_config(config, solver_type="bh1"),
+            "got a UniPCMultistepScheduler with solver_type='bh1', expected 'bh2': .*answers NaN",
+        ),
+        (
+            lambda config: DPMSolverMultistepScheduler.from_config(config, final_sigmas_type="sigma_min"),
+            "got a DPMSolverMultistepScheduler with final_sigmas_type='sigma_min', expected 'zero'",
         ),
     ],
 )

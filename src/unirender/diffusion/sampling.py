@@ -33,10 +33,11 @@ NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
 CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
 OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
 DDIM = ("DDIMScheduler", "DDIMParallelScheduler")
-SCHEDULERS = (
-    *DDIM,
-    *("UniPCMultistepScheduler", "DPMSolverMultistepScheduler"),  # the last without sde
-)
+FINITE: dict[str, dict[str, Any]] = {  # settings without which steps divide by the signal at T or the noise at the end
+    "UniPCMultistepScheduler": {"predict_x0": True, "solver_type": "bh2", "lower_order_final": True},
+    "DPMSolverMultistepScheduler": {"algorithm_type": "dpmsolver++", "final_sigmas_type": "zero"},
+}
+SCHEDULERS = (*DDIM, *FINITE)
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
@@ -93,8 +94,8 @@ def check_scheduler(scheduler: Any) -> None:
 
     Raises:
         UnirenderError: it takes what the network predicts, x0, for something else, or changes it; its noise schedule is
-            not the network's, which ends in noise alone; or it is of another kind, which may draw noise of its own,
-            that no seed would fix, or want its input scaled.
+            not the network's, which ends in noise alone; it would divide by zero there, or where all is clean; or it is
+            of another kind, which may draw noise of its own, that no seed would fix, or want its input scaled.
     """
     name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
     kinds = {base.__name__ for base in type(scheduler).__mro__}
@@ -115,6 +116,13 @@ def check_scheduler(scheduler: Any) -> None:
     if wrong:
         got = ", ".join(f"{key}={config.get(key)!r}" for key in wrong)
         raise UnirenderError(f"scheduler: got a {name} with {got}, unlike what the network was trained with; {advice}")
+    finite = [setting for kind in kinds & FINITE.keys() for setting in FINITE[kind].items()]
+    for key, value in finite:
+        if config.get(key) != value:
+            raise UnirenderError(
+                f"scheduler: got a {name} with {key}={config.get(key)!r}, expected {value!r}: under a schedule that "
+                f"begins without signal and ends without noise, the other answers NaN; {advice}"
+            )
 
 
 def sampler_name(scheduler: Any) -> str:
