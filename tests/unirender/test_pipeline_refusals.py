@@ -208,6 +208,12 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
             "got a DDIMScheduler with rescale_betas_zero_snr=False",
         ),
         (
+            lambda config: DPMSolverMultistepScheduler(
+                prediction_type="sample", rescale_betas_zero_snr=True, timestep_spacing="trailing"
+            ),
+            "got a DPMSolverMultistepScheduler with another noise schedule",  # that of DDPM
+        ),
+        (
             lambda config: UniPCMultistepScheduler.from_config(config, solver_type="bh1"),
             "got a UniPCMultistepScheduler with solver_type='bh1', expected 'bh2': .*answers NaN",
         ),

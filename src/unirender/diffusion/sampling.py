@@ -12,6 +12,7 @@ zero and log-SNR, UniPC's variable, is minus infinity; diffusers puts alpha_bar 
 apart than that, and what is amiss adds up over the steps: such steps are made here (`_ddim_step`).
 """
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
 from typing import Any
@@ -21,7 +22,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unirender.diffusion.schedule import last_timestep
+from unirender.diffusion.schedule import last_timestep, make_scheduler
 from unirender.errors import UnirenderError
 
 SAMPLE_STEPS = 20  # the paper's
@@ -30,6 +31,9 @@ MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timeste
 
 PREDICTION_TYPE = "sample"  # diffusers' name of x0
 NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
+SAME_SIGNAL = (
+    0.01  # of sqrt(alpha_bar), up to which two noise schedules are one; diffusers' own rescaling is off by 0.0005
+)
 CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
 OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
 DDIM = ("DDIMScheduler", "DDIMParallelScheduler")
@@ -116,13 +120,24 @@ def check_scheduler(scheduler: Any) -> None:
     if wrong:
         got = ", ".join(f"{key}={config.get(key)!r}" for key in wrong)
         raise UnirenderError(f"scheduler: got a {name} with {got}, unlike what the network was trained with; {advice}")
-    finite = [setting for kind in kinds & FINITE.keys() for setting in FINITE[kind].items()]
-    for key, value in finite:
+    apart = float((scheduler.alphas_cumprod.sqrt().cpu() - _signal(len(scheduler.alphas_cumprod))).abs().max())
+    if apart > SAME_SIGNAL:
+        raise UnirenderError(
+            f"scheduler: got a {name} with another noise schedule than the network's: its signal, sqrt(alpha_bar), is "
+            f"off by up to {apart:.2f}, expected at most {SAME_SIGNAL}; {advice}"
+        )
+    for key, value in [setting for kind in kinds & FINITE.keys() for setting in FINITE[kind].items()]:
         if config.get(key) != value:
             raise UnirenderError(
                 f"scheduler: got a {name} with {key}={config.get(key)!r}, expected {value!r}: under a schedule that "
                 f"begins without signal and ends without noise, the other answers NaN; {advice}"
             )
+
+
+@functools.cache
+def _signal(num_timesteps: int) -> Float[Tensor, " t"]:
+    """sqrt(alpha_bar) of the noise schedule that all networks are trained with."""
+    return make_scheduler(num_timesteps).alphas_cumprod.sqrt()
 
 
 def sampler_name(scheduler: Any) -> str:
