@@ -230,6 +230,19 @@ def test_a_scheduler_that_would_give_wrong_maps_is_refused(made: Callable[[Any],
         pipeline.decompose(*picture(), mode="sample", num_inference_steps=3, num_samples=1)
 
 
+def test_a_network_that_answers_nan_is_refused_in_both_directions() -> None:
+    """Maps have a contract; a picture was handed out as it was."""
+    pipeline = make_pipeline()
+    maps = pipeline.decompose(*picture(), closed=False).intrinsics
+    with torch.no_grad():
+        for unet in (pipeline.dual_stream.attribute_unet, pipeline.dual_stream.image_unet):
+            unet.conv_out.weight.fill_(torch.nan)
+    with pytest.raises(UnirenderError, match="values are NaN or infinite, expected finite values"):
+        pipeline.decompose(*picture(), closed=False)
+    with pytest.raises(UnirenderError, match="values of the network's picture are NaN or infinite, expected"):
+        pipeline.render(maps)
+
+
 def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRenderPipeline) -> None:
     """A light of 16 x 32 has no reflection as sharp as roughness 0.1; without a new roughness there is no question."""
     image, mask = picture()
