@@ -12,6 +12,8 @@ from diffusers.pipelines.marigold.marigold_image_processing import MarigoldImage
 from jaxtyping import Float
 from torch import Tensor
 
+from unirender.diffusion.sampling import set_timesteps
+
 
 @dataclass(frozen=True)
 class ConditionedDiffusion:
@@ -61,7 +63,7 @@ class ConditionedDiffusion:
         shape = (1, self.vae.config.latent_channels, *condition.shape[-2:])
         noise = torch.randn(shape, generator=generator)  # drawn in float32: the same noise at any precision
         latent = noise.to(self.unet.device, self.unet.dtype) * self.scheduler.init_noise_sigma
-        self.scheduler.set_timesteps(steps, device=self.unet.device)
+        set_timesteps(self.scheduler, steps, self.unet.device)
         for t in self.scheduler.timesteps:
             seen = torch.cat([self.scheduler.scale_model_input(latent, t), condition], dim=1)
             output = self.unet(seen, t, encoder_hidden_states=words, return_dict=False)[0]

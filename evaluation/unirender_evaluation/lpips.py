@@ -119,7 +119,7 @@ class Lpips:
         self.network = LpipsNetwork(backbone)
         self.network.load_state_dict(load_file(path))
         self.network.eval().requires_grad_(False)
-        self._kept: dict[bytes, list[Tensor]] = {}
+        self._kept: dict[tuple[torch.Size, bytes], list[Tensor]] = {}
 
     @property
     def metric(self) -> str:
@@ -159,7 +159,7 @@ class Lpips:
 
     def _features_once(self, image: Float[Tensor, "1 3 h w"]) -> list[Tensor]:
         """Features of a truth; the last few are kept, because many methods are scored on one truth after another."""
-        key = hashlib.sha256(image.contiguous().numpy().tobytes()).digest()
+        key = image.shape, hashlib.sha256(image.contiguous().numpy().tobytes()).digest()
         if key not in self._kept:
             while len(self._kept) >= KEPT_TRUTHS:
                 del self._kept[next(iter(self._kept))]

@@ -9,7 +9,7 @@ import torch
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from torch import Tensor
 
-from unirender.diffusion.sampling import denoise, draw_noise, steps_of
+from unirender.diffusion.sampling import MOST_STEPS, denoise, draw_noise, set_timesteps, steps_of
 from unirender.diffusion.schedule import add_noise, last_timestep, make_scheduler, zero_terminal_betas
 from unirender.diffusion.timesteps import algorithm1_timesteps, conditional_timesteps, draw_timesteps
 from unirender.errors import UnirenderError
@@ -47,10 +47,11 @@ def test_schedule_is_the_rescaled_scaled_linear_one() -> None:
 
 def test_sampling_starts_at_the_last_index() -> None:
     scheduler = make_scheduler()
-    for steps in (1, 2, 20, 50):
-        scheduler.set_timesteps(steps)
+    for steps in range(1, MOST_STEPS + 1):
+        set_timesteps(scheduler, steps, torch.device("cpu"))
         assert scheduler.timesteps[0] == last_timestep(scheduler)
-        assert len(scheduler.timesteps) == steps
+        assert scheduler.timesteps[-1] > 0
+        assert len(scheduler.timesteps) == steps == scheduler.num_inference_steps
 
 
 # --- timesteps

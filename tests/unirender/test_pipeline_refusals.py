@@ -14,6 +14,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from PIL import Image, ImageOps
 from tiny_models import SIZE, make_pipeline
 
@@ -206,6 +207,20 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
             lambda config: DDIMScheduler.from_config(config, rescale_betas_zero_snr=False, trained_betas=None),
             "got a DDIMScheduler with rescale_betas_zero_snr=False",
         ),
+        (
+            lambda config: DPMSolverMultistepScheduler(
+                prediction_type="sample", rescale_betas_zero_snr=True, timestep_spacing="trailing"
+            ),
+            "got a DPMSolverMultistepScheduler with another noise schedule",  # that of DDPM
+        ),
+        (
+            lambda config: UniPCMultistepScheduler.from_config(config, solver_type="bh1"),
+            "got a UniPCMultistepScheduler with solver_type='bh1', expected 'bh2': .*answers NaN",
+        ),
+        (
+            lambda config: DPMSolverMultistepScheduler.from_config(config, final_sigmas_type="sigma_min"),
+            "got a DPMSolverMultistepScheduler with final_sigmas_type='sigma_min', expected 'zero'",
+        ),
     ],
 )
 def test_a_scheduler_that_would_give_wrong_maps_is_refused(made: Callable[[Any], Any], words: str) -> None:
@@ -213,6 +228,19 @@ def test_a_scheduler_that_would_give_wrong_maps_is_refused(made: Callable[[Any],
     pipeline.scheduler = made(pipeline.scheduler.config)
     with pytest.raises(UnirenderError, match=f"scheduler: {words}"):
         pipeline.decompose(*picture(), mode="sample", num_inference_steps=3, num_samples=1)
+
+
+def test_a_network_that_answers_nan_is_refused_in_both_directions() -> None:
+    """Maps have a contract; a picture was handed out as it was."""
+    pipeline = make_pipeline()
+    maps = pipeline.decompose(*picture(), closed=False).intrinsics
+    with torch.no_grad():
+        for unet in (pipeline.dual_stream.attribute_unet, pipeline.dual_stream.image_unet):
+            unet.conv_out.weight.fill_(torch.nan)
+    with pytest.raises(UnirenderError, match="values are NaN or infinite, expected finite values"):
+        pipeline.decompose(*picture(), closed=False)
+    with pytest.raises(UnirenderError, match="values of the network's picture are NaN or infinite, expected"):
+        pipeline.render(maps)
 
 
 def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRenderPipeline) -> None:

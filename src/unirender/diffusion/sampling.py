@@ -12,6 +12,7 @@ zero and log-SNR, UniPC's variable, is minus infinity; diffusers puts alpha_bar 
 apart than that, and what is amiss adds up over the steps: such steps are made here (`_ddim_step`).
 """
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from numbers import Integral
 from typing import Any
@@ -21,7 +22,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unirender.diffusion.schedule import last_timestep
+from unirender.diffusion.schedule import last_timestep, make_scheduler
 from unirender.errors import UnirenderError
 
 SAMPLE_STEPS = 20  # the paper's
@@ -30,13 +31,17 @@ MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timeste
 
 PREDICTION_TYPE = "sample"  # diffusers' name of x0
 NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
+SAME_SIGNAL = (
+    0.01  # of sqrt(alpha_bar), up to which two noise schedules are one; diffusers' own rescaling is off by 0.0005
+)
 CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
 OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
 DDIM = ("DDIMScheduler", "DDIMParallelScheduler")
-SCHEDULERS = (
-    *DDIM,
-    *("UniPCMultistepScheduler", "DPMSolverMultistepScheduler"),  # the last without sde
-)
+FINITE: dict[str, dict[str, Any]] = {  # settings without which steps divide by the signal at T or the noise at the end
+    "UniPCMultistepScheduler": {"predict_x0": True, "solver_type": "bh2", "lower_order_final": True},
+    "DPMSolverMultistepScheduler": {"algorithm_type": "dpmsolver++", "final_sigmas_type": "zero"},
+}
+SCHEDULERS = (*DDIM, *FINITE)
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
 
@@ -93,8 +98,8 @@ def check_scheduler(scheduler: Any) -> None:
 
     Raises:
         UnirenderError: it takes what the network predicts, x0, for something else, or changes it; its noise schedule is
-            not the network's, which ends in noise alone; or it is of another kind, which may draw noise of its own,
-            that no seed would fix, or want its input scaled.
+            not the network's, which ends in noise alone; it would divide by zero there, or where all is clean; or it is
+            of another kind, which may draw noise of its own, that no seed would fix, or want its input scaled.
     """
     name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
     kinds = {base.__name__ for base in type(scheduler).__mro__}
@@ -115,6 +120,24 @@ def check_scheduler(scheduler: Any) -> None:
     if wrong:
         got = ", ".join(f"{key}={config.get(key)!r}" for key in wrong)
         raise UnirenderError(f"scheduler: got a {name} with {got}, unlike what the network was trained with; {advice}")
+    apart = float((scheduler.alphas_cumprod.sqrt().cpu() - _signal(len(scheduler.alphas_cumprod))).abs().max())
+    if apart > SAME_SIGNAL:
+        raise UnirenderError(
+            f"scheduler: got a {name} with another noise schedule than the network's: its signal, sqrt(alpha_bar), is "
+            f"off by up to {apart:.2f}, expected at most {SAME_SIGNAL}; {advice}"
+        )
+    for key, value in [setting for kind in kinds & FINITE.keys() for setting in FINITE[kind].items()]:
+        if config.get(key) != value:
+            raise UnirenderError(
+                f"scheduler: got a {name} with {key}={config.get(key)!r}, expected {value!r}: under a schedule that "
+                f"begins without signal and ends without noise, the other answers NaN; {advice}"
+            )
+
+
+@functools.cache
+def _signal(num_timesteps: int) -> Float[Tensor, " t"]:
+    """sqrt(alpha_bar) of the noise schedule that all networks are trained with."""
+    return make_scheduler(num_timesteps).alphas_cumprod.sqrt()
 
 
 def sampler_name(scheduler: Any) -> str:
@@ -143,7 +166,7 @@ def denoise(
     if steps == 1:
         t = torch.full((len(noise),), last_timestep(scheduler), device=noise.device)
         return predict(noise, t)
-    scheduler.set_timesteps(steps, device=noise.device)
+    set_timesteps(scheduler, steps, noise.device)
     x_t = noise * scheduler.init_noise_sigma
     uneven = _strides_unevenly(scheduler, steps)
     following = [*scheduler.timesteps[1:], None]
@@ -154,6 +177,20 @@ def denoise(
         else:
             x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
     return x_t
+
+
+def set_timesteps(scheduler: Any, steps: int, device: torch.device) -> None:
+    """Sets the timesteps of a diffusers scheduler: as many as there are steps.
+
+    diffusers counts trailing ones down in floating point. For 29 numbers of steps up to 500 (61 is the first) it ends
+    with one too many: -1, the index of pure noise.
+    """
+    scheduler.set_timesteps(steps, device=device)
+    if len(scheduler.timesteps) > steps:
+        scheduler.timesteps = scheduler.timesteps[:steps]
+        scheduler.num_inference_steps = steps
+        if hasattr(scheduler, "sigmas"):  # of every timestep, and of the end
+            scheduler.sigmas = torch.cat([scheduler.sigmas[:steps], scheduler.sigmas[-1:]])
 
 
 def _strides_unevenly(scheduler: Any, steps: int) -> bool:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.diffusion.inference import infer_attributes, infer_image
+from unirender.errors import UnirenderError
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
@@ -99,6 +100,9 @@ class Network:
             scenes: at the network's size.
             how: steps, samples and noise.
             derived: for each scene, which of its maps were derived from its light, without shadows; None: none.
+
+        Raises:
+            UnirenderError: the network's picture is not finite.
         """
         flags = [[name in own for name in TRIPLETS] for own in derived or [()] * len(scenes)]
         image = infer_image(
@@ -114,7 +118,13 @@ class Network:
             derived=torch.tensor(_repeat(flags, how.count), device=self.device),
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
-        return list(means.permute(0, 2, 3, 1).float().cpu().numpy())
+        pictures = means.permute(0, 2, 3, 1).float().cpu().numpy()
+        if wrong := int(np.count_nonzero(~np.isfinite(pictures))):
+            raise UnirenderError(
+                f"rendering: {wrong} of {pictures.size} values of the network's picture are NaN or infinite, expected "
+                "finite ones; compute in float32 (torch_dtype, --dtype), or load the checkpoint again"
+            )
+        return list(pictures)
 
     def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """The HDR maps that exceed the curve through which they enter the network, by name; {}: none does."""
