@@ -88,6 +88,15 @@ def test_stars_of_any_radii_are_filled(radii: list[float], start: int) -> None:
     assert np.abs(found).sum() == pytest.approx(area(flat), rel=5e-3)
 
 
+def test_many_small_notches_count_together():
+    """Each of them alone is below what is taken for rounding; the fan covered three times the polygon."""
+    angles = np.arange(8000) * 2 * np.pi / 8000
+    radii = np.where(np.arange(8000) // 2 % 2, 1.0, 0.998)
+    points = placed((np.stack([np.cos(angles), np.sin(angles)], axis=1) * radii[:, None]).tolist())
+    found = areas(points, triangulate(points, np.array([8000]))[0])
+    assert found.sum() == pytest.approx(np.abs(found).sum(), rel=1e-9)
+
+
 def test_an_obj_with_a_notch_has_the_area_that_it_draws(tmp_path: Path) -> None:
     lines = [*(f"v {x} {y} 0" for x, y in COMB), "f 2 3 4 5 6 7 8 9 10 11 12 1"]
     (tmp_path / "comb.obj").write_text("\n".join(lines))

@@ -14,6 +14,7 @@ from unirender_reference.meshes.gltf_document import Document
 from unirender_reference.meshes.gltf_materials import Materials, vector
 from unirender_reference.meshes.limits import MAX_NODES, check_faces, check_pieces, float32_step
 from unirender_reference.meshes.normals import flat_normals
+from unirender_reference.meshes.polygons import strip
 from unirender_reference.meshes.surface import Model, Piece
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -207,6 +208,4 @@ def _triangles(indices: Int[np.ndarray, " n"], mode: int, points: int) -> Int[np
         return np.zeros((0, 3), np.int64)
     if mode == FAN:
         return np.stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]], axis=1)
-    faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=1)
-    faces[1::2] = faces[1::2][:, [0, 2, 1]]
-    return faces
+    return strip(indices)
