@@ -260,13 +260,13 @@ def test_colors_of_off_files(tmp_path, kind):
     assert obj.provenance["ignored"] == ignored
 
 
-def write_colored_ply(path, types, color, faces="3 0 1 2\n3 0 2 3\n"):
+def write_colored_ply(path, types, color):
     names = ["x", "y", "z", "red", "green", "blue", "alpha"]
     kinds = ["float"] * 3 + types
     head = ["ply", "format ascii 1.0", "element vertex 4"]
     head += [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=False)]
-    head += [f"element face {len(faces.splitlines())}", "property list uchar int vertex_indices", "end_header"]
-    path.write_text("\n".join([*head, *(f"{line} {color}" for line in CORNER_LINES), faces]))
+    head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+    path.write_text("\n".join([*head, *(f"{line} {color}" for line in CORNER_LINES), "3 0 1 2", "3 0 2 3"]))
     return path
 
 
@@ -296,16 +296,6 @@ def test_colors_of_an_obj_that_miss_one_by_rounding(tmp_path):
     np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=1e-4)
 
 
-def test_colors_of_a_ply_s_quads_are_said_to_be_left_out(tmp_path):
-    """The object was white, and nothing said so; beside triangles it was no PLY."""
-    path = write_colored_ply(tmp_path / "a.ply", [], "", "4 0 1 2 3 255 0 0\n3 0 1 2 0 255 0\n")
-    types = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    path.write_text(path.read_text().replace("end_header", types + "end_header"))
-    obj = load_mesh(path)
-    assert obj.provenance["ignored"] == "colours"
-    assert obj.albedo == pytest.approx(0.5)
-
-
 def test_stl_that_goes_on_behind_its_facets(tmp_path):
     """It was called a point cloud; colours in the facets were left out, and nothing said so."""
     trimesh.creation.box().export(tmp_path / "a.stl")
@@ -331,8 +321,6 @@ def test_each_face_of_an_off_file_has_its_color(tmp_path):
     (tmp_path / "a.off").write_text(body)
     found = {tuple(texel) for texel in load_mesh(tmp_path / "a.off").albedo.reshape(-1, 3).tolist()}
     assert found == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
-    (tmp_path / "b.off").write_text("\n".join(["OFF", "4 1 0", *CORNER_LINES, "4 0 1 2 3 255 0 0"]))
-    assert load_mesh(tmp_path / "b.off").provenance["ignored"] == "colours"
 
 
 def test_normals_of_an_off_file(tmp_path):

@@ -373,8 +373,8 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
     [
         ("a.ply", PLY + b"element vertex 4000000000\nproperty float x\nend_header\n", "claims 4,000,000,000"),
         ("a.ply", PLY + b"element vertex 400000\nproperty float x\nend_header\n", "truncated: claims 400,000"),
-        ("a.off", b"OFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
-        ("a.off", b"# made by hand\nNCOFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
+        ("a.off", b"OFF\n900000 2 0\n", "truncated: claims 900,000 vertices"),
+        ("a.off", b"# made by hand\nNCOFF\n900000 2 0\n", "truncated: claims 900,000 vertices"),
         ("a.off", b"4OFF\n3 1 0\n", "starts with '4OFF', expected OFF"),
         ("a.off", b"off\n3 1 0\n", "expected OFF"),
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),

@@ -1,10 +1,7 @@
 """The folder of a model: where its buffers, materials and textures are read from, and from nowhere else."""
 
 from pathlib import Path
-from typing import NoReturn
 from urllib.parse import unquote, urlparse
-
-from trimesh.resolvers import Resolver
 
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.limits import check_bytes
@@ -63,31 +60,3 @@ class ModelFolder:
                 raise
             raise UnirenderError(f"{what} {shown!r} cannot be read ({error}); check the name") from error
         return path
-
-
-class FolderResolver(Resolver):
-    """The same for trimesh's loaders. They swallow errors, so the first one is kept in `error`."""
-
-    def __init__(self, folder: ModelFolder) -> None:
-        self.folder = folder
-        self.error: UnirenderError | None = None
-
-    def get(self, key: str) -> bytes:
-        """The bytes of a file in the folder."""
-        try:
-            return self.folder.read(key, "file")
-        except UnirenderError as error:
-            self.error = self.error or error
-            raise
-
-    def keys(self) -> list[str]:
-        """Nothing: names are asked for one by one."""
-        return []
-
-    def namespaced(self, namespace: str) -> "FolderResolver":
-        """This resolver: there are no inner folders of another model."""
-        return self
-
-    def write(self, name: str, data: object) -> NoReturn:
-        """Refused: loading writes nothing."""
-        raise UnirenderError(f"{name}: a model that is loaded writes no file")
