@@ -368,6 +368,21 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
     assert obj.provenance["ignored"] == "undefined materials"
 
 
+def test_names_that_differ_in_case_alone_are_found(tmp_path):
+    """Files made on Windows and macOS were refused; what lies outside still is, and so is a choice of two."""
+    (tmp_path / "model" / "Maps").mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(png(random_pixels(0, 4, 4)))
+    (tmp_path / "model" / "Maps" / "Wood.PNG").write_bytes(png(random_pixels(0, 4, 4)))
+    model = tmp_path / "model" / "model.obj"
+    model.write_text(TRIANGLE + "vt 0 0\nvt 1 0\nvt 0 1\nmtllib MODEL.MTL\nusemtl a\nf 1/1 2/2 3/3\n")
+    (tmp_path / "model" / "model.mtl").write_text("newmtl a\nmap_Kd maps\\wood.png\n")
+    assert load_mesh(model).albedo.shape == (6, 6, 3)
+    (tmp_path / "model" / "Maps" / "WOOD.png").symlink_to(tmp_path / "secret.png")
+    assert "texture 'maps\\\\wood.png' is missing" in reason(model)
+    (tmp_path / "model" / "Maps" / "Wood.PNG").unlink()
+    assert "lies outside the model's folder" in reason(model)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
