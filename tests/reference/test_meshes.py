@@ -307,12 +307,13 @@ def test_stl_that_goes_on_behind_its_facets(tmp_path):
     assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "attributes of facets"
 
 
-@pytest.mark.parametrize("padding", ["in capitals", "a name", "the end"])
+@pytest.mark.parametrize("padding", ["in capitals", "a name", "the end", "ends of lines"])
 def test_stl_of_words_in_capitals_or_with_zeros(tmp_path, padding):
-    """It was taken for a binary one that is cut off."""
+    """It was taken for a binary one that is cut off; one whose lines end in CR, for none."""
     text = str(trimesh.creation.box().export(file_type="stl_ascii")).upper()
     text = text.replace("\n", "\0\n", 1) if padding == "a name" else text
-    (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"))
+    text = text.replace("\n", "\r") if padding == "ends of lines" else text
+    (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"), newline="")
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 

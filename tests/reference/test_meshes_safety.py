@@ -27,6 +27,8 @@ PLY_TRIANGLE = (
     b"element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
 )
+STL_FACET = b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+STL_END = b"endsolid\n"
 
 
 def reason(path) -> str:
@@ -105,6 +107,7 @@ def set_in(document, *keys, value):
         (("bufferViews", 0, "byteStride"), 4, "cut off"),
         (("buffers", 0, "byteLength"), 10**12, r"truncated: buffers\[0\] holds"),
         (("meshes", 0, "primitives", 0, "indices"), 77, r"names accessors\[77\], but has 3 of them"),
+        (("meshes", 0, "primitives", 0, "mode"), 7, "has the mode 7, expected 0 to 6"),
         (("meshes", 0, "primitives", 0, "material"), 5, r"names materials\[5\], but has 1"),
         (("nodes", 0, "children"), [0], r"nodes\[0\] has two parents or is its own"),
         (("nodes", 0, "scale"), [1, 2], "has scale .*expected 3 finite numbers"),
@@ -393,6 +396,8 @@ def test_names_that_differ_in_case_alone_are_found(tmp_path):
         ("a.off", b"4OFF\n3 1 0\n", "starts with '4OFF', expected OFF"),
         ("a.off", b"off\n3 1 0\n", "expected OFF"),
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),
+        ("a.stl", STL_FACET.replace(b"1 0 0", b"1 0") * 3 + STL_END, "the line b'vertex 1 0', expected three numbers"),
+        ("a.stl", STL_FACET.replace(b"endloop", b"vertex 1 1 0\nendloop") * 3 + STL_END, "has facets of 4 vertices"),
         ("a.ply", PLY + b"comment TextureFile ../a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "'../a.png' lies outside"),
         ("a.ply", PLY + b"comment TextureFile a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "texture 'a.png' is missing"),
         ("a.ply", PLY + b"comment TextureFile a\ncomment TextureFile b\n" + PLY_TRIANGLE + b"3 0 1 2\n", "names 2"),

@@ -3,7 +3,6 @@
 trimesh trusts the counts of a header, so those are held against the size of the file first.
 """
 
-import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -29,11 +28,10 @@ from unirender_reference.meshes.mtl import DEFAULT_ALBEDO
 from unirender_reference.meshes.off_lines import OffLines, read_off_lines
 from unirender_reference.meshes.ply_elements import PlyHeader, read_header
 from unirender_reference.meshes.ply_triangles import COLORS, triangles_ply
+from unirender_reference.meshes.stl_facets import whole_stl
 from unirender_reference.meshes.surface import BARE, Channel, Material, Model, Piece, Texture
 
 HEAD = 65536  # bytes that are looked at before trimesh reads the file
-STL_HEADER, STL_FACET = 84, 50  # bytes of a binary file: its header with the count, and each facet
-FACET_ATTRIBUTES = "attributes of facets"  # among what is ignored
 WHITE = Material({"albedo": np.ones(3, np.float32)})
 TEXTURE_COMMENT = re.compile(rb"TextureFile\s+(.+)", re.IGNORECASE)
 
@@ -53,7 +51,7 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     with path.open("rb") as file:
         head = file.read(HEAD)
     texture, off, rewritten, exact = None, OffLines(), None, False
-    ignored = set[str]()
+    ignored: set[str] = set()
     if kind == "ply":
         header = read_header(head)
         _check_claims(header, length)
@@ -64,11 +62,8 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
         off = read_off_lines(path)
         rewritten, exact = off.triangles, True
         ignored |= {"colours"} if off.left_out else set()
-    elif _is_text(head):
-        _check_end(path)
     else:
-        rewritten = _whole_facets(path, head)
-        ignored |= {FACET_ATTRIBUTES} if _has_attributes(rewritten) else set()
+        rewritten, ignored = whole_stl(path, head)
     scene = trimesh.load_scene(path if rewritten is None else rewritten, file_type=kind, process=False)
     pieces = []
     for mesh in scene.geometry.values():
@@ -86,27 +81,6 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     return Model(pieces, frozenset(ignored))
 
 
-def _is_text(head: bytes) -> bool:
-    """Whether an STL is one of words, whose name or end may be padded; a binary one's count of facets has a zero."""
-    return b"\0" not in head[80:STL_HEADER] and re.search(rb"facet|endsolid", head, re.IGNORECASE) is not None
-
-
-def _whole_facets(path: Path, head: bytes) -> io.BytesIO:
-    """A binary STL without what follows its last facet, which trimesh takes for a sign that it is none."""
-    length, count = path.stat().st_size, int.from_bytes(head[80:STL_HEADER], "little")
-    expected = STL_HEADER + STL_FACET * count
-    if length < expected:
-        raise UnirenderError(f"truncated: claims {count:,} triangles in {length:,} bytes, expected {expected:,}")
-    with path.open("rb") as file:
-        return io.BytesIO(file.read(expected))
-
-
-def _has_attributes(stl: io.BytesIO) -> bool:
-    """Whether a facet has attributes: the two last bytes of each, where some exporters keep a colour."""
-    facets = np.frombuffer(stl.getbuffer(), np.uint8, offset=STL_HEADER).reshape(-1, STL_FACET)
-    return bool(facets[:, -2:].any())
-
-
 def _check_claims(header: PlyHeader, length: int) -> None:
     """Counts that the file cannot hold; a row takes a byte at least."""
     for name, count in ((name, element.rows) for name, element in header.elements.items()):
@@ -115,14 +89,6 @@ def _check_claims(header: PlyHeader, length: int) -> None:
             raise UnirenderError(f"claims {count:,} of element {name}, expected at most {limit:,}")
         if count > length:
             raise UnirenderError(f"truncated: claims {count:,} of element {name} in {length:,} bytes")
-
-
-def _check_end(path: Path) -> None:
-    """An STL of words that is cut off: trimesh takes no face of it."""
-    with path.open("rb") as file:
-        file.seek(-min(path.stat().st_size, HEAD), io.SEEK_END)  # zeros may follow
-        if b"endsolid" not in file.read().lower():
-            raise UnirenderError("truncated: its last solid does not end, expected 'endsolid'; copy it again")
 
 
 def _texture(folder: ModelFolder, header: PlyHeader) -> Texture | None:
