@@ -241,6 +241,9 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
     "words": ("OFF", "", " a b c", np.full(3, 0.5), "colours"),
     "words of vertices": ("COFF", " a b c", "", np.full(3, 0.5), "colours"),
+    "not in the header": ("OFF", " 128 64 255", "", np.full(3, 0.5), "colours"),
+    "half transparent": ("COFF", " 128 64 255 128", "", PURPLE, "alpha"),
+    "half transparent faces": ("OFF", "", " 0.50196 0.25098 1.0 0.5", PURPLE, "alpha"),
     "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", PURPLE, ""),
     "before coordinates": ("STCOFF", " 128 64 255 0.5 0.5", "", PURPLE, ""),
 }
@@ -275,6 +278,8 @@ def write_colored_ply(path, types, color):
     [
         (["uchar"] * 3, "128 64 255"),
         (["uchar"] * 3 + ["float"], "128 64 255 1"),
+        (["uchar"] * 3 + ["float"], "128 64 255 0.5"),
+        (["uchar"] * 4, "128 64 255 255"),
         (["float"] * 3, "128 64 255"),
         (["float"] * 3, "0.50196 0.25098 1.00001"),
         (["ushort"] * 3, "32896 16448 65535"),
@@ -284,6 +289,7 @@ def write_colored_ply(path, types, color):
 def test_colors_of_a_ply_are_in_the_range_of_their_type(tmp_path, types, color):
     """They were white where one number was a float and of 255, and their low bytes where they had 16 bits."""
     obj = load_mesh(write_colored_ply(tmp_path / "a.ply", types, color))
+    assert obj.provenance["ignored"] == ("alpha" if color.endswith(" 0.5") else "")
     found = obj.albedo.reshape(-1, 3)
     np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=2e-3)
 

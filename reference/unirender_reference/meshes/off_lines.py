@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_reference.meshes.colors import unit_colors
+from unirender_reference.meshes.colors import is_opaque, unit_colors
 from unirender_reference.meshes.limits import MAX_VERTICES, check_faces
 from unirender_reference.meshes.polygons import triangulate
 
@@ -31,14 +31,14 @@ class OffLines:
         normals: (n, 3) of the vertices, as they are stored, or None.
         vertices: (n, 3) colours of the vertices, or None.
         faces: (m, 3) colours of the triangles, or None.
-        left_out: the file has colours, or numbers in their place, that are not read.
+        ignored: "colours" where the file has some, or numbers in their place, that are not read; "alpha".
         triangles: the file with triangles for its polygons; None where it has triangles alone.
     """
 
     normals: Float[np.ndarray, "n 3"] | None = None
     vertices: Float[np.ndarray, "n 3"] | None = None
     faces: Float[np.ndarray, "m 3"] | None = None
-    left_out: bool = False
+    ignored: frozenset[str] = frozenset()
     triangles: io.BytesIO | None = None
 
     @property
@@ -73,21 +73,24 @@ def read_off_lines(path: Path) -> OffLines:
             f"starts with {first[:20]!r}, expected OFF, or COFF, NOFF, STOFF and the like, as text and in three "
             "dimensions; export it again"
         )
-    of_vertices, of_faces = _rows([line.split() for line in body.splitlines() if line.strip()])
-    polygon, triangles = _triangles(of_vertices, [line[1 : int(line[0]) + 1] for line in of_faces])
     start = 6 if "N" in letters else 3
     end = -2 if "ST" in letters else None
-    vertex_colors = [line[start:end] for line in of_vertices] if "C" in letters else []
+    lines = [line.split() for line in body.splitlines() if line.strip()]
+    of_vertices, of_faces = _rows(lines, start - (end or 0))
+    polygon, triangles = _triangles(of_vertices, [line[1 : int(line[0]) + 1] for line in of_faces])
+    vertex_colors = [line[start:end] for line in of_vertices]
     face_colors = [of_faces[k][int(of_faces[k][0]) + 1 :] for k in polygon]
-    of_each_vertex = _linear(vertex_colors)
-    of_each_face = _linear(face_colors) if of_each_vertex is None else None
+    of_each_vertex, vertices_opaque = _linear(vertex_colors if "C" in letters else [])
+    of_each_face, faces_opaque = _linear(face_colors if of_each_vertex is None else [])
     unread = (any(vertex_colors) and of_each_vertex is None) or (any(face_colors) and of_each_face is None)
+    ignored = {"colours": unread, "alpha": not (vertices_opaque and faces_opaque)}
     normals = np.array([line[3:6] for line in of_vertices], np.float64) if "N" in letters else None
-    return OffLines(normals, of_each_vertex, of_each_face, unread, triangles)
+    names = frozenset(name for name, is_so in ignored.items() if is_so)
+    return OffLines(normals, of_each_vertex, of_each_face, names, triangles)
 
 
-def _rows(lines: list[list[str]]) -> tuple[list[list[str]], list[list[str]]]:
-    """The lines of vertices and of faces, as many as the first line says."""
+def _rows(lines: list[list[str]], width: int) -> tuple[list[list[str]], list[list[str]]]:
+    """The lines of vertices, of `width` numbers and more, and of faces, as many as the first line says."""
     try:
         vertices, faces = (int(count) for count in lines[0][:2])
     except (ValueError, IndexError):
@@ -101,7 +104,7 @@ def _rows(lines: list[list[str]]) -> tuple[list[list[str]], list[list[str]]]:
     of_vertices, of_faces = lines[1 : vertices + 1], lines[vertices + 1 : vertices + 1 + faces]
     if bad := next((line for line in of_faces if not line[0].isdecimal()), None):
         raise UnirenderError(f"has the face {' '.join(bad)[:40]!r}, expected its corners' count; export it again")
-    whole = all(len(line) > 2 for line in of_vertices) and all(len(line) > int(line[0]) for line in of_faces)
+    whole = all(len(line) >= width for line in of_vertices) and all(len(line) > int(line[0]) for line in of_faces)
     if len(of_vertices) < vertices or len(of_faces) < faces or not whole:
         raise UnirenderError(
             f"truncated: claims {vertices:,} vertices and {faces:,} faces, but its lines, one for each, end before; "
@@ -131,14 +134,16 @@ def _triangles(vertices: list[list[str]], corners: list[list[str]]) -> tuple[Int
     return rows[polygon], io.BytesIO("\n".join(lines).encode())
 
 
-def _linear(numbers: list[list[str]]) -> Float[np.ndarray, "n 3"] | None:
+def _linear(numbers: list[list[str]]) -> tuple[Float[np.ndarray, "n 3"] | None, bool]:
+    """Linear colours, None where they are none; and whether those that are have no alpha, or one of 1."""
     if not numbers or {len(words) for words in numbers} - {3, 4}:
-        return None
+        return None, True
     have_alpha = all(len(words) == 4 for words in numbers)
     try:
         stored = np.array([words if have_alpha else words[:3] for words in numbers], np.float64)
     except ValueError:  # words
-        return None
+        return None, True
+    opaque = not have_alpha or is_opaque(stored[:, 3])
     if (stored % 1).any():
         stored = stored[:, :3]  # of floats, alpha may be of another range
-    return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64)
+    return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64), opaque

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_reference.meshes.colors import unit_colors
+from unirender_reference.meshes.colors import is_opaque, unit_colors
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.images import ImageBudget, texels_of
 from unirender_reference.meshes.limits import (
@@ -61,7 +61,7 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
     elif kind == "off":
         off = read_off_lines(path)
         rewritten, exact = off.triangles, True
-        ignored |= {"colours"} if off.left_out else set()
+        ignored = set(off.ignored)
     else:
         rewritten, ignored = whole_stl(path, head)
     scene = trimesh.load_scene(path if rewritten is None else rewritten, file_type=kind, process=False)
@@ -73,6 +73,7 @@ def read_through_trimesh(path: Path, folder: ModelFolder) -> Model:
                 raise UnirenderError(f"its faces index outside the {len(mesh.vertices):,} vertices; export it again")
             piece = _piece(mesh, texture, step=0.0 if exact else float32_step(mesh.vertices))
             ignored |= {BARE} if texture is not None and not piece.uv else set()
+            ignored |= {"alpha"} if piece.colors is not None and not _is_opaque(mesh) else set()
             if off.normals is not None:
                 piece = replace(piece, normals=off.normals[piece.faces])
             if off.colored:
@@ -143,3 +144,9 @@ def _stored_colors(mesh: trimesh.Trimesh, element: str) -> np.ndarray | None:
     if data is None or not set(COLORS) <= set(data.dtype.names):
         return None
     return np.stack([data[name] for name in COLORS], axis=-1)
+
+
+def _is_opaque(mesh: trimesh.Trimesh) -> bool:
+    """Whether the element that has the colours of a PLY has no alpha, or one of 1."""
+    data = mesh.metadata["_ply_raw"][getattr(mesh.visual, "kind", None)]["data"]
+    return "alpha" not in data.dtype.names or is_opaque(data["alpha"])
