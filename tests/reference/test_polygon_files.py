@@ -187,6 +187,11 @@ def test_lines_of_a_ply_may_end_in_any_way(tmp_path, ends):
 VERTICES = ("vertex", POINT, FLAT)
 WRONG = {
     "a word": (ply("ascii", [VERTICES, faces_of(QUAD)]).replace(b"0 1 2 3", b"0 1 two 3"), "has the word b'two'"),
+    "glued numbers": (ply("ascii", [VERTICES, faces_of(QUAD)]).replace(b"0 1 0", b"0 1-0"), "has the word b'1-0'"),
+    "many lists": (
+        ply("ascii", [("face", [("uchar", "int", f"list{k}") for k in range(9)], [])]),
+        "its element face has 9 lists",
+    ),
     "a short line": (ply("ascii", [VERTICES, faces_of(QUAD)]).replace(b"1 1 0", b"1 1"), "row 3 of its element vertex"),
     "a short binary": (ply("binary_big_endian", [VERTICES, faces_of(QUAD)])[:-1], "truncated: row 1 .* face"),
     "several sizes, short": (ply("binary_big_endian", [VERTICES, faces_of(QUAD, TRIANGLE)])[:-13], "truncated"),

@@ -6,7 +6,7 @@ differ in length, and shifts the rows of a text behind a blank line.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from unirender.errors import UnirenderError
 INTEGERS = {"char": "int8", "uchar": "uint8", "short": "int16", "ushort": "uint16", "int": "int32", "uint": "uint32"}
 KINDS = INTEGERS | {"float": "float32", "double": "float64"}
 KINDS |= {name: name for name in [*KINDS.values(), "int64", "uint64", "float16"]}
+MAX_LISTS = 8  # of an element: each costs memory for each row
 ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 END = re.compile(rb"[\r\n]end_header[^\r\n]*")
 
@@ -151,6 +152,11 @@ def read_header(head: bytes) -> PlyHeader:
     for element, each in elements.items():
         if len({found.name for found in each.properties}) < len(each.properties):
             raise UnirenderError(f"its element {element} has two properties of one name; export it again")
+        lists = sum(found.counts is not None for found in each.properties)
+        if lists > MAX_LISTS:
+            raise UnirenderError(
+                f"its element {element} has {lists} lists, expected at most {MAX_LISTS}; leave some out"
+            )
     if not form:
         raise UnirenderError(f"its header has no line 'format', expected one of {', '.join(ORDERS)}; export it again")
     return PlyHeader(ORDERS[form] is None, start, elements, comments)
@@ -160,8 +166,13 @@ def _kind(word: str, form: str) -> np.dtype:
     return np.dtype(KINDS[word]).newbyteorder(ORDERS[form] or "=")
 
 
-def read_columns(path: Path, header: PlyHeader) -> dict[str, PlyColumns]:
+def read_columns(path: Path, header: PlyHeader, wanted: Collection[str]) -> dict[str, PlyColumns]:
     """The columns of each element, by the names of its properties.
+
+    Args:
+        path: the file.
+        header: its own.
+        wanted: which properties that are no lists; lists are all there, and cost nothing before they are joined.
 
     Raises:
         UnirenderError: the file ends before its elements do, a line of a text is shorter than its row, or a list has a
@@ -171,33 +182,36 @@ def read_columns(path: Path, header: PlyHeader) -> dict[str, PlyColumns]:
         file.seek(header.start)
         body = file.read()
     if header.text:
-        return _of_text(body, header.elements)
+        return _of_text(body, header.elements, wanted)
     numbers = _Numbers(np.frombuffer(body, np.uint8), text=False)
     result: dict[str, PlyColumns] = {}
     position = 0
     for name, element in header.elements.items():
         starts = _starts(body, position, name, element)
-        result[name], ends = _columns(numbers, starts, np.broadcast_to(len(body), element.rows), name, element)
+        limit = np.broadcast_to(len(body), element.rows)
+        result[name], ends = _columns(numbers, (starts, limit), name, element, wanted)
         position = int(ends[-1]) if len(ends) else position
     return result
 
 
-def _of_text(body: bytes, elements: Mapping[str, PlyElement]) -> dict[str, PlyColumns]:
+def _of_text(body: bytes, elements: Mapping[str, PlyElement], wanted: Collection[str]) -> dict[str, PlyColumns]:
     claimed = sum(element.rows for element in elements.values())
     lines = [line for line in body.splitlines() if line.strip()][:claimed]
     if len(lines) < claimed:
         raise UnirenderError(f"truncated: its header claims {claimed:,} lines, it has {len(lines):,}; copy it again")
+    ends = np.cumsum([len(line.split()) for line in lines], dtype=np.int64)
     try:
         numbers = _Numbers(np.fromstring(b"\n".join(lines), sep=" "), text=True)
     except ValueError:
-        raise UnirenderError(f"{_first_word(lines)}, expected numbers alone; export it again") from None
-    ends = np.cumsum([len(line.split()) for line in lines])
+        numbers = None
+    if numbers is None or len(numbers.stored) != ends[-1:].sum():  # "1-2" is two numbers for numpy
+        raise UnirenderError(f"{_first_word(lines)}, expected numbers alone; export it again")
     starts = np.concatenate([[0], ends[:-1]])
     result: dict[str, PlyColumns] = {}
     row = 0
     for name, element in elements.items():
         part = slice(row, row + element.rows)
-        result[name], _ = _columns(numbers, starts[part], ends[part], name, element)
+        result[name], _ = _columns(numbers, (starts[part], ends[part]), name, element, wanted)
         row += element.rows
     return result
 
@@ -213,10 +227,14 @@ def _first_word(lines: list[bytes]) -> str:
 
 
 def _columns(
-    numbers: _Numbers, starts: Int[np.ndarray, " n"], ends: Int[np.ndarray, " n"], name: str, element: PlyElement
+    numbers: _Numbers,
+    rows: tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]],
+    name: str,
+    element: PlyElement,
+    wanted: Collection[str],
 ) -> tuple[PlyColumns, Int[np.ndarray, " n"]]:
-    """The columns of rows that begin at `starts` and end at `ends` or before, and where they do end."""
-    at = np.array(starts, np.int64)
+    """The columns of rows, of which the first and the last possible place are given, and where they do end."""
+    at, ends = np.array(rows[0], np.int64), rows[1]
     result: dict[str, Num[np.ndarray, " n"] | PlyLists] = {}
 
     def moved(by: Int[np.ndarray, " n"] | int) -> Int[np.ndarray, " n"]:
@@ -228,7 +246,9 @@ def _columns(
     for each in element.properties:
         if each.counts is None:
             after = moved(numbers.width(each.kind))
-            result[each.name], at = numbers.take(at, each.kind), after
+            if each.name in wanted:
+                result[each.name] = numbers.take(at, each.kind)
+            at = after
             continue
         first = moved(numbers.width(each.counts))
         sizes, at = numbers.take(at, each.counts).astype(np.int64), first

@@ -20,6 +20,7 @@ VERTEX_COORDINATES = "texture_u", "texture_v", "u", "v", "s", "t"
 STRIPS, RESTART = "tristrips", -1  # several strips in one list, with this number between them
 COLORS = "red", "green", "blue"
 OTHER_COLORS = ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")
+WANTED = {"x", "y", "z", "nx", "ny", "nz", *COLORS, *OTHER_COLORS[0], *OTHER_COLORS[1], "alpha", *VERTEX_COORDINATES}
 Columns = dict[str, np.ndarray]  # (rows,), or (rows, k) of lists of one length
 
 
@@ -39,7 +40,7 @@ def triangles_ply(path: Path, header: PlyHeader, *, textured: bool) -> io.BytesI
         UnirenderError: the file is cut off, its vertices have no x, y and z or its faces no list of them, it has both
             faces and strips, or too many triangles.
     """
-    elements = read_columns(path, header)
+    elements = read_columns(path, header, WANTED)
     vertices = _numbers(elements.get("vertex", {}))
     if missing := [axis for axis in "xyz" if axis not in vertices]:
         raise UnirenderError(f"its vertices have no {', '.join(missing)}, expected x, y and z; export it again")
