@@ -77,7 +77,7 @@ def test_what_no_cut_fills_stays_a_fan(points: np.ndarray) -> None:
     np.testing.assert_array_equal(triangles, fans(np.array([len(points)]))[0])
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(0.2, 2.0), min_size=4, max_size=12), st.integers(0, 11))
 def test_stars_of_any_radii_are_filled(radii: list[float], start: int) -> None:
     angles = np.arange(len(radii)) * 2 * np.pi / len(radii)
