@@ -39,11 +39,8 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                 raise UnirenderError(
                     f"{path}: {width} x {height} pixels, expected at most {MAX_PIXELS:,}; scale it down first"
                 )
-            if misread(file):
-                raise UnirenderError(
-                    f"{path}: its channels are stored one after the other, uncompressed, with 16 bits, which "
-                    "cannot be read; save it as PNG, or with interleaved channels"
-                )
+            if what := misread(file):
+                raise UnirenderError(f"{path}: {what}; save it as PNG, or with interleaved channels")
             _check_grey(file, str(path))
             _scale_transparent_grey(file)
             if not upright:

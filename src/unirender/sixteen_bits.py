@@ -6,6 +6,7 @@ bytes were in the other order, and then keeps what it dropped before.
 
 import sys
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ OTHER_ORDER = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L
 UNPACKED = {"RGB": "RGB", "RGBX": "RGBX", "RGBA": "RGBA", "RGBa": "RGBA"}  # as Pillow names them -> bytes as they are
 PLANAR_CONFIGURATION, SEPARATE = 284, 2  # tags and values of TIFF
 COMPRESSION, UNCOMPRESSED = 259, 1
-BITS = 258
+BITS_PER_SAMPLE = 258
 PHOTOMETRIC, WHITE_IS_ZERO = 262, 0
 TURNED_BACK = {  # EXIF orientation -> what undoes its turn
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -83,11 +84,19 @@ def planar(picture: Image.Image) -> bool:
     return getattr(picture, "tag_v2", {}).get(PLANAR_CONFIGURATION) == SEPARATE
 
 
-def misread(picture: Image.Image) -> bool:
-    """Whether Pillow makes noise of it, or nothing: such a TIFF, uncompressed, of 16 bits. Grey of 32 it reads."""
+def misread(picture: Image.Image) -> str:
+    """Of what Pillow makes noise, or nothing: such a TIFF, uncompressed, of 16 bits. Empty where it reads the picture,
+    as it does grey of 32 bits."""
     tags = getattr(picture, "tag_v2", {})
-    deep = max(tags.get(BITS, (8,))) > 8 and picture.mode not in ("I", "F")
-    return planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and deep
+    deep = max(tags.get(BITS_PER_SAMPLE, (8,))) > 8 and picture.mode not in ("I", "F")
+    if not (planar(picture) and tags.get(COMPRESSION) == UNCOMPRESSED and deep):
+        return ""
+    return "its channels are stored one after the other, uncompressed, with 16 bits, which cannot be read"
+
+
+def white_is_zero(tags: Mapping[int, Any]) -> bool:
+    """Whether the tags of a TIFF say that its greys count down from white."""
+    return tags.get(PHOTOMETRIC) == WHITE_IS_ZERO
 
 
 def unheeded_grey(picture: Image.Image) -> str:
@@ -95,9 +104,9 @@ def unheeded_grey(picture: Image.Image) -> str:
     tags = getattr(picture, "tag_v2", {})
     if not picture.mode.startswith("I"):
         return ""
-    if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO:
+    if white_is_zero(tags):
         return "its 0 is white"
-    return f"its grey has {bits} bits" if 8 < (bits := max(tags.get(BITS, (16,)))) < 16 else ""
+    return f"its grey has {bits} bits" if 8 < (bits := max(tags.get(BITS_PER_SAMPLE, (16,)))) < 16 else ""
 
 
 def _bytes(path: Path, name: str, upright: bool) -> np.ndarray:

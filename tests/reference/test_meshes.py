@@ -241,6 +241,9 @@ OFF_FILES = {  # the header, what stands behind each vertex and each face, the c
     "an index of a table": ("OFF", "", " 3", np.full(3, 0.5), "colours"),
     "words": ("OFF", "", " a b c", np.full(3, 0.5), "colours"),
     "words of vertices": ("COFF", " a b c", "", np.full(3, 0.5), "colours"),
+    "not in the header": ("OFF", " 128 64 255", "", np.full(3, 0.5), "colours"),
+    "half transparent": ("COFF", " 128 64 255 128", "", PURPLE, "alpha"),
+    "half transparent faces": ("OFF", "", " 0.50196 0.25098 1.0 0.5", PURPLE, "alpha"),
     "beside normals": ("NCOFF", " 0 0 1 128 64 255 255", "", PURPLE, ""),
     "before coordinates": ("STCOFF", " 128 64 255 0.5 0.5", "", PURPLE, ""),
 }
@@ -260,13 +263,13 @@ def test_colors_of_off_files(tmp_path, kind):
     assert obj.provenance["ignored"] == ignored
 
 
-def write_colored_ply(path, types, color, faces="3 0 1 2\n3 0 2 3\n"):
+def write_colored_ply(path, types, color):
     names = ["x", "y", "z", "red", "green", "blue", "alpha"]
     kinds = ["float"] * 3 + types
     head = ["ply", "format ascii 1.0", "element vertex 4"]
     head += [f"property {kind} {name}" for kind, name in zip(kinds, names, strict=False)]
-    head += [f"element face {len(faces.splitlines())}", "property list uchar int vertex_indices", "end_header"]
-    path.write_text("\n".join([*head, *(f"{line} {color}" for line in CORNER_LINES), faces]))
+    head += ["element face 2", "property list uchar int vertex_indices", "end_header"]
+    path.write_text("\n".join([*head, *(f"{line} {color}" for line in CORNER_LINES), "3 0 1 2", "3 0 2 3"]))
     return path
 
 
@@ -275,6 +278,8 @@ def write_colored_ply(path, types, color, faces="3 0 1 2\n3 0 2 3\n"):
     [
         (["uchar"] * 3, "128 64 255"),
         (["uchar"] * 3 + ["float"], "128 64 255 1"),
+        (["uchar"] * 3 + ["float"], "128 64 255 0.5"),
+        (["uchar"] * 4, "128 64 255 255"),
         (["float"] * 3, "128 64 255"),
         (["float"] * 3, "0.50196 0.25098 1.00001"),
         (["ushort"] * 3, "32896 16448 65535"),
@@ -284,6 +289,7 @@ def write_colored_ply(path, types, color, faces="3 0 1 2\n3 0 2 3\n"):
 def test_colors_of_a_ply_are_in_the_range_of_their_type(tmp_path, types, color):
     """They were white where one number was a float and of 255, and their low bytes where they had 16 bits."""
     obj = load_mesh(write_colored_ply(tmp_path / "a.ply", types, color))
+    assert obj.provenance["ignored"] == ("alpha" if color.endswith(" 0.5") else "")
     found = obj.albedo.reshape(-1, 3)
     np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=2e-3)
 
@@ -294,16 +300,6 @@ def test_colors_of_an_obj_that_miss_one_by_rounding(tmp_path):
     (tmp_path / "a.obj").write_text("\n".join(lines))
     found = load_mesh(tmp_path / "a.obj").albedo.reshape(-1, 3)
     np.testing.assert_allclose(found, np.broadcast_to(PURPLE, found.shape), rtol=0, atol=1e-4)
-
-
-def test_colors_of_a_ply_s_quads_are_said_to_be_left_out(tmp_path):
-    """The object was white, and nothing said so; beside triangles it was no PLY."""
-    path = write_colored_ply(tmp_path / "a.ply", [], "", "4 0 1 2 3 255 0 0\n3 0 1 2 0 255 0\n")
-    types = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    path.write_text(path.read_text().replace("end_header", types + "end_header"))
-    obj = load_mesh(path)
-    assert obj.provenance["ignored"] == "colours"
-    assert obj.albedo == pytest.approx(0.5)
 
 
 def test_stl_that_goes_on_behind_its_facets(tmp_path):
@@ -317,12 +313,13 @@ def test_stl_that_goes_on_behind_its_facets(tmp_path):
     assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "attributes of facets"
 
 
-@pytest.mark.parametrize("padding", ["in capitals", "a name", "the end"])
+@pytest.mark.parametrize("padding", ["in capitals", "a name", "the end", "ends of lines"])
 def test_stl_of_words_in_capitals_or_with_zeros(tmp_path, padding):
-    """It was taken for a binary one that is cut off."""
+    """It was taken for a binary one that is cut off; one whose lines end in CR, for none."""
     text = str(trimesh.creation.box().export(file_type="stl_ascii")).upper()
     text = text.replace("\n", "\0\n", 1) if padding == "a name" else text
-    (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"))
+    text = text.replace("\n", "\r") if padding == "ends of lines" else text
+    (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"), newline="")
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 
@@ -331,8 +328,6 @@ def test_each_face_of_an_off_file_has_its_color(tmp_path):
     (tmp_path / "a.off").write_text(body)
     found = {tuple(texel) for texel in load_mesh(tmp_path / "a.off").albedo.reshape(-1, 3).tolist()}
     assert found == {(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)}
-    (tmp_path / "b.off").write_text("\n".join(["OFF", "4 1 0", *CORNER_LINES, "4 0 1 2 3 255 0 0"]))
-    assert load_mesh(tmp_path / "b.off").provenance["ignored"] == "colours"
 
 
 def test_normals_of_an_off_file(tmp_path):

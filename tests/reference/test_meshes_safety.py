@@ -27,6 +27,8 @@ PLY_TRIANGLE = (
     b"element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
 )
+STL_FACET = b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+STL_END = b"endsolid\n"
 
 
 def reason(path) -> str:
@@ -105,6 +107,7 @@ def set_in(document, *keys, value):
         (("bufferViews", 0, "byteStride"), 4, "cut off"),
         (("buffers", 0, "byteLength"), 10**12, r"truncated: buffers\[0\] holds"),
         (("meshes", 0, "primitives", 0, "indices"), 77, r"names accessors\[77\], but has 3 of them"),
+        (("meshes", 0, "primitives", 0, "mode"), 7, "has the mode 7, expected 0 to 6"),
         (("meshes", 0, "primitives", 0, "material"), 5, r"names materials\[5\], but has 1"),
         (("nodes", 0, "children"), [0], r"nodes\[0\] has two parents or is its own"),
         (("nodes", 0, "scale"), [1, 2], "has scale .*expected 3 finite numbers"),
@@ -368,16 +371,33 @@ def test_mtl_textures_stay_in_the_folder(tmp_path, line, message):
     assert obj.provenance["ignored"] == "undefined materials"
 
 
+def test_names_that_differ_in_case_alone_are_found(tmp_path):
+    """Files made on Windows and macOS were refused; what lies outside still is, and so is a choice of two."""
+    (tmp_path / "model" / "Maps").mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(png(random_pixels(0, 4, 4)))
+    (tmp_path / "model" / "Maps" / "Wood.PNG").write_bytes(png(random_pixels(0, 4, 4)))
+    model = tmp_path / "model" / "model.obj"
+    model.write_text(TRIANGLE + "vt 0 0\nvt 1 0\nvt 0 1\nmtllib MODEL.MTL\nusemtl a\nf 1/1 2/2 3/3\n")
+    (tmp_path / "model" / "model.mtl").write_text("newmtl a\nmap_Kd maps\\wood.png\n")
+    assert load_mesh(model).albedo.shape == (6, 6, 3)
+    (tmp_path / "model" / "Maps" / "WOOD.png").symlink_to(tmp_path / "secret.png")
+    assert "texture 'maps\\\\wood.png' is missing" in reason(model)
+    (tmp_path / "model" / "Maps" / "Wood.PNG").unlink()
+    assert "lies outside the model's folder" in reason(model)
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("a.ply", PLY + b"element vertex 4000000000\nproperty float x\nend_header\n", "claims 4,000,000,000"),
         ("a.ply", PLY + b"element vertex 400000\nproperty float x\nend_header\n", "truncated: claims 400,000"),
-        ("a.off", b"OFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
-        ("a.off", b"# made by hand\nNCOFF\n900000 2 0\n", "truncated: claims 900,000 of element vertex"),
+        ("a.off", b"OFF\n900000 2 0\n", "truncated: claims 900,000 vertices"),
+        ("a.off", b"# made by hand\nNCOFF\n900000 2 0\n", "truncated: claims 900,000 vertices"),
         ("a.off", b"4OFF\n3 1 0\n", "starts with '4OFF', expected OFF"),
         ("a.off", b"off\n3 1 0\n", "expected OFF"),
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),
+        ("a.stl", STL_FACET.replace(b"1 0 0", b"1 0") * 3 + STL_END, "the line b'vertex 1 0', expected three numbers"),
+        ("a.stl", STL_FACET.replace(b"endloop", b"vertex 1 1 0\nendloop") * 3 + STL_END, "has facets of 4 vertices"),
         ("a.ply", PLY + b"comment TextureFile ../a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "'../a.png' lies outside"),
         ("a.ply", PLY + b"comment TextureFile a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "texture 'a.png' is missing"),
         ("a.ply", PLY + b"comment TextureFile a\ncomment TextureFile b\n" + PLY_TRIANGLE + b"3 0 1 2\n", "names 2"),

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 MOST_FLOAT = 2.0  # of colours that are floats of 1
+OPAQUE = 0.998  # what alpha is above if it means 1: less than half a step of 255 below
 
 
 def unit_colors(stored: Shaped[np.ndarray, "n c"]) -> Float[np.ndarray, "n 3"]:
@@ -25,3 +26,8 @@ def unit_colors(stored: Shaped[np.ndarray, "n c"]) -> Float[np.ndarray, "n 3"]:
     else:
         white = 1
     return np.clip(np.nan_to_num(stored[:, :3].astype(np.float64) / white), 0, 1)
+
+
+def is_opaque(alpha: Shaped[np.ndarray, " n"]) -> bool:
+    """Whether each alpha, stored as colours are, is 1."""
+    return bool((unit_colors(alpha[:, None].repeat(3, axis=1)) > OPAQUE).all())

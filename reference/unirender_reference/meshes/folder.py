@@ -1,10 +1,8 @@
 """The folder of a model: where its buffers, materials and textures are read from, and from nowhere else."""
 
-from pathlib import Path
-from typing import NoReturn
+import os
+from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, urlparse
-
-from trimesh.resolvers import Resolver
 
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.limits import check_bytes
@@ -29,7 +27,8 @@ class ModelFolder:
         """The bytes of a file that the model names.
 
         Args:
-            name: as the model spells it; backslashes count as slashes.
+            name: as the model spells it; backslashes count as slashes. Where there is no such file, one that is spelled
+                otherwise in small and capital letters alone is read, as on systems that do not tell them apart.
             what: the file's part in the model, for messages ("texture", "buffer").
             uri: whether `name` is percent-encoded.
             limit: of its bytes; None: `MAX_FILE_BYTES`.
@@ -52,7 +51,7 @@ class ModelFolder:
         if any(tiles in spelled.upper() for tiles in TILE_SETS):
             raise UnirenderError(f"{what} {shown!r} is a set of tiles, not read here; bake them into one picture")
         try:
-            path = (self.folder / spelled).resolve()
+            path = _in_any_case(self.folder, spelled).resolve()
             if not any(path.is_relative_to(root) for root in self._roots):
                 raise UnirenderError(f"{what} {shown!r} lies outside {self._where}; copy it into the folder")
             if not spelled or not path.is_file():
@@ -65,29 +64,12 @@ class ModelFolder:
         return path
 
 
-class FolderResolver(Resolver):
-    """The same for trimesh's loaders. They swallow errors, so the first one is kept in `error`."""
-
-    def __init__(self, folder: ModelFolder) -> None:
-        self.folder = folder
-        self.error: UnirenderError | None = None
-
-    def get(self, key: str) -> bytes:
-        """The bytes of a file in the folder."""
-        try:
-            return self.folder.read(key, "file")
-        except UnirenderError as error:
-            self.error = self.error or error
-            raise
-
-    def keys(self) -> list[str]:
-        """Nothing: names are asked for one by one."""
-        return []
-
-    def namespaced(self, namespace: str) -> "FolderResolver":
-        """This resolver: there are no inner folders of another model."""
-        return self
-
-    def write(self, name: str, data: object) -> NoReturn:
-        """Refused: loading writes nothing."""
-        raise UnirenderError(f"{name}: a model that is loaded writes no file")
+def _in_any_case(folder: Path, spelled: str) -> Path:
+    """The path as it is spelled, or that of the one file whose name differs from it in case alone."""
+    path = folder
+    for part in PurePosixPath(spelled).parts:
+        if part != ".." and not (path / part).exists() and path.is_dir():
+            alike = [name for name in os.listdir(path) if name.casefold() == part.casefold()]
+            part = alike[0] if len(alike) == 1 else part
+        path = path / part
+    return path

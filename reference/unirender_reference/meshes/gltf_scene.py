@@ -14,6 +14,7 @@ from unirender_reference.meshes.gltf_document import Document
 from unirender_reference.meshes.gltf_materials import Materials, vector
 from unirender_reference.meshes.limits import MAX_NODES, check_faces, check_pieces, float32_step
 from unirender_reference.meshes.normals import flat_normals
+from unirender_reference.meshes.polygons import strip
 from unirender_reference.meshes.surface import Model, Piece
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
@@ -42,7 +43,7 @@ def read_gltf(path: Path, folder: ModelFolder) -> Model:
         pieces_claimed += len(primitives[mesh])
         check_pieces(pieces_claimed)
     solid = {
-        mesh: [primitive for primitive in group if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
+        mesh: [primitive for primitive in group if _mode(primitive) in (TRIANGLES, STRIP, FAN)]
         for mesh, group in primitives.items()
     }
     faces = {mesh: sum(_face_count(document, primitive) for primitive in group) for mesh, group in solid.items()}
@@ -108,13 +109,21 @@ def _local(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
+def _mode(primitive: dict[str, Any]) -> int:
+    """What its vertices make up: points, lines (1 to 3), triangles."""
+    mode = primitive.get("mode", TRIANGLES)
+    if mode not in range(FAN + 1):
+        raise UnirenderError(f"a primitive has the mode {mode!r}, expected 0 to {FAN}; export it again")
+    return mode
+
+
 def _face_count(document: Document, primitive: dict[str, Any]) -> int:
     """By arithmetic: nothing is read."""
     attributes = primitive.get("attributes", {})
     if "POSITION" not in attributes:
         return 0
     count = accessor_count(document, primitive.get("indices", attributes["POSITION"]))
-    return count // 3 if primitive.get("mode", TRIANGLES) == TRIANGLES else max(count - 2, 0)
+    return count // 3 if _mode(primitive) == TRIANGLES else max(count - 2, 0)
 
 
 class _Shape:
@@ -133,7 +142,7 @@ class _Shape:
             indices = read_accessor(document, primitive["indices"])[:, 0]
         else:
             indices = np.arange(total)
-        faces = _triangles(indices.astype(np.int64), primitive.get("mode", TRIANGLES), total)
+        faces = _triangles(indices.astype(np.int64), _mode(primitive), total)
         rows, index = np.unique(faces, return_inverse=True)
 
         def attribute(name: str, *widths: int) -> Num[np.ndarray, "n width"] | None:
@@ -207,6 +216,4 @@ def _triangles(indices: Int[np.ndarray, " n"], mode: int, points: int) -> Int[np
         return np.zeros((0, 3), np.int64)
     if mode == FAN:
         return np.stack([np.full(len(indices) - 2, indices[0]), indices[1:-1], indices[2:]], axis=1)
-    faces = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=1)
-    faces[1::2] = faces[1::2][:, [0, 2, 1]]
-    return faces
+    return strip(indices)

@@ -11,14 +11,13 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from unirender.errors import UnirenderError
-from unirender.sixteen_bits import as_stored, misread
+from unirender.sixteen_bits import BITS_PER_SAMPLE, as_stored, misread, white_is_zero
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
 _LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
-BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED = 258, 339, 2  # TIFF tags, and a value of the second
-PHOTOMETRIC, WHITE_IS_ZERO = 262, 0  # the same
+SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and a value of it
 STRIP = 500_000  # stored pixels made float at a time
 SLACK = 1e-3  # by which floats may miss [0, 1]: rounding, resampling
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
@@ -84,11 +83,8 @@ def texels_of(image: Image.Image, name: str, side: int, mode: str, curve: Decode
         UnirenderError: the image is cut off or damaged, a TIFF that Pillow makes noise of, or its numbers are no
             brightness (negative, floats above 1).
     """
-    if misread(image):
-        raise UnirenderError(
-            f"texture {name}: its channels are stored one after the other, uncompressed, with 16 bits, which cannot be "
-            "read; export it as PNG"
-        )
+    if what := misread(image):
+        raise UnirenderError(f"texture {name}: {what}; export it as PNG")
     try:
         tags = getattr(image, "tag_v2", {})  # of a TIFF
         image = _eight_bits(as_stored(image), tags, name)
@@ -119,7 +115,7 @@ def _eight_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> Image
     if image.mode[0] not in "IF":
         return image
     upper = _upper_bits(image, tags, name)
-    return Image.fromarray(255 - upper if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO else upper)
+    return Image.fromarray(255 - upper if white_is_zero(tags) else upper)
 
 
 def _upper_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> UInt8[np.ndarray, "h w"]:

@@ -15,6 +15,7 @@ MAX_TEXT_BYTES = 2**26  # of JSON or of an MTL
 MAX_LINE_BYTES = 2**20  # of an OBJ, continuations included
 MAX_FACES = 1_000_000  # of all instances together, after triangulation
 MAX_VERTICES = 3 * MAX_FACES  # of one array
+MAX_CORNERS = 100_000  # of a concave polygon: to fill it takes a time that grows with their square
 MAX_NODES = 100_000
 MAX_PIECES = 50_000  # primitives of all instances together
 MAX_MATERIALS = 10_000
@@ -45,6 +46,14 @@ def check_faces(count: int) -> None:
     """Refuses a mesh of too many faces."""
     if count > MAX_FACES:
         raise UnirenderError(f"has {count:,} faces, expected at most {MAX_FACES:,}; decimate the mesh")
+
+
+def check_corners(count: int) -> None:
+    """Refuses a concave polygon of too many corners."""
+    if count > MAX_CORNERS:
+        raise UnirenderError(
+            f"has a concave polygon of {count:,} corners, expected at most {MAX_CORNERS:,}; export it as triangles"
+        )
 
 
 def check_pieces(count: int) -> None:

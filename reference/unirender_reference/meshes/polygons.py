@@ -6,7 +6,9 @@ import mapbox_earcut
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-FOLDED = 1e-3  # a triangle turned against its polygon by more than this share of the polygon's area
+from unirender_reference.meshes.limits import check_corners
+
+FOLDED = 1e-3  # triangles turned against their polygon, together more than this share of its area
 SAME_AREA = 1e-3  # by which the area of a cut may miss the polygon's
 
 
@@ -22,10 +24,15 @@ def triangulate(
     Returns:
         The triangles' corners as rows of `points`, and the polygon of each triangle. A polygon that cuts itself, which
         no cut fills, remains a fan.
+
+    Raises:
+        UnirenderError: a concave polygon has too many corners.
     """
     triangles, polygon = fans(sizes)
     first = np.cumsum(sizes) - sizes
-    cuts = {p: _other_cut(points[first[p] : first[p] + sizes[p]]) for p in _folded(points, sizes, triangles, polygon)}
+    folded = _folded(points, sizes, triangles, polygon)
+    check_corners(int(sizes[folded].max(initial=0)))
+    cuts = {p: _other_cut(points[first[p] : first[p] + sizes[p]]) for p in folded}
     found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
     if not found:
         return triangles, polygon
@@ -45,20 +52,28 @@ def fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.n
     return np.stack([first, first + step + 1, first + step + 2], axis=1), polygon
 
 
+def strip(corners: Int[np.ndarray, " n"]) -> Int[np.ndarray, "m 3"]:
+    """Triangles of a strip: each corner and the two behind it, every second one turned round."""
+    triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    triangles[1::2] = triangles[1::2][:, [0, 2, 1]]
+    return triangles
+
+
 def _folded(
     points: Float[np.ndarray, "k 3"],
     sizes: Int[np.ndarray, " p"],
     triangles: Int[np.ndarray, "m 3"],
     polygon: Int[np.ndarray, " m"],
 ) -> Int[np.ndarray, " q"]:
-    """Polygons of four corners and more of whose fan a triangle is turned against the whole."""
+    """Polygons of four corners and more of whose fan some triangles are turned against the whole."""
     several: Bool[np.ndarray, " m"] = sizes[polygon] > 3
     areas, owner = _doubled_areas(points, triangles[several]), polygon[several]
     whole = np.zeros((len(sizes), 3))
     np.add.at(whole, owner, areas)
     with np.errstate(over="ignore", invalid="ignore"):  # broken coordinates are refused later
-        turned = (areas * whole[owner]).sum(-1) < -FOLDED * (whole[owner] ** 2).sum(-1)
-    return np.unique(owner[turned])
+        along = (areas * whole[owner]).sum(-1)
+        turned = np.bincount(owner, np.maximum(-along, 0), len(sizes))
+        return np.flatnonzero(turned > FOLDED * (whole**2).sum(-1))
 
 
 def _other_cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"] | None:
