@@ -44,6 +44,20 @@ def end(number: int, frame: FrameType | None) -> None:
     raise Ended(number)
 
 
+def open_streams() -> None:
+    """Of the standard streams, those that were closed when the process began (`>&-`) lead nowhere from now on.
+
+    What is printed to them is lost, as whoever closed them asked for, and no file that is opened later gets it instead.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, mode))
+
+
 def reader_left() -> bool:
     """Whether nobody reads the standard output any more; another pipe that breaks is an error like others."""
     output = select.poll()
