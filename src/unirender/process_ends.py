@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import io
 import os
 import select
 import signal
@@ -48,6 +49,7 @@ def open_streams() -> None:
     """Of the standard streams, those that were closed when the process began (`>&-`) lead nowhere from now on.
 
     What is printed to them is lost, as whoever closed them asked for, and no file that is opened later gets it instead.
+    To those that are open, letters that their encoding lacks are printed by their number, as Python does with errors.
     """
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, name) is None:
@@ -56,6 +58,9 @@ def open_streams() -> None:
                 os.dup2(nowhere, number)
                 os.close(nowhere)
             setattr(sys, name, os.fdopen(number, mode))
+    out = sys.stdout
+    if isinstance(out, io.TextIOWrapper) and (out.errors == "strict" or not out.encoding.lower().startswith("utf")):
+        out.reconfigure(errors="backslashreplace")
 
 
 def reader_left() -> bool:

@@ -1,6 +1,7 @@
 """What the command line says of a line that is wrong, and of Ctrl-C."""
 
 import errno
+import io
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ from optimizer_runs import rendered_views, truth
 from unirender import cli
 from unirender.command_line import causes, interrupted, refused_by_system
 from unirender.files import write_png
+from unirender.process_ends import open_streams
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 
@@ -105,6 +107,18 @@ def test_closed_standard_streams_lead_nowhere(tmp_path: Path) -> None:
     script = '"$0" -m unirender decompose none.png --output y 2>&-; "$0" -m unirender --help >&-'
     run = subprocess.run(["sh", "-c", script, sys.executable], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+def test_letters_that_the_output_lacks_are_printed_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every terminal has the arrows of tables and the bullets of help; not every file's name is UTF-8."""
+    for encoding, errors in (("ascii", "strict"), ("latin-1", "surrogateescape"), ("utf-8", "strict")):
+        printed = io.BytesIO()
+        with io.TextIOWrapper(printed, encoding, errors) as output:
+            monkeypatch.setattr(sys, "stdout", output)
+            open_streams()
+            print("b\udcfc \u2191", flush=True)
+            assert printed.getvalue().decode(encoding).startswith("b\\udcfc ")
+        monkeypatch.undo()
 
 
 def test_a_missing_command_or_option_is_told_by_the_parser(capsys: pytest.CaptureFixture[str]) -> None:

@@ -195,15 +195,15 @@ def test_a_checkpoints_hash_is_of_weights_and_configuration(tmp_path: Path) -> N
 def test_headers_say_where_a_file_comes_from(tmp_path: Path) -> None:
     mask = np.ones((4, 4, 1), dtype=np.float32)
     intrinsics = Intrinsics(mask=mask, environment=np.ones((3, 4, 3), dtype=np.float32), camera=Camera(40))
-    meta = {"input": Path("private/mug.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
+    meta = {"input": Path("private/m\udcfcg.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
     with new_folder(tmp_path / "out") as folder:
         write_result(folder, intrinsics, meta, image_linear=np.ones((4, 4, 3), dtype=np.float32))
     for name in ("intrinsics.exr", "environment.exr", "image.exr"):
         _, attributes = read_exr(tmp_path / "out" / name)
-        expected = {"input": "mug.png", "seed": "3", "mode": "mean", "camera": "fov_deg=40 principal=0.5,0.5"}
+        expected = {"input": "m\\udcfcg.png", "seed": "3", "mode": "mean", "camera": "fov_deg=40 principal=0.5,0.5"}
         assert expected.items() <= attributes.items(), name
     record = json.loads((tmp_path / "out" / "meta.json").read_text())
-    assert record["input"] == str(Path("private/mug.png"))
+    assert record["input"] == "private/m\udcfcg.png", "a name that is no UTF-8 comes back"
     assert record["above_x_max"] == {"specular": {"count": 1}}
 
 
