@@ -1,5 +1,6 @@
 """Result folders: what is written reads back, and what goes wrong leaves nothing behind."""
 
+import errno
 import json
 import os
 import shutil
@@ -116,6 +117,9 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
 
     with pytest.raises(RuntimeError):
         fail_half_way()
+    with pytest.raises(OSError, match="full") as full, new_folder(out, overwrite=True):
+        raise OSError(errno.ENOSPC, "full")  # as Pillow raises it, without a name
+    assert full.value.filename == str(out)
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
