@@ -16,7 +16,9 @@ from unirender.errors import UnirenderError, UsageError
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
 LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
-OUT_OF_MEMORY = re.compile(r"can't allocate memory|out of memory", re.IGNORECASE)
+OUT_OF_MEMORY = re.compile(
+    r"can(?:'t|not) allocate memory|out of memory|failed to map segment from shared object", re.IGNORECASE
+)
 SYMLINK_LOOP = (
     "Symlink loop from "  # how a `RuntimeError` of `Path.resolve` begins; from Python 3.13 on it is an OSError
 )
@@ -134,9 +136,10 @@ def interrupted(error: BaseException) -> bool:
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Whether there was not enough memory: of the machine, or of its GPU; PyTorch has no class of its own for both."""
+    """Whether there was not enough memory: of the machine, or of its GPU; PyTorch has no class of its own for both, and
+    a library for which there was no room is an `ImportError`."""
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and OUT_OF_MEMORY.search(str(error)) is not None
+        isinstance(error, RuntimeError | ImportError) and OUT_OF_MEMORY.search(str(error)) is not None
     )
 
 
