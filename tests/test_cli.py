@@ -575,6 +575,8 @@ def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, capsys: p
         MemoryError("Unable to allocate 120. GiB for an array"),
         RuntimeError("[enforce fail at alloc_cpu.cpp:127] DefaultCPUAllocator: can't allocate memory: you tried"),
         RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+        RuntimeError("unable to mmap 21736176 bytes from file <x.safetensors>: Cannot allocate memory (12)"),
+        ImportError("libtorch_cpu.so: failed to map segment from shared object"),
     ],
 )
 def test_too_little_memory_is_no_internal_error(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,7 +69,7 @@ def read_conventions(folder: Path) -> Conventions:
         return Conventions()
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UnirenderError(f"{path}: not a readable TOML file ({error})") from None
     known = [field.name for field in fields(Conventions)]
     problems = [f"{path}: unknown key {key!r}, expected some of {', '.join(known)}" for key in data if key not in known]

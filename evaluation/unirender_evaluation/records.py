@@ -55,6 +55,8 @@ class Record:
             value = getattr(self, name)
             if not isinstance(value, str) or not value:
                 raise UnirenderError(f"record field {name!r}: got {value!r}, expected a non-empty string")
+        if not isinstance(self.key, str):
+            raise UnirenderError(f"record field 'key': got {self.key!r}, expected a string")
         for metric, value in self.values.items():
             if not _is_number(value):
                 raise _no_number(f"{self.table}/{self.method}/{self.sample}/{metric}", value)
@@ -82,7 +84,7 @@ class Record:
         """
         try:
             data = json.loads(line)
-        except json.JSONDecodeError as error:
+        except (ValueError, RecursionError) as error:  # no JSON, a number of thousands of digits, nested too deeply
             raise UnirenderError(f"not a JSON line: {line[:80]!r} ({error})") from error
         return cls.from_plain(data)
 
@@ -211,7 +213,7 @@ def read_run(path: Path) -> RunInfo:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise UnirenderError(f"cannot read the run's description from {path}: {error}") from error
     if not isinstance(data, dict) or data.get("schema") != SCHEMA_VERSION:
         got = data.get("schema") if isinstance(data, dict) else type(data).__name__

@@ -115,6 +115,8 @@ def read_document(path: Path) -> Any:
         raise UnirenderError(f"{path}: is nested too deeply to be results") from None
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}") from None
+    except ValueError as error:  # a whole number of thousands of digits
+        raise UnirenderError(f"{path}: holds a number that cannot be read ({error})") from None
 
 
 def from_document(document: Any, source: str) -> Results:

@@ -56,8 +56,10 @@ class BenchShards:
         self.check()
         from rich.console import Console
 
-        from unirender.whole_files import replace_file
         from unirender_evaluation.shard_scores import minus, shard_tables
+        from unirender_reference.measure.output import check_file, write_file
+
+        check_file("--out", self.out)
 
         console = Console()
         name, found = self._scored(self.checkpoint)
@@ -69,7 +71,7 @@ class BenchShards:
         for table in tables:
             table.show(console)
         if self.out is not None:
-            replace_file(self.out, "\n".join(table.markdown() for table in tables))
+            write_file("--out", self.out, "\n".join(table.markdown() for table in tables))
         return 0
 
     def _scored(self, named: Path | None) -> "tuple[str, list[Scored]]":

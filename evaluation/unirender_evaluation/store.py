@@ -7,12 +7,14 @@ resumes.
 
 import hashlib
 import json
+import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from unirender.errors import UnirenderError
 from unirender_evaluation.records import Record, append_record, write_records
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import SEPARATOR
@@ -56,14 +58,13 @@ class Store:
         Args:
             path: of `records.jsonl`.
             mend: cuts off half a line that a killed run left; without, nothing is written.
+
+        Raises:
+            UnirenderError: a line is no record, or a file cannot be read.
         """
         store = cls(path)
         for file in (store.unused_path, path):
-            text = file.read_text(encoding="utf-8") if file.exists() else ""
-            complete = text[: text.rfind("\n") + 1]  # a killed run may leave half a line
-            store.known |= {record.key: record for record in map(Record.from_json, complete.splitlines())}
-            if mend and complete != text:
-                file.write_text(complete, encoding="utf-8")
+            store.known |= {record.key: record for record in _kept(file, mend)}
         return store
 
     def has(self, key: str) -> bool:
@@ -110,6 +111,24 @@ class Store:
                     continue
             kept.append(record)
         return kept[::-1]
+
+
+def _kept(file: Path, mend: bool) -> Iterator[Record]:
+    """The records of a file, if it is there, but for half a line at its end."""
+    try:
+        data = file.read_bytes() if file.exists() else b""
+    except OSError as error:
+        raise UnirenderError(f"{file}: cannot be read ({error.strerror}), expected a file of records") from error
+    complete = data[: data.rfind(b"\n") + 1]
+    for number, line in enumerate(complete.splitlines(), start=1):
+        try:
+            yield Record.from_json(line.decode())
+        except ValueError as error:
+            raise UnirenderError(
+                f"{file}, line {number}: {error}; restore the file, or delete that line to measure its value again"
+            ) from error
+    if mend and complete != data:
+        os.truncate(file, len(complete))  # and not written anew: a run that is killed meanwhile would lose all
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,7 @@ def read_text(path: Path) -> str:
         UnirenderError: it is not there, or no text.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise UnirenderError(
             f"no suite file {path}: expected a TOML file like the package's data/suites/tiny.toml"
@@ -179,7 +179,7 @@ def parse_spec(text: str, path: Path) -> SuiteSpec:
     """
     try:
         flat = _flat(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # no TOML, a number of thousands of digits, nested too deeply
         raise UnirenderError(f"{path} is not TOML: {error}") from None
     fields = {name: f for name, f in SuiteSpec.__dataclass_fields__.items() if name != "path"}
     required = {name for name in fields if name not in _OPTIONAL}

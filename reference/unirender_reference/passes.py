@@ -29,6 +29,7 @@ NAN_ATTEMPTS = 8
 PIXELS_PER_BLOCK = 1 << 13
 MOST_KEPT = 32  # passes, or means of groups of them, in memory
 PIXELS_KEPT = 1 << 25  # in memory, of all of them: of pictures above 1024 x 1024 fewer than `MOST_KEPT` are kept
+MOST_PASSES = 1_000_000  # of one image: more take days, and finding how to divide them takes long, too
 MOST_SPLITS = 8  # passes to make of one that is no full grid: small passes are hardly stratified
 
 Picture = Float[np.ndarray, "h w c"]
@@ -242,13 +243,15 @@ def pass_count(spp: int, batches: int, most: int) -> int:
         most: largest number of samples per pixel in one pass.
 
     Raises:
-        UnirenderError: fewer samples than batches, or more than `MOST_SPLITS` times as many passes as `batches` and
-            `most` ask for (67 samples in one batch are 67 passes of one sample).
+        UnirenderError: fewer samples than batches, more than `MOST_PASSES`, or more than `MOST_SPLITS` times as many as
+            `batches` and `most` ask for (67 samples in one batch are 67 passes of one sample).
     """
     if not isinstance(spp, Integral):
         raise UnirenderError(f"spp: got {spp!r:.60}, expected a whole number of samples, at least 1")
     if spp < 1 or batches < 1 or batches > spp:
         raise UnirenderError(f"spp: got {spp} in {batches} batches, expected at least one sample in each")
+    if spp > (limit := MOST_PASSES * max(most, 1)):
+        raise UnirenderError(f"spp: got {spp}, expected at most {limit:,}, which {MOST_PASSES:,} passes take")
     if (count := _grid_passes(spp, batches, most)) is not None:
         return count
     below = next(n for n in range(spp - 1, 0, -1) if n < batches or _grid_passes(n, batches, most) is not None)

@@ -22,11 +22,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import Ended, causes, interrupted, out_of_memory, parse
+from unirender.command_line import Ended, causes, interrupted, out_of_memory, parse, refused_by_system
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.notices import NoticeHandler, notice
-from unirender.process_ends import READER_LEFT, drop_output, end, quick_start, reader_left
+from unirender.process_ends import READER_LEFT, drop_output, end, open_streams, quick_start, reader_left
 from unirender.training.average import Average
 from unirender.training.calibrate import Calibrate
 from unirender.training.command import Train
@@ -209,6 +209,8 @@ def main(argv: list[str] | None = None) -> None:
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv
+    if argv is None:
+        open_streams()
     command = None
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
@@ -258,6 +260,7 @@ def refuse(error: BaseException) -> int:
             f"not enough memory{said}; expected a machine with more, or less asked for at a time: smaller pictures or "
             "batches, fewer samples, looks or workers"
         )
+    error = refused_by_system(error) or error
     kind = "" if isinstance(error, UnirenderError) else f"internal error: {type(error).__name__}: "
     hint = "" if isinstance(error, UnirenderError) else " (UNIRENDER_DEBUG=1 shows where)"
     notice(f"error: {kind}{' '.join(str(error).split())}{hint}")

@@ -114,7 +114,8 @@ def exr_bytes(
         stored[name] = np.ascontiguousarray(value, dtype=np.float16 if half else np.float32)
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for key, value in (attributes or {}).items():
-        header[key if key.startswith(ATTRIBUTE_PREFIX) else ATTRIBUTE_PREFIX + key] = str(value)
+        text = str(value).encode(errors="backslashreplace").decode()  # the name of a file need not be UTF-8
+        header[key if key.startswith(ATTRIBUTE_PREFIX) else ATTRIBUTE_PREFIX + key] = text
     stream = io.BytesIO()
     OpenEXR.File(header, stored, num_threads=0).write(stream)
     return stream.getvalue()

@@ -39,7 +39,7 @@ from unirender.exr import (
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender.vectors import nonzero
-from unirender.whole_files import move_into_place
+from unirender.whole_files import move_into_place, naming
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 SUMMARY_FILE = "summary.json"  # of a folder of results
@@ -92,7 +92,8 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[P
             temporary.mkdir(mode=0o700)
         except OSError as error:
             raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
-        yield temporary
+        with naming(Path(shown)):
+            yield temporary
         os.chmod(temporary, 0o755)
         try:
             move_into_place(temporary, path)

@@ -26,7 +26,7 @@ from unirender.files import (
     write_result,
 )
 from unirender.intrinsics import MAPS
-from unirender.pictures import Picture
+from unirender.pictures import Picture, checked_file
 from unirender.whole_files import replace_file
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ def input_sha256(path: Path, mask: Path | None) -> str:
     digest = hashlib.sha256()
     for file in filter(None, (path, mask)):
         try:
-            digest.update(file.read_bytes())
+            digest.update(checked_file(file).read_bytes())
         except OSError as error:
             raise UnirenderError(f"{file}: cannot be read ({error.strerror})") from error
     return digest.hexdigest()
@@ -238,6 +238,8 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
     try:
         stored = json.loads((folder / META_FILE).read_text())
     except (OSError, ValueError):
+        return None
+    if not isinstance(stored, dict):
         return None
     now = json.loads(json.dumps(dict(meta), default=str))
     differing = [

@@ -73,13 +73,15 @@ def checked_file(path: str | Path) -> Path:
     """The path.
 
     Raises:
-        UnirenderError: there is no such file.
+        UnirenderError: there is no such file, or it is none.
     """
     path = Path(path)
     if not path.exists():
         raise UnirenderError(f"{path}: no such file, expected a picture: {FORMATS}")
     if path.is_dir():
         raise UnirenderError(f"{path}: is a folder, expected a picture: {FORMATS}")
+    if not path.is_file():  # which would wait for who writes to it, and cannot be read twice
+        raise UnirenderError(f"{path}: is a pipe or a device, expected a picture: {FORMATS}; save it as a file first")
     return path
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import io
 import os
 import select
 import signal
@@ -42,6 +43,24 @@ def end(number: int, frame: FrameType | None) -> None:
     for each in (signal.SIGTERM, signal.SIGHUP):  # `timeout` sends it to the process and to its group
         signal.signal(each, signal.SIG_IGN)
     raise Ended(number)
+
+
+def open_streams() -> None:
+    """Of the standard streams, those that were closed when the process began (`>&-`) lead nowhere from now on.
+
+    What is printed to them is lost, as whoever closed them asked for, and no file that is opened later gets it instead.
+    To those that are open, letters that their encoding lacks are printed by their number, as Python does with errors.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            nowhere = os.open(os.devnull, os.O_RDWR)
+            if nowhere != number:
+                os.dup2(nowhere, number)
+                os.close(nowhere)
+            setattr(sys, name, os.fdopen(number, mode))
+    out = sys.stdout
+    if isinstance(out, io.TextIOWrapper) and (out.errors == "strict" or not out.encoding.lower().startswith("utf")):
+        out.reconfigure(errors="backslashreplace")
 
 
 def reader_left() -> bool:

@@ -50,6 +50,21 @@ def test_values_outside_their_range(
     assert not any(tmp_path.iterdir())
 
 
+def test_an_output_that_cannot_be_written_is_told_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    for command, out in (
+        (["figures"], tmp_path / "file"),
+        (["bench", "physics"], tmp_path / "file"),
+        (["bench", "shards", "--data", str(tmp_path)], tmp_path),
+    ):
+        status, printed = refused([*command, "--out", str(out)], capsys)
+        assert status == 1
+        assert printed.startswith(f"unirender: error: {'--out ' if out == tmp_path else ''}{out}: ")
+        assert "is no folder" in printed or "is a folder, expected the name of a file" in printed
+
+
 @pytest.mark.parametrize("command", [["run"], ["report", "run"], ["tables", "results.json"]])
 def test_a_word_that_no_axis_of_a_variant_has(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--variant", "masked-linear", "--variant", "whole-shiny"]

@@ -51,6 +51,19 @@ def test_a_process_that_dies_costs_its_job_alone() -> None:
         assert worker.run(demo_jobs.add, 2) == 42
 
 
+def test_whoever_is_interrupted_while_it_starts_leaves_no_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    worker, ended = Worker(demo_jobs.start, seconds=60), []
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(worker, "_begin", interrupt)
+    monkeypatch.setattr(worker, "_end", lambda: ended.append(True))
+    with pytest.raises(KeyboardInterrupt), worker:
+        pass
+    assert ended
+
+
 def test_whoever_cannot_start_says_why() -> None:
     with pytest.raises(UnirenderError, match="no checkpoint"), Worker(demo_jobs.no_start, seconds=60):
         pass

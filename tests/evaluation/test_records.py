@@ -19,6 +19,7 @@ from unirender_evaluation.records import (
     write_records,
     write_run,
 )
+from unirender_evaluation.store import Store
 
 
 def record(sample: str = "a", **changes: Any) -> Record:
@@ -90,6 +91,7 @@ def test_one_measurement_twice_is_an_error(tmp_path: Path) -> None:
         ('{"table": "inverse"}', "line 1"),
         (record().to_json().replace('"subset"', '"subste"'), "subste"),
         (record().to_json().replace("21.5", '"good"'), "expected a number"),
+        (record().to_json().replace("21.5", "9" * 5000), "line 1: not a JSON line"),
     ],
 )
 def test_bad_lines_are_named(tmp_path: Path, line: str, match: str) -> None:
@@ -113,3 +115,25 @@ def test_another_schema_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"schema": 1', '"schema": 0'))
     with pytest.raises(UnirenderError, match="got schema 0, expected 1"):
         read_run(path)
+
+
+def test_what_a_killed_run_left_is_kept_and_a_broken_line_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "records.jsonl"
+    write_records(path, [record("a"), record("b", key="01")])
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"table": "inv')
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("written anew: a run that is killed meanwhile would lose all records")
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    assert len(Store.open(path).known) == 2
+    monkeypatch.undo()
+    assert path.read_bytes() == whole
+    for line in (b"\xff\x00", b"{}"):
+        path.write_bytes(whole + line + b"\n")
+        with pytest.raises(UnirenderError, match=r"records.jsonl, line 3: .*delete that line"):
+            Store.open(path)

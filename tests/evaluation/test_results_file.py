@@ -84,6 +84,7 @@ def test_nothing_invalid_is_written(tmp_path: Path) -> None:
         ("a.json", b'{"format": NaN}', "has the number NaN, which JSON does not know"),
         ("a.json", b'{"format": 1, "format": 2}', "an object has the field 'format' twice"),
         ("a.json", b"[" * 100_000, "nested too deeply"),
+        ("a.json", b"9" * 5000, "a.json: holds a number that cannot be read"),
         ("a.json", b"[1]", "format: got a list, expected 'unirender-results': is this the results.json of"),
         ("a.json", b'{"runs": []}', "format: got None"),
         (

@@ -85,9 +85,12 @@ def test_broken_suite_files_are_named(tmp_path: Path) -> None:
         suite_path("no-such-suite")
     with pytest.raises(UnirenderError, match="no suite file"):
         read_spec(tmp_path / "none.toml")
-    (tmp_path / "broken.toml").write_text("name = ")
-    with pytest.raises(UnirenderError, match="is not TOML"):
-        read_spec(tmp_path / "broken.toml")
+    for text in ("name = ", f"name = {'9' * 5000}", f"name = {'[' * 3000}"):
+        (tmp_path / "broken.toml").write_text(text)
+        with pytest.raises(UnirenderError, match="is not TOML"):
+            read_spec(tmp_path / "broken.toml")
+    (tmp_path / "marked.toml").write_bytes((suite_path("tiny").read_text().replace("\n", "\r\n")).encode("utf-8-sig"))
+    assert read_spec(tmp_path / "marked.toml") == read_spec("tiny"), "as editors on Windows write it"
     (tmp_path / "short.toml").write_text('name = "x"\nwrong = 1\n')
     with pytest.raises(UnirenderError, match=r"missing keys: .*unknown keys: wrong"):
         read_spec(tmp_path / "short.toml")

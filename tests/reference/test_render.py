@@ -302,6 +302,13 @@ def test_samples_that_fall_apart_into_many_passes_are_refused(spp: int, batches:
         assert passes.pass_count(better, batches, most) <= passes.MOST_SPLITS * batches
 
 
+def test_more_passes_than_anybody_waits_for_are_refused_at_once() -> None:
+    """Finding how to divide them would take as long."""
+    with pytest.raises(UnirenderError, match=r"spp: got 1\d+, expected at most 64,000,000, "):
+        passes.pass_count(10**20, 1, 64)
+    assert passes.pass_count(64 * passes.MOST_PASSES, 1, 64) == passes.MOST_PASSES
+
+
 def test_small_passes_that_the_wavefront_asks_for_are_not_refused() -> None:
     assert passes.pass_count(67, 1, 1) == 67
 

@@ -1,5 +1,7 @@
 """What the command line says of a line that is wrong, and of Ctrl-C."""
 
+import errno
+import io
 import os
 import signal
 import subprocess
@@ -13,8 +15,9 @@ import pytest
 from optimizer_runs import rendered_views, truth
 
 from unirender import cli
-from unirender.command_line import causes, interrupted
+from unirender.command_line import causes, interrupted, refused_by_system
 from unirender.files import write_png
+from unirender.process_ends import open_streams
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 
@@ -46,6 +49,14 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
             ["bench", "warm-start", "--single.steps", "1"],
             "--single.steps 1, --single.noise 0.1 0.05 0.025: expected as many numbers in both, a pair for each stage",
         ),
+        (  # the picture would be the folder that one is in
+            ["decompose", "", "--output", "y"],
+            "after decompose: got an empty word, expected a value; is a variable of the shell not set?",
+        ),
+        (
+            ["bench", "run", "--out="],
+            "--out=: got an empty word, expected a value; is a variable of the shell not set?",
+        ),
     ],
 )
 def test_what_a_command_does_not_take(arguments: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -57,6 +68,57 @@ def test_what_the_machine_does_not_have(capsys: pytest.CaptureFixture[str]) -> N
     status, line = said(capsys, "optimize", "x", "--out", "y", "--shape.cells", "100000")
     assert status == 1
     assert line.startswith("unirender: error: --shape.cells 100000: would take about 167,643,093 GiB of memory")
+
+
+def test_what_the_system_refuses(capsys: pytest.CaptureFixture[str]) -> None:
+    """No error of ours: one sentence that says what to do, whatever command and file it is."""
+    long = "a" * 300
+    refused = f"{long}: cannot be read or written ({os.strerror(errno.ENAMETOOLONG)}); shorten the name"
+    assert said(capsys, "bench", "tables", long) == (1, f"unirender: error: {refused}\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.ENOSPC, "No space left"), "a file or the standard output: cannot be read or written (No space"),
+        (PermissionError(errno.EACCES, "Denied", b"x.png"), "x.png: cannot be read or written (Denied); allow it"),
+        (FileNotFoundError(errno.ENOENT, "No such file"), None),  # where we looked for it ourselves
+        (
+            RuntimeError("Symlink loop from '/a/b'"),
+            "/a/b: cannot be read or written (Too many levels of symbolic links",
+        ),
+        (RuntimeError("Symlink"), None),
+    ],
+)
+def test_an_error_of_the_system_and_one_of_ours(error: Exception, line: str | None) -> None:
+    said = refused_by_system(error)
+    assert said is None if line is None else str(said).startswith(line)
+
+
+def test_a_folder_that_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    assert "is not there any more" in str(refused_by_system(FileNotFoundError(errno.ENOENT, "No such file")))
+    tmp_path.mkdir()
+
+
+def test_closed_standard_streams_lead_nowhere(tmp_path: Path) -> None:
+    """Neither does printing fail, nor do errors go to where results are expected."""
+    script = '"$0" -m unirender decompose none.png --output y 2>&-; "$0" -m unirender --help >&-'
+    run = subprocess.run(["sh", "-c", script, sys.executable], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
+def test_letters_that_the_output_lacks_are_printed_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every terminal has the arrows of tables and the bullets of help; not every file's name is UTF-8."""
+    for encoding, errors in (("ascii", "strict"), ("latin-1", "surrogateescape"), ("utf-8", "strict")):
+        printed = io.BytesIO()
+        with io.TextIOWrapper(printed, encoding, errors) as output:
+            monkeypatch.setattr(sys, "stdout", output)
+            open_streams()
+            print("b\udcfc \u2191", flush=True)
+            assert printed.getvalue().decode(encoding).startswith("b\\udcfc ")
+        monkeypatch.undo()
 
 
 def test_a_missing_command_or_option_is_told_by_the_parser(capsys: pytest.CaptureFixture[str]) -> None:

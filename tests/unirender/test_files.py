@@ -1,5 +1,6 @@
 """Result folders: what is written reads back, and what goes wrong leaves nothing behind."""
 
+import errno
 import json
 import os
 import shutil
@@ -116,6 +117,9 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
 
     with pytest.raises(RuntimeError):
         fail_half_way()
+    with pytest.raises(OSError, match="full") as full, new_folder(out, overwrite=True):
+        raise OSError(errno.ENOSPC, "full")  # as Pillow raises it, without a name
+    assert full.value.filename == str(out)
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
     with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
@@ -195,15 +199,15 @@ def test_a_checkpoints_hash_is_of_weights_and_configuration(tmp_path: Path) -> N
 def test_headers_say_where_a_file_comes_from(tmp_path: Path) -> None:
     mask = np.ones((4, 4, 1), dtype=np.float32)
     intrinsics = Intrinsics(mask=mask, environment=np.ones((3, 4, 3), dtype=np.float32), camera=Camera(40))
-    meta = {"input": Path("private/mug.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
+    meta = {"input": Path("private/m\udcfcg.png"), "seed": 3, "mode": "mean", "above_x_max": {"specular": {"count": 1}}}
     with new_folder(tmp_path / "out") as folder:
         write_result(folder, intrinsics, meta, image_linear=np.ones((4, 4, 3), dtype=np.float32))
     for name in ("intrinsics.exr", "environment.exr", "image.exr"):
         _, attributes = read_exr(tmp_path / "out" / name)
-        expected = {"input": "mug.png", "seed": "3", "mode": "mean", "camera": "fov_deg=40 principal=0.5,0.5"}
+        expected = {"input": "m\\udcfcg.png", "seed": "3", "mode": "mean", "camera": "fov_deg=40 principal=0.5,0.5"}
         assert expected.items() <= attributes.items(), name
     record = json.loads((tmp_path / "out" / "meta.json").read_text())
-    assert record["input"] == str(Path("private/mug.png"))
+    assert record["input"] == "private/m\udcfcg.png", "a name that is no UTF-8 comes back"
     assert record["above_x_max"] == {"specular": {"count": 1}}
 
 

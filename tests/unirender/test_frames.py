@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,12 @@ def test_pictures_in_natural_order(tmp_path: Path) -> None:
         list_pictures(tmp_path / "folder.png")
     Image.new("RGB", (12, 10)).save(tmp_path / "folder.png" / "a.gif")
     (tmp_path / "folder.png" / "b.png").symlink_to(tmp_path / "nowhere.png")
-    found = list_pictures(tmp_path / "folder.png")
-    assert [path.name for path in found] == ["a.gif", "b.png"]
-    assert "b.png: cannot be read" in run(found, tmp_path / "out").failed["b.png"]
+    os.mkfifo(tmp_path / "folder.png" / "c.png")  # to which nobody writes: not waited for
+    pictures = list_pictures(tmp_path / "folder.png")
+    assert [path.name for path in pictures] == ["a.gif", "b.png", "c.png"]
+    found = run(pictures, tmp_path / "out")
+    assert "b.png: no such file" in found.failed["b.png"]
+    assert "c.png: is a pipe or a device" in found.failed["c.png"]
     with pytest.raises(UnirenderError, match=r"is a result, whose pictures are maps, .*`unirender render`"):
         list_pictures(tmp_path / "out" / "a.gif")
 
@@ -126,6 +130,8 @@ def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path
     fresh = run(pictures, tmp_path / "out", settings=SETTINGS | {"seed": 1}, overwrite=True)
     assert (fresh.kept, len(fresh.figures), fresh.failed) == (0, 2, {})
     assert figures_of(tmp_path / "out" / "c.png", SETTINGS) is None
+    (tmp_path / "out" / "a.png" / "meta.json").write_text("[]")
+    assert figures_of(tmp_path / "out" / "a.png", SETTINGS) is None
 
 
 def test_of_another_mask_the_result_is_another(tmp_path: Path) -> None:

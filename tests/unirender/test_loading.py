@@ -13,6 +13,7 @@ from safetensors.numpy import load_file, save_file
 from tiny_models import make_pipeline
 
 from unirender.errors import UnirenderError
+from unirender.pipelines.loading import reading
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 WEIGHTS = "dual_stream/diffusion_pytorch_model.safetensors"
@@ -120,3 +121,10 @@ def test_what_a_setting_of_ours_says_is_said_as_it_is(folder: Path) -> None:
 def test_the_package_runs_as_a_module() -> None:
     done = subprocess.run([sys.executable, "-m", "unirender", "--help"], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("usage: unirender [-h]")
+
+
+def test_too_little_memory_is_no_damaged_file(tmp_path: Path) -> None:
+    (tmp_path / "model_index.json").write_text("{}")
+    for error in (MemoryError(), RuntimeError("unable to mmap 9 bytes from file <x>: Cannot allocate memory (12)")):
+        with pytest.raises(type(error)), reading(tmp_path):
+            raise error

@@ -47,8 +47,12 @@ class Worker:
         Raises:
             UnirenderError: `start` did.
         """
-        with self._lock:
-            self._begin()
+        try:
+            with self._lock:
+                self._begin()
+        except BaseException:  # an interrupt, too: the process would be left alone, and print what it makes of that
+            self._end()
+            raise
         return self
 
     def __exit__(

@@ -12,6 +12,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.notices import notice
 from unirender.option_checks import at_least
 from unirender.options import Device
+from unirender.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -90,6 +91,7 @@ class Figures:
     def run(self) -> int:
         """Draws, and prints a line for each figure; returns the exit status."""
         self.check()
+        check_out(self.out)
         from rich.console import Console
 
         from unirender_evaluation.figures.grid import Grid, save

@@ -6,6 +6,7 @@ from pathlib import Path
 from unirender.errors import UnirenderError
 from unirender.option_checks import at_least
 from unirender.options import Device
+from unirender.writing import check_out
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class BenchPhysics:
     def run(self) -> int:
         """Returns 1 where a test does not refuse its twin."""
         self.check()
+        check_out(self.out)
         from rich.progress import track
 
         from unirender_evaluation.bench_config import BenchConfig, build_rows

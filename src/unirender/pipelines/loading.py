@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
+from unirender.command_line import out_of_memory
 from unirender.errors import UnirenderError
 from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
@@ -41,7 +42,7 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
 
 @contextlib.contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """What goes wrong while a pipeline folder is read is an error about the folder.
+    """What goes wrong while a pipeline folder is read is an error about the folder, but for too little memory.
 
     Raises:
         UnirenderError: anything did.
@@ -52,6 +53,8 @@ def reading(path: Path) -> Iterator[None]:
     except (UnirenderError, MemoryError):
         raise
     except Exception as error:  # diffusers and safetensors raise half a dozen kinds for a broken file
+        if out_of_memory(error):
+            raise
         advice = "; if the files are damaged, copy the folder again" if isinstance(error, OF_FILES) else ""
         raise UnirenderError(f"{path}: cannot be read as a checkpoint ({one_line(error)}){advice}") from error
 
