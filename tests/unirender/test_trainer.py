@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from synthetic_shards import write_dataset
+from synthetic_shards import group_members, maps_members, write_dataset, write_shard
 from tiny_models import TRAIN, make_batch, make_pipeline
 from torch import Tensor, nn
 
@@ -262,6 +262,20 @@ def test_run_on_shards_writes_what_it_says(tmp_path: Path) -> None:
     assert pipeline.dtype == torch.float32
     weight = trainer.ema.average["image_unet.conv_in.weight"].half().float()
     assert torch.equal(pipeline.dual_stream.image_unet.conv_in.weight, weight)
+
+
+def test_a_pipeline_answers_with_maps_if_it_was_trained_on_maps(tmp_path: Path) -> None:
+    """Their mean over the object would be wrong everywhere; maps beside objects of one value make no difference."""
+    for name, groups in {
+        "scalar": {"a_g0": group_members("independent", 32, 1, (40,), (50,), 0)},
+        "mixed": {"a_g0": group_members("independent", 32, 1, (40,), (50,), 0), "b_g0": maps_members(32, 1, 1)},
+    }.items():
+        (tmp_path / name).mkdir()
+        write_shard(tmp_path / name / "shard-000000.tar", groups)
+        trainer = Trainer(TRAIN, RunConfig(tmp_path / f"run-{name}", steps=1), CPU, torch.float32)
+        trainer.source = ShardSource(tmp_path / name, TRAIN.batch_size, TRAIN.seed)
+        found = UniRenderPipeline.from_pretrained(export_pipeline(trainer, tmp_path / f"run-{name}" / "pipeline"))
+        assert found.config["material"] == {"scalar": "scalar", "mixed": "map"}[name]
 
 
 def scores_in_turn(values: list[float], higher_is_better: bool) -> tuple[Validate, list[UniRenderPipeline]]:

@@ -122,6 +122,11 @@ class GroupDataset:
         """Stored pictures."""
         return sum(len(group.pairs) for _, group in self._groups)
 
+    @property
+    def has_material_maps(self) -> bool:
+        """Whether roughness and metallic of some pictures are maps, not one value over the object."""
+        return any(pair.roughness is None for _, group in self._groups for pair in group.pairs)
+
     def __len__(self) -> int:
         """Items, the samples of an epoch: basis groups count once, other groups by their pairs."""
         return len(self._items)
