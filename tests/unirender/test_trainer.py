@@ -50,7 +50,7 @@ from unirender.training.run import train
 from unirender.training.source import ShardSource
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import Trainer, learning_rate
-from unirender.training.validation import Validate
+from unirender.training.validation import Validate, Validation
 
 CPU = torch.device("cpu")
 OVERFIT_STEPS = 150
@@ -346,6 +346,33 @@ def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> Non
         (tmp_path / "best" / "training.json").write_text(broken)
         with pytest.raises(UnirenderError, match=r"training\.json: cannot be read as the record of a training"):
             other.fit(SyntheticSource(), validate=scores_in_turn([1.0], higher_is_better=True)[0])
+
+
+def test_the_best_on_other_scenes_is_not_compared(tmp_path: Path) -> None:
+    """The best of an easy suite would stay for ever; and a run that goes on may be scored on others (`--validate`)."""
+    facts: dict[str, Any] = {"train": dataclasses.asdict(TRAIN), "scored_on": "4 scenes of the suite tiny"}
+    (tmp_path / "best").mkdir()
+    (tmp_path / "best" / "training.json").write_text(json.dumps(facts))
+    (tmp_path / STATE_FILE).touch()  # of a run that goes on; nobody reads it before
+
+    def trainer(scored_on: str | None) -> Trainer:
+        run = RunConfig(tmp_path, 1, keep_best="error", scored_on=scored_on)
+        return Trainer(TRAIN, run, CPU, torch.float32)
+
+    validate, _ = scores_in_turn([], higher_is_better=True)
+    for same in (facts["scored_on"], None):
+        Validation(validate, "error").begin(trainer(same))
+    with pytest.raises(UnirenderError, match=r"best on 4 .* expected 8 .*: scores on other scenes cannot be compared"):
+        trainer("8 scenes of the suite tiny").fit(SyntheticSource(), validate=validate)
+
+
+def test_a_run_that_is_over_is_scored_once(tmp_path: Path) -> None:
+    over = Trainer(TRAIN, RunConfig(tmp_path, steps=1), CPU, torch.float32)
+    over.step = 1
+    over.save(SyntheticSource())
+    validate, shown = scores_in_turn([1.0, 2.0], higher_is_better=True)
+    fit(tmp_path, 1, validate)
+    assert len(shown) == 1
 
 
 def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:

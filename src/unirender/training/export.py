@@ -87,6 +87,9 @@ def export_pipeline(
     pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
     facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}
     chosen = json.loads(beside[SCORES_FILE]) if SCORES_FILE in beside else None
+    if chosen is not None:  # the log may have other scores of this step, on other scenes
+        facts["scores"] = {name: score["value"] for name, score in chosen["scores"].items()}
+        facts |= {} if trainer.run.scored_on is None else {"scored_on": trainer.run.scored_on}
     try:
         with writing(folder):
             pipeline.save_pretrained(partial, safe_serialization=True)
