@@ -179,6 +179,8 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     assert stopped.read_bytes() == whole.read_bytes()
     steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1, 2, 3, 4]
+    stopped.unlink()  # as if the disk had been full after the last state
+    assert train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options)).read_bytes() == whole.read_bytes()
     with pytest.raises(UnirenderError, match="other batch_size; repeat the options"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 

@@ -97,6 +97,8 @@ def train_visibility(options: TrainVisibility) -> Path:
 
     items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
     run = _Run(options, *split(items), shards)
+    if run.step == options.steps:
+        run.write_weights()  # it may have ended between its state and them
     saved = time.monotonic()
     with stopping_gently() as stop:
         while run.step < options.steps and not stop.asked:
@@ -194,24 +196,30 @@ class _Run:
 
     def keep(self) -> None:
         """Saves the state and the averaged weights, and what they score."""
-        from safetensors.torch import save
-
-        from unirender.models.visibility import VisibilityNet
         from unirender.training.checkpoint import save_state
         from unirender.training.visibility_loss import mean, validate
-        from unirender.whole_files import replace_file
 
         parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
         state = {name: part.state_dict() for name, part in parts.items()}
         save_state(self.options.out, {**state, "step": self.step, "options": self.asked})
+        shown = self.write_weights()
+        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
+        self.losses.clear()
+        self._tell(means | validate(shown, self.held_out, self.options.seed))
+
+    def write_weights(self) -> "VisibilityNet":
+        """Writes the averaged weights; a network that has them."""
+        from safetensors.torch import save
+
+        from unirender.models.visibility import VisibilityNet
+        from unirender.whole_files import replace_file
+
         shown = channels_last(VisibilityNet())
         self.ema.copy_to(shown)
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
         with writing(path := self.options.out / WEIGHTS_FILE):
             replace_file(path, save(halves))
-        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
-        self.losses.clear()
-        self._tell(means | validate(shown, self.held_out, self.options.seed))
+        return shown
 
     def _tell(self, values: Mapping[str, float]) -> None:
         line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
