@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
+from unirender.notices import notice
 from unirender.option_checks import check_seed
 from unirender.training.command import Alone
 from unirender.writing import check_out, writing
@@ -92,9 +93,12 @@ def train_visibility(options: TrainVisibility) -> Path:
         UnirenderError: broken data, or the folder holds a run of other options or data.
         Ended: it was asked to stop.
     """
+    from unirender.training.groups import unread_shards
     from unirender.training.stopping import stopping_gently
     from unirender.training.visibility_data import read_items
 
+    if unread := unread_shards(options.data):
+        notice(unread)
     items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
     run = _Run(options, *split(items), shards)
     if run.step == options.steps:
