@@ -530,9 +530,12 @@ def test_a_run_that_fails_ends_its_threads(tmp_path: Path, capsys: pytest.Captur
             raise RuntimeError
         return {"error": Score(1.0, higher_is_better=False)}
 
-    options = Train(data=data, steps=1, parallel=1, device="cpu")
+    options = Train(data=data, steps=1, parallel=1, device="cpu", batch_size=2, seed=7)
     with pytest.raises(RuntimeError) as stopped:
         train(options, TRAIN, tmp_path / "run", fail_at_the_end)
+    written = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (written["train"]["batch_size"], written["train"]["seed"]) == (2, 7)  # of the options, as in the command
+    assert written["run"]["preset"] is None  # the configuration is not that of the row `tiny`
     assert stopped.tb  # keeps the reader, whose threads end with it
     assert not {thread.name for thread in set(threading.enumerate()) - before}
     assert ", one pass at a time\n" in capsys.readouterr().out
