@@ -242,9 +242,14 @@ def channels_last(net: "VisibilityNet") -> "VisibilityNet":
 
 
 def split(items: "Sequence[VisibilityItem]") -> "tuple[list[VisibilityItem], list[VisibilityItem]]":
-    """The objects to learn from, and those that are held out (of less than `HELD_OUT`, the last one)."""
-    held_out = [items[i] for i in range(HELD_OUT - 1, len(items), HELD_OUT)] or [items[-1]]
-    own = [item for item in items if not any(item is other for other in held_out)]
+    """The objects to learn from, and those that are held out (of less than `HELD_OUT`, the last one).
+
+    All views of one object are on one side.
+    """
+    names = [item.object or str(number) for number, item in enumerate(items)]
+    objects = list(dict.fromkeys(names))
+    apart = set(objects[HELD_OUT - 1 :: HELD_OUT] or objects[-1:])
+    own, held_out = ([i for i, name in zip(items, names, strict=True) if (name in apart) == side] for side in (0, 1))
     return own or list(items), held_out
 
 
