@@ -79,6 +79,7 @@ def _train(
 
     from unirender.models.precision import resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
+    from unirender.training.closed_form_check import doubt
     from unirender.training.export import export_pipeline
     from unirender.training.groups import split_of, unread_shards
     from unirender.training.live import live_report
@@ -112,6 +113,8 @@ def _train(
             say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
             if unread := unread_shards(options.data):
                 tell(unread)
+            if doubtful := doubt(data):
+                tell(doubtful)
             if split_of(options.data) == "test":
                 tell(f"{options.data}: was rendered with --split test; what is trained on it cannot be tested on it")
     del data  # a folder that grew is opened anew: not both at once
