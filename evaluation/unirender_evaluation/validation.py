@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from unirender.errors import UsageError
 from unirender.score import Score
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, metric_key
 from unirender_evaluation.scoring import score_image, score_maps
@@ -32,8 +33,11 @@ def suite_validation(suite: str = "tiny", scenes: int = 4) -> Callable[[Any], di
 
     Raises:
         UnirenderError: no such suite, or no scene.
+        UsageError: it has fewer scenes.
     """
     loaded = load_suite(suite)
+    if scenes > (there := len(loaded.scenes)):
+        raise UsageError(f"--validate {scenes}: the suite {suite} has {there} scenes, expected at most as many")
     chosen = scene_ids(loaded, scenes)
 
     def validate(pipeline: Any) -> dict[str, Score]:

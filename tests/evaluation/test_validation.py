@@ -8,7 +8,7 @@ import torch
 from tiny_models import make_pipeline
 from tiny_suites import write_suite
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites import load_suite
 from unirender_evaluation.tasks import tasks
@@ -56,3 +56,5 @@ def test_what_cannot_be_scored_is_refused(tmp_path: Path, suite: str) -> None:
         suite_validation(str(tmp_path / "none.toml"), 1)
     with pytest.raises(UnirenderError, match="at least 1 scene"):
         suite_validation(suite, 0)
+    with pytest.raises(UsageError, match=r"--validate 3: the suite .* has 2 scenes, expected at most as many"):
+        suite_validation(suite, 3)  # the model card would say that there were three

@@ -166,10 +166,16 @@ def test_other_networks_are_refused(checkpoints: tuple[Path, Path], tmp_path: Pa
     make_pipeline(2, block_out_channels=(16, 48)).save_pretrained(tmp_path / "wide")
     with pytest.raises(UnirenderError, match=r"wide: dual_stream.block_out_channels is \[16, 48\], expected"):
         Average((checkpoints[0], tmp_path / "wide"), tmp_path / "out").run()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["wide"]
+
+
+def test_an_average_has_maps_of_materials_if_one_of_its_parts_has(
+    checkpoints: tuple[Path, Path], tmp_path: Path
+) -> None:
     UniRenderPipeline.from_pretrained(checkpoints[0], material="map").save_pretrained(tmp_path / "map")
-    with pytest.raises(UnirenderError, match=r"map: its material is 'map', expected 'scalar', that of"):
-        Average((checkpoints[0], tmp_path / "map"), tmp_path / "out").run()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["map", "wide"]
+    for out, parts in {"one": (tmp_path / "map", checkpoints[1]), "two": (checkpoints[1], tmp_path / "map")}.items():
+        Average(parts, tmp_path / out).run()
+        assert UniRenderPipeline.from_pretrained(tmp_path / out).config["material"] == "map"
 
 
 def test_schedules_may_differ_by_rounding_only(checkpoints: tuple[Path, Path], tmp_path: Path) -> None:

@@ -203,7 +203,8 @@ def test_the_command_writes_a_copy(data: Path, checkpoint: Path, tmp_path: Path,
         (tmp_path / "new" / name / "precious").touch()
     out = tmp_path / "new" / "calibrated"
     assert Calibrate(data, out, checkpoint, pictures=2).run() == 0
-    said = capsys.readouterr().out
+    said, noticed = capsys.readouterr()
+    assert f"{checkpoint}: does not say what it was trained on; make sure that {data} has other objects" in noticed
     assert "decomposed pictures of 10 of 10 groups" in said
     assert sorted(path.name for path in out.parent.iterdir()) == ["calibrated", "calibrated.old", "calibrated.partial"]
     assert all((out.parent / name / "precious").exists() for name in ("calibrated.old", "calibrated.partial"))

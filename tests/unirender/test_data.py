@@ -29,7 +29,7 @@ from unirender.training.augment import (
 from unirender.training.config import Augmentation
 from unirender.training.data import BATCH_MAPS, GroupDataset
 from unirender.training.environments import turned_environments
-from unirender.training.groups import Pair, list_shards, read_groups, split_of
+from unirender.training.groups import Pair, list_shards, read_groups, split_of, unread_shards
 from unirender.training.reader import BatchReader
 from unirender.training.source import ShardSource
 
@@ -318,6 +318,15 @@ def test_a_training_set_in_parts(folder: Path, dataset: GroupDataset, tmp_path: 
     chairs = GroupDataset(whole, shards=parts.shard_names[1:])
     assert chairs.fingerprint == dataset.fingerprint
     assert torch.equal(samples(chairs, 1, start=3)[0], samples(dataset, 1, start=3)[0])
+    assert unread_shards(whole) is None
+    (whole / "mine").mkdir()
+    (whole / "chairs").rename(whole / "mine" / "chairs")  # too deep
+    assert GroupDataset(whole).shard_names == ("balls/shard-000000.tar",)
+    assert str(unread_shards(whole)).startswith(f"{whole}: shards in mine/chairs are not read: those of the folder it")
+    write_shard(whole / "shard-000000.tar", extra)  # beside those of the folder itself
+    assert "shards in balls, mine/chairs are not read" in str(unread_shards(whole))
+    (whole / "shard-000000.tar").unlink()
+    (whole / "mine" / "chairs").rename(whole / "chairs")
     (whole / "chairs" / dataset.shard_names[0]).unlink()
     with pytest.raises(UnirenderError, match=r"chairs: shards .* of the manifest are missing"):
         GroupDataset(whole)

@@ -18,13 +18,13 @@ LOG: tuple[dict[str, Any], ...] = (
     {"step": 10, "samples_per_s": 5.0, "image": 0.4},
     {"step": 10, "validation": {"albedo.psnr": 15.0}},
     {"step": 20, "samples_per_s": 5.0, "image": 0.3},
-    {"step": 20, "validation": {"albedo.psnr": 16.0}},
+    {"step": 20, "validation": {"albedo.psnr": 16.0}, "scored_on": "4 scenes"},
 )
 
 
 def facts_at(step: int, folder: Path) -> dict[str, Any]:
     """Of a run with that log."""
-    trainer = Trainer(TRAIN, RunConfig(folder, steps=20), torch.device("cpu"), torch.float32)
+    trainer = Trainer(TRAIN, RunConfig(folder, steps=20, scored_on="now"), torch.device("cpu"), torch.float32)
     (folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in LOG))
     trainer.step = step
     return training_facts(trainer)
@@ -41,6 +41,7 @@ def test_the_log_counts_up_to_the_step_of_the_weights(
     assert (found["steps"], found["samples"]) == (step, step * TRAIN.batch_size)
     assert found.get("losses", {}).get("image") == image
     assert found.get("scores", {}).get("albedo.psnr") == psnr
+    assert found["scored_on"] == ("4 scenes" if step == 20 else "now")  # where the line says it, not what is asked now
 
 
 @pytest.mark.parametrize(("steps", "minutes", "expected"), [(8, None, {"steps": 8}), (None, 2.5, {"minutes": 2.5})])

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -226,8 +227,20 @@ def test_sizes_and_keys_of_several_shards_are_named_with_their_shards(tmp_path: 
     with pytest.raises(UnirenderError, match=r"sizes 8 x 8 \(shard-000001.tar\), 16 x 16 \(shard-000000.tar\), exp"):
         GroupDataset(tmp_path)
     write_shard(tmp_path / "shard-000001.tar", {"a": members("independent")})
-    twice = r"1 groups occur twice \(a in shard-000000.tar, shard-000001.tar\), .*\(of meshes with --turn-objects, too"
+    twice = r"1 groups occur twice \(a in shard-000000.tar, shard-000001.tar\), expected each key once in a folder and"
     with pytest.raises(UnirenderError, match=twice):
+        GroupDataset(tmp_path)
+
+
+def test_meshes_of_one_name_in_two_parts_are_two_objects(tmp_path: Path) -> None:
+    """`chair.glb` of one catalogue and of another, or one object under other lights; a copy of a part is none."""
+    parts = {"one": members(), "other": group_members("basis", 16, 1, (40,), (0, 50, 100), 1)}
+    for part, group in parts.items():
+        (tmp_path / part).mkdir()
+        write_shard(tmp_path / part / "shard-000000.tar", {"chair-0123_g0": group})
+    assert GroupDataset(tmp_path).keys == ("chair-0123_g0",) * 2
+    shutil.copytree(tmp_path / "one", tmp_path / "copy")
+    with pytest.raises(UnirenderError, match=r"twice \(chair-0123_g0 in copy/shard-.*, one/shard-.*no copies; take"):
         GroupDataset(tmp_path)
 
 

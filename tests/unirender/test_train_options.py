@@ -1,5 +1,6 @@
 """The options of `unirender train`, looked at before anything is read."""
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from unirender import cli
 from unirender.errors import UsageError
 from unirender.training.checkpoint import STATE_FILE
 from unirender.training.command import Train
+from unirender.training.presets import PRESETS
+from unirender.training.run import train
 from unirender_reference.folder_lock import locked, made_folder
 
 
@@ -28,6 +31,24 @@ from unirender_reference.folder_lock import locked, made_folder
 def test_a_value_outside_its_range_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         Train(Path("data"), **options).check()
+
+
+def test_options_count_in_python_as_in_the_command(tmp_path: Path) -> None:
+    """Beside a configuration of one's own they were passed over without a word."""
+    own = dataclasses.replace(PRESETS["tiny"], batch_size=6, seed=5)
+    assert Train(tmp_path).resolved(own) == own
+    changed = Train(tmp_path, batch_size=8, learning_rate=1e-4, resolution=128, seed=3).resolved(own)
+    found = changed.batch_size, changed.optimizer.learning_rate, changed.model.resolution, changed.seed
+    assert found == (8, 1e-4, 128, 3)
+    for options, message in (
+        (Train(tmp_path, validate=4), "validate 4, .*: nothing scores, expected the argument `validate`"),
+        (Train(tmp_path, keep_best="albedo.psnr"), "keep_best albedo.psnr: nothing scores"),
+        (Train(tmp_path, resolution=65), "--resolution 65: expected a multiple of 32"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            train(options, own, tmp_path / "run")
+    with pytest.raises(UsageError, match=r"it trains a part of a network .* expected --init with a trained one"):
+        train(Train(tmp_path), PRESETS["tiny_inverse"], tmp_path / "run")
 
 
 def test_a_run_of_a_part_goes_on_without_what_it_began_with(tmp_path: Path) -> None:

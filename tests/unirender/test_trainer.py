@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from rich.console import Console
-from synthetic_shards import write_dataset
+from synthetic_shards import group_members, maps_members, write_dataset, write_shard
 from tiny_models import TRAIN, make_batch, make_pipeline
 from torch import Tensor, nn
 
@@ -50,7 +50,7 @@ from unirender.training.run import train
 from unirender.training.source import ShardSource
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import Trainer, learning_rate
-from unirender.training.validation import Validate
+from unirender.training.validation import Validate, Validation
 
 CPU = torch.device("cpu")
 OVERFIT_STEPS = 150
@@ -264,6 +264,20 @@ def test_run_on_shards_writes_what_it_says(tmp_path: Path) -> None:
     assert torch.equal(pipeline.dual_stream.image_unet.conv_in.weight, weight)
 
 
+def test_a_pipeline_answers_with_maps_if_it_was_trained_on_maps(tmp_path: Path) -> None:
+    """Their mean over the object would be wrong everywhere; maps beside objects of one value make no difference."""
+    for name, groups in {
+        "scalar": {"a_g0": group_members("independent", 32, 1, (40,), (50,), 0)},
+        "mixed": {"a_g0": group_members("independent", 32, 1, (40,), (50,), 0), "b_g0": maps_members(32, 1, 1)},
+    }.items():
+        (tmp_path / name).mkdir()
+        write_shard(tmp_path / name / "shard-000000.tar", groups)
+        trainer = Trainer(TRAIN, RunConfig(tmp_path / f"run-{name}", steps=1), CPU, torch.float32)
+        trainer.source = ShardSource(tmp_path / name, TRAIN.batch_size, TRAIN.seed)
+        found = UniRenderPipeline.from_pretrained(export_pipeline(trainer, tmp_path / f"run-{name}" / "pipeline"))
+        assert found.config["material"] == {"scalar": "scalar", "mixed": "map"}[name]
+
+
 def scores_in_turn(values: list[float], higher_is_better: bool) -> tuple[Validate, list[UniRenderPipeline]]:
     """A validation that answers with the next value, and the pipelines that it was shown."""
     shown: list[UniRenderPipeline] = []
@@ -332,6 +346,33 @@ def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> Non
         (tmp_path / "best" / "training.json").write_text(broken)
         with pytest.raises(UnirenderError, match=r"training\.json: cannot be read as the record of a training"):
             other.fit(SyntheticSource(), validate=scores_in_turn([1.0], higher_is_better=True)[0])
+
+
+def test_the_best_on_other_scenes_is_not_compared(tmp_path: Path) -> None:
+    """The best of an easy suite would stay for ever; and a run that goes on may be scored on others (`--validate`)."""
+    facts: dict[str, Any] = {"train": dataclasses.asdict(TRAIN), "scored_on": "4 scenes of the suite tiny"}
+    (tmp_path / "best").mkdir()
+    (tmp_path / "best" / "training.json").write_text(json.dumps(facts))
+    (tmp_path / STATE_FILE).touch()  # of a run that goes on; nobody reads it before
+
+    def trainer(scored_on: str | None) -> Trainer:
+        run = RunConfig(tmp_path, 1, keep_best="error", scored_on=scored_on)
+        return Trainer(TRAIN, run, CPU, torch.float32)
+
+    validate, _ = scores_in_turn([], higher_is_better=True)
+    for same in (facts["scored_on"], None):
+        Validation(validate, "error").begin(trainer(same))
+    with pytest.raises(UnirenderError, match=r"best on 4 .* expected 8 .*: scores on other scenes cannot be compared"):
+        trainer("8 scenes of the suite tiny").fit(SyntheticSource(), validate=validate)
+
+
+def test_a_run_that_is_over_is_scored_once(tmp_path: Path) -> None:
+    over = Trainer(TRAIN, RunConfig(tmp_path, steps=1), CPU, torch.float32)
+    over.step = 1
+    over.save(SyntheticSource())
+    validate, shown = scores_in_turn([1.0, 2.0], higher_is_better=True)
+    fit(tmp_path, 1, validate)
+    assert len(shown) == 1
 
 
 def test_the_best_of_an_unknown_score_is_refused_before_training(tmp_path: Path) -> None:
@@ -489,9 +530,12 @@ def test_a_run_that_fails_ends_its_threads(tmp_path: Path, capsys: pytest.Captur
             raise RuntimeError
         return {"error": Score(1.0, higher_is_better=False)}
 
-    options = Train(data=data, steps=1, parallel=1, device="cpu")
+    options = Train(data=data, steps=1, parallel=1, device="cpu", batch_size=2, seed=7)
     with pytest.raises(RuntimeError) as stopped:
         train(options, TRAIN, tmp_path / "run", fail_at_the_end)
+    written = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert (written["train"]["batch_size"], written["train"]["seed"]) == (2, 7)  # of the options, as in the command
+    assert written["run"]["preset"] is None  # the configuration is not that of the row `tiny`
     assert stopped.tb  # keeps the reader, whose threads end with it
     assert not {thread.name for thread in set(threading.enumerate()) - before}
     assert ", one pass at a time\n" in capsys.readouterr().out

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from synthetic_shards import own_picture
 
+from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.training.closed_form_check import doubt
 from unirender.training.data import GroupDataset
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
@@ -34,6 +36,26 @@ def test_own_renders_are_read_back_as_they_were(tmp_path: Path, monkeypatch: pyt
     for name in ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment", "mask"):
         expected = getattr(maps, name)
         np.testing.assert_allclose(getattr(found, name), expected, rtol=2e-3, atol=2e-3, err_msg=name)
+
+
+def test_pictures_that_are_no_pictures_of_their_maps_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is valid by itself: display values in place of linear ones; an exposure that the light has not."""
+    picture, maps = own_picture(0)
+    rgb, mask = picture[..., :3], picture[..., 3:]
+    diffuse, specular = maps.require("diffuse", "specular").values()
+    dim = maps.replace(diffuse=diffuse / 4, specular=specular / 4)
+    wrong = {
+        "display": (np.concatenate([srgb_encode(rgb / 4), mask], axis=-1), dim),
+        "irradiance": (picture, maps.replace(diffuse=diffuse * np.float32(np.pi))),
+        "unexposed": (np.concatenate([rgb / 2, mask], axis=-1), maps),
+    }
+    said = {}
+    for name, own in {"right": (picture, maps), **wrong}.items():
+        (tmp_path / name).mkdir()
+        said[name] = doubt(GroupDataset(written(tmp_path / name, {"mug": own}, monkeypatch)))
+    assert said.pop("right") is None
+    assert all(said.values())
+    assert "pictures are 0.5 times as bright as the closed form of their maps" in str(said["unexposed"])
 
 
 def test_a_key_with_a_dot_is_not_taken_for_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

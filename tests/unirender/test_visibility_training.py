@@ -1,5 +1,6 @@
 """What the network of shadows learns from, and its training: sorted rays, other views of them, resumed runs."""
 
+import dataclasses
 import io
 import json
 import logging
@@ -114,7 +115,7 @@ def test_at_half_the_size_there_are_the_same_rays() -> None:
 def test_a_folder_is_looked_at_once(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         items, shards = read_items(folder)
-        assert len(items) == 4
+        assert [one.object for one in items] == ["ball0", "gutter1", "gutter2", "ball3"]
         assert list(shards) == ["shard-000000.tar"]
         again, _ = read_items(folder)
     assert sum("looking at the objects" in record.message for record in caplog.records) <= 1
@@ -179,6 +180,8 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     assert stopped.read_bytes() == whole.read_bytes()
     steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1, 2, 3, 4]
+    stopped.unlink()  # as if the disk had been full after the last state
+    assert train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options)).read_bytes() == whole.read_bytes()
     with pytest.raises(UnirenderError, match="other batch_size; repeat the options"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
@@ -222,5 +225,9 @@ def test_objects_are_held_out() -> None:
     own = [VisibilityItem(*vars(one).values()) for one in items]
     learned, held_out = split(own)
     assert (len(learned), len(held_out)) == (58, 2)
+    views = [dataclasses.replace(one, object=f"mesh{number // 2}") for number, one in enumerate(own)]
+    learned, held_out = split(views)
+    assert [one.object for one in held_out] == ["mesh24", "mesh24"]  # seen from two sides, and learned from neither
+    assert {one.object for one in learned} == {f"mesh{number}" for number in range(30)} - {"mesh24"}
     alone = own[:1]
     assert split(alone) == (alone, alone)

@@ -111,16 +111,18 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     histories = [read_history(folder) for folder in folders]
     with new_folder(out) as new:
         first = _read(checkpoints[0], folders[0])
+        material = first.config["material"]
         total = {name: shares[0] * value.double() for name, value in first.dual_stream.state_dict().items()}
         for path, folder, share in zip(checkpoints[1:], folders[1:], shares[1:], strict=True):
             other = _read(path, folder)
             _check_alike(first, other, checkpoints[0], path)
+            material = other.config["material"] if material == "scalar" else material  # maps, if any of them has maps
             for name, value in other.dual_stream.state_dict().items():
                 total[name] += share * value.double()
             del other
         vae = None if first.vae is None else _fresh(first.vae, first.vae.state_dict(), torch.float32)
         model = _fresh(first.dual_stream, total, getattr(torch, store))
-        pipeline = UniRenderPipeline(model, first.scheduler, vae, material=first.config["material"])
+        pipeline = UniRenderPipeline(model, first.scheduler, vae, material=material)
         facts = averaged_facts(histories, [_label(folder) for folder in folders], shares) | {"stored_as": store}
         facts.setdefault("train", {"model": {"codec": model.config["codec"]}})  # the card's licence depends on it
         with writing(out, "free some space or choose another --out"):
@@ -205,11 +207,6 @@ def _check_alike(first: "UniRenderPipeline", other: "UniRenderPipeline", first_n
     Raises:
         UnirenderError: they have not; the message names the first thing that differs.
     """
-    if first.config["material"] != other.config["material"]:
-        raise UnirenderError(
-            f"{name}: its material is {other.config['material']!r}, expected {first.config['material']!r}, that of "
-            f"{first_name}; only checkpoints of one kind can be averaged"
-        )
     for part in ("dual_stream", "scheduler"):
         one, two = (_settings(pipeline, part) for pipeline in (first, other))
         for entry in sorted(one.keys() | two.keys()):

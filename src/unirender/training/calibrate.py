@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError
+from unirender.notices import notice
 from unirender.option_checks import at_least
 
 if TYPE_CHECKING:
@@ -97,6 +98,8 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
         )
     if seen := _trained_on(data, history):
         raise UnirenderError(f"{options.data}: {checkpoint} was trained on {seen}, expected a folder of other objects")
+    if not any("data" in facts for facts in history):
+        notice(f"{checkpoint}: does not say what it was trained on; make sure that {options.data} has other objects")
     numbers, alike = objects_of(data)
     if alike:
         print(f"{len(alike)} pairs of groups look alike, such as {' and '.join(alike[0])}: each is of one object")

@@ -118,7 +118,20 @@ class Train:
 
             check_trackers(self.track)
         with usage():
-            config = dataclasses.replace(get_preset(self.preset), seed=self.seed)
+            config = get_preset(self.preset)
+        config = self.resolved(config)
+        with usage():
+            check_config(config)
+        self.check_start(config, self.folder)
+        return config
+
+    def resolved(self, config: TrainConfig) -> TrainConfig:
+        """A configuration with the values that the options give in place of its own (a seed of 0 gives none).
+
+        Raises:
+            UsageError: no network has pictures of that size.
+        """
+        config = dataclasses.replace(config, seed=self.seed or config.seed)
         if self.batch_size is not None:
             config = dataclasses.replace(config, batch_size=self.batch_size)
         if self.learning_rate is not None:
@@ -132,15 +145,17 @@ class Train:
                     "and the light's texels cover whole pixels"
                 )
             config = dataclasses.replace(config, model=dataclasses.replace(config.model, resolution=self.resolution))
-        with usage():
-            check_config(config)
-        self._check_start(config)
         return config
 
-    def _check_start(self, config: TrainConfig) -> None:
+    def check_start(self, config: TrainConfig, folder: Path) -> None:
+        """Looks whether a run of a configuration can begin, or go on in its folder.
+
+        Raises:
+            UsageError: it lacks weights to begin with, or has some that it cannot begin with.
+        """
         if self.init is not None and self.init_from is not None:
             raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
-        if config.trains != "all" and self.init is None and not self._is_saved():
+        if config.trains != "all" and self.init is None and not _is_saved(folder):
             raise UsageError(
                 f"--preset {self.preset}: it trains a part of a network and leaves the others as they are, expected "
                 "--init with a trained one (the name of a shipped checkpoint, or a pipeline folder)"
@@ -160,12 +175,6 @@ class Train:
                 f"--preset {self.preset}: its network works on latents of Stable Diffusion's autoencoder, which it "
                 "needs; pass --init-from with a Stable Diffusion folder (or --init with a pipeline of this preset)"
             )
-
-    def _is_saved(self) -> bool:
-        """Whether there is a run to go on with, which has all weights."""
-        from unirender.training.checkpoint import STATE_FILE
-
-        return (self.folder / STATE_FILE).is_file()
 
     def run(
         self, make_validation: MakeValidation, score_names: ScoreNames, alone: Alone = contextlib.nullcontext
@@ -189,3 +198,10 @@ class Train:
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
+
+
+def _is_saved(folder: Path) -> bool:
+    """Whether there is a run to go on with, which has all weights."""
+    from unirender.training.checkpoint import STATE_FILE
+
+    return (folder / STATE_FILE).is_file()

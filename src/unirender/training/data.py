@@ -99,19 +99,36 @@ class GroupDataset:
         self._groups = [(shard, group) for shard in self.shards for group in shard.groups]
         self._shard_of = [number for number, shard in enumerate(self.shards) for _ in shard.groups]
         self.keys = tuple(group.key for _, group in self._groups)
-        if twice := [key for key, count in Counter(self.keys).items() if count > 1]:
-            where = [shard.name for shard, group in self._groups if group.key == twice[0]]
-            raise UnirenderError(
-                f"{folder}: {len(twice)} groups occur twice ({twice[0]} in {', '.join(where)}), expected each key "
-                "once; take one of the shards away, or render one set with another --seed (of meshes with "
-                "--turn-objects, too: their keys else name the file alone)"
-            )
+        self._check_keys()
         basis = [i for i, (_, group) in enumerate(self._groups) if group.vary == "basis"]
         self._basis = {i: basis_rows(*self._groups[i]) for i in basis}
         self._items: list[tuple[int, Pair | None]] = []
         for i, (_, group) in enumerate(self._groups):
             self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
         self.fingerprint = hashlib.sha256(" ".join(shard.sha256 for shard in self.shards).encode()).hexdigest()
+
+    def _check_keys(self) -> None:
+        """Looks for groups that are there twice; meshes of one name in two parts are two objects.
+
+        Raises:
+            UnirenderError: two groups of one folder have one key, or two of any have key, surface and lights in common.
+        """
+        counts, where = Counter(self.keys), dict[tuple[str, str], str]()
+        twice: list[str] = []
+        for shard, group in self._groups:
+            if counts[group.key] == 1:
+                continue
+            lights = sorted({pair.light for pair in group.pairs})
+            content = shard.shared[group.shared].tobytes() + shard.environment[lights].tobytes()
+            for same in (f"folder {shard.name.rpartition('/')[0]}", hashlib.sha256(content).hexdigest()):
+                if (first := where.setdefault((group.key, same), shard.name)) != shard.name:
+                    twice.append(f"{group.key} in {first}, {shard.name}")
+                    break
+        if twice:
+            raise UnirenderError(
+                f"{self.folder}: {len(twice)} groups occur twice ({twice[0]}), expected each key once in a folder and "
+                "no copies; take one of the shards away, or render one set with another --seed"
+            )
 
     @property
     def shard_names(self) -> tuple[str, ...]:
@@ -121,6 +138,11 @@ class GroupDataset:
     def num_pairs(self) -> int:
         """Stored pictures."""
         return sum(len(group.pairs) for _, group in self._groups)
+
+    @property
+    def has_material_maps(self) -> bool:
+        """Whether roughness and metallic of some pictures are maps, not one value over the object."""
+        return any(pair.roughness is None for _, group in self._groups for pair in group.pairs)
 
     def __len__(self) -> int:
         """Items, the samples of an epoch: basis groups count once, other groups by their pairs."""

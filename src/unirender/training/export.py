@@ -15,7 +15,9 @@ from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.card import CARD_FILE, card_text
 from unirender.training.checkpoint import replace_folder
+from unirender.training.device_data import DeviceSource
 from unirender.training.facts import training_facts
+from unirender.training.source import BatchSource, ShardSource
 from unirender.writing import writing
 
 if TYPE_CHECKING:
@@ -29,16 +31,23 @@ def averaged_pipeline(
 ) -> UniRenderPipeline:
     """A pipeline of the averaged weights as they are now, a copy; on the trainer's device without another one.
 
-    An autoencoder is the trainer's own, in float32.
+    An autoencoder is the trainer's own, in float32. Roughness and metallic are maps where those of the data are.
     """
     model, _ = build_model(trainer.config.model, trainer.vae)
     trainer.ema.copy_to(model)
     for own, trained in zip(model.buffers(), trainer.model.buffers(), strict=True):  # the prompt embedding
         own.copy_(trained)
     nn.Module.to(model.eval(), device or trainer.device, dtype)  # in place
-    pipeline = UniRenderPipeline(dual_stream=model, scheduler=trainer.loss.scheduler, vae=trainer.vae)
+    pipeline = UniRenderPipeline(model, trainer.loss.scheduler, trainer.vae, material=_material(trainer.source))
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
+
+
+def _material(source: BatchSource | None) -> str:
+    """How a pipeline answers that was trained on the data of a source; of a source of one's own nothing is known."""
+    if isinstance(source, DeviceSource):
+        source = source.source
+    return "map" if isinstance(source, ShardSource) and source.open().has_material_maps else "scalar"
 
 
 def read_history(folder: Path) -> list[dict[str, Any]]:
@@ -78,6 +87,9 @@ def export_pipeline(
     pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
     facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}
     chosen = json.loads(beside[SCORES_FILE]) if SCORES_FILE in beside else None
+    if chosen is not None:  # the log may have other scores of this step, on other scenes
+        facts["scores"] = {name: score["value"] for name, score in chosen["scores"].items()}
+        facts |= {} if trainer.run.scored_on is None else {"scored_on": trainer.run.scored_on}
     try:
         with writing(folder):
             pipeline.save_pretrained(partial, safe_serialization=True)

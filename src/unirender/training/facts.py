@@ -27,10 +27,11 @@ HASH_DIGITS = 10  # by which a shard is known: of 100 others one is taken for on
 def training_facts(trainer: "Trainer") -> dict[str, Any]:
     """Length, hardware, software, data, losses and configuration of a run as it stands; plain data, no paths.
 
-    The scores are those of the validation at the present step, if the log has one.
+    The scores are those of the validation at the present step, if the log has one, on the scenes that it names.
     """
     run, log = trainer.run, _Log(trainer.run.out, trainer.step)
-    scores = log.latest("validation")
+    scores = log.latest("validation") or {}
+    scores = scores if scores.get("step") == trainer.step else {}
     facts = {
         "preset": run.preset,
         "parameters": sum(p.numel() for p in trainer.model.parameters()),
@@ -47,8 +48,8 @@ def training_facts(trainer: "Trainer") -> dict[str, Any]:
         },
         "data": data_facts(trainer.source),
         "losses": log.latest("samples_per_s"),
-        "scores": scores["validation"] if scores and scores["step"] == trainer.step else None,
-        "scored_on": run.scored_on,
+        "scores": scores.get("validation"),
+        "scored_on": scores.get("scored_on", run.scored_on),
         "train": _resolved(trainer),
         "continues": trainer.continues,
     }

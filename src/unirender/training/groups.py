@@ -66,6 +66,19 @@ def list_shards(folder: str | Path) -> dict[Path, str | None]:
     return found
 
 
+def unread_shards(folder: str | Path) -> str | None:
+    """In words: which folders below a data folder have shards that `list_shards` passes over; None: there are none."""
+    folder = Path(folder)
+    holding = {path.parent for path in folder.rglob("*.tar")}
+    unread = sorted(part.relative_to(folder).as_posix() for part in holding - set(_parts(folder)))
+    if not unread:
+        return None
+    return (
+        f"{folder}: shards in {', '.join(unread[:3])}{' ...' if len(unread) > 3 else ''} are not read: those of the "
+        "folder itself are, or, where it has none, those of the folders in it; pass another --data, or move them"
+    )
+
+
 def split_of(folder: str | Path) -> str | None:
     """The side, `train` or `test`, that a data folder was rendered for, as its manifests say; None where none says.
 
@@ -275,4 +288,5 @@ __all__ = [
     "read_groups",
     "split_of",
     "store",
+    "unread_shards",
 ]

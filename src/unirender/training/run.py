@@ -1,6 +1,7 @@
 """One training run, as the options of `unirender train` describe it: its device, its data, and what it tells."""
 
 import contextlib
+import dataclasses
 import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,6 +10,7 @@ from unirender.errors import UsageError
 from unirender.notices import notice
 from unirender.training.command import Alone, Train
 from unirender.training.config import RunConfig, TrainConfig
+from unirender.training.presets import PRESETS
 
 if TYPE_CHECKING:
     import torch
@@ -29,12 +31,30 @@ def train(
     validate: "Validate | None" = None,
     alone: Alone = contextlib.nullcontext,
 ) -> Path | None:
-    """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first."""
+    """Runs the training; returns the folder with the trained pipeline, or None in all processes but the first.
+
+    Args:
+        options: of the command; `preset` and `out` are not looked at, but for what the model card says.
+        config: of the training, in which the values that the options give take the place of its own.
+        out: run folder.
+        validate: what `options.validate` asks for.
+        alone: holds the folder against another process.
+
+    Raises:
+        UsageError: the options ask for scores and there is no `validate`, or contradict each other.
+    """
     from unirender.models.precision import resolve_device
     from unirender.training.checkpoint import check_leftover
     from unirender.training.groups import list_shards
     from unirender.training.processes import join_processes
 
+    config = options.resolved(config)
+    options.check_start(config, out)
+    if validate is None and (options.validate or options.keep_best is not None):
+        raise UsageError(
+            f"validate {options.validate}, keep_best {options.keep_best}: nothing scores, expected the argument "
+            "`validate` of `train`, such as unirender_evaluation.validation.suite_validation('tiny', 4)"
+        )
     processes, device = join_processes(resolve_device(options.device))
     if options.batches == "device" and device.type != "cuda":
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
@@ -59,8 +79,9 @@ def _train(
 
     from unirender.models.precision import resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
+    from unirender.training.closed_form_check import doubt
     from unirender.training.export import export_pipeline
-    from unirender.training.groups import split_of
+    from unirender.training.groups import split_of, unread_shards
     from unirender.training.live import live_report
     from unirender.training.memory import training_bytes
     from unirender.training.start import read_start
@@ -90,6 +111,10 @@ def _train(
         say(f"memory: {memory}")
         if not resumed:  # which goes on with the shards that it has
             say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+            if unread := unread_shards(options.data):
+                tell(unread)
+            if doubtful := doubt(data):
+                tell(doubtful)
             if split_of(options.data) == "test":
                 tell(f"{options.data}: was rendered with --split test; what is trained on it cannot be tested on it")
     del data  # a folder that grew is opened anew: not both at once
@@ -116,9 +141,17 @@ def run_config(options: Train, config: TrainConfig, out: Path, parallel: int) ->
         parallel=parallel,
         accumulate=options.accumulate,
         keep_best=options.keep_best,
-        preset=options.preset,
+        preset=_preset_of(options, config),
         scored_on=options.scored_on,
     )
+
+
+def _preset_of(options: Train, config: TrainConfig) -> str | None:
+    """The row that a configuration is of, by its name in the options; None: it is another than that row."""
+    if options.preset not in PRESETS:
+        return options.preset  # a name of one's own
+    row = options.resolved(PRESETS[options.preset])
+    return options.preset if dataclasses.replace(config, seed=row.seed, steps=row.steps) == row else None
 
 
 def make_source(

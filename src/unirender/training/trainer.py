@@ -164,7 +164,7 @@ class Trainer:
         """
         self.source, main = source, self.processes.is_main
         validation = Validation(validate, self.run.keep_best) if validate else None
-        if main and validation is not None and not (self.run.out / STATE_FILE).exists():
+        if main and validation is not None:
             validation.begin(self)
         resumed = self.resume(source, report)
         self._start_alike(source)
@@ -174,7 +174,7 @@ class Trainer:
         self._look(None, validation, report)
         due = Due(save=self.run.save_minutes, picture=self.run.picture_minutes, refresh=self.run.refresh_minutes)
         shown: Maps = {}  # of the first batch: the same in every picture
-        logged = self.step, self.seconds
+        begun, logged = self.step, (self.step, self.seconds)
         with stopping_gently() as request:
             while self.progress < 1:
                 start = time.monotonic()  # pictures, validation and saves are no training
@@ -199,7 +199,8 @@ class Trainer:
                         self._refresh(source, report)
         if main:
             self.save(source)
-        self._look(shown, validation, report)
+        if self.step > begun:  # else it has been looked at
+            self._look(shown, validation, report)
 
     def _tell_losses(self, step: int, seconds: float, report: Report) -> None:
         """Logs the means of the losses, and the speed since a step and its seconds of training."""

@@ -40,17 +40,18 @@ class Validation:
     keep_best: str | None = None
 
     def begin(self, trainer: "Trainer") -> None:
-        """Looks at the `best/` of a run that begins: it may be its own, if it was killed before its first save.
+        """Looks at the `best/` of a run that begins or goes on: it may be its own.
 
         Raises:
-            UnirenderError: it is that of a run of another configuration.
+            UnirenderError: it is that of a run of another configuration, or was scored on other scenes.
         """
         path = trainer.run.out / BEST_FOLDER / TRAINING_FILE
         if self.keep_best is None or not path.is_file():
             return
         try:
-            config = json.loads(path.read_text())["train"]
-            differing = differences(config, trainer.config)
+            facts = json.loads(path.read_text())
+            differing = differences(facts["train"], trainer.config)
+            scored_on = facts.get("scored_on")
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UnirenderError(
                 f"{path}: cannot be read as the record of a training ({error}); move it away"
@@ -59,6 +60,12 @@ class Validation:
             raise UnirenderError(
                 f"{path.parent}: is the best of another run, with {', '.join(differing)}, whose scores these weights "
                 "would have to beat; move it away, or pass another --out"
+            )
+        if None not in (scored_on, trainer.run.scored_on) and scored_on != trainer.run.scored_on:
+            raise UnirenderError(
+                f"{path.parent}: is the best on {scored_on}, expected {trainer.run.scored_on}: scores on other scenes "
+                "cannot be compared; repeat --validate and --validate-suite of that run, leave --keep-best out, or "
+                "move the folder away"
             )
 
     def run(self, trainer: "Trainer") -> dict[str, Any]:
@@ -71,6 +78,7 @@ class Validation:
         scores = self.validate(averaged_pipeline(trainer))
         values = {name: score.value for name, score in scores.items()}
         line = {"step": trainer.step, "validation": values, "validation_s": round(time.monotonic() - start, 2)}
+        line |= {} if trainer.run.scored_on is None else {"scored_on": trainer.run.scored_on}
         if self.keep_best is None:
             return line
         if self.keep_best not in scores:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.command_line import Ended
 from unirender.errors import UnirenderError, UsageError
+from unirender.notices import notice
 from unirender.option_checks import check_seed
 from unirender.training.command import Alone
 from unirender.writing import check_out, writing
@@ -92,11 +93,16 @@ def train_visibility(options: TrainVisibility) -> Path:
         UnirenderError: broken data, or the folder holds a run of other options or data.
         Ended: it was asked to stop.
     """
+    from unirender.training.groups import unread_shards
     from unirender.training.stopping import stopping_gently
     from unirender.training.visibility_data import read_items
 
+    if unread := unread_shards(options.data):
+        notice(unread)
     items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
     run = _Run(options, *split(items), shards)
+    if run.step == options.steps:
+        run.write_weights()  # it may have ended between its state and them
     saved = time.monotonic()
     with stopping_gently() as stop:
         while run.step < options.steps and not stop.asked:
@@ -194,24 +200,30 @@ class _Run:
 
     def keep(self) -> None:
         """Saves the state and the averaged weights, and what they score."""
-        from safetensors.torch import save
-
-        from unirender.models.visibility import VisibilityNet
         from unirender.training.checkpoint import save_state
         from unirender.training.visibility_loss import mean, validate
-        from unirender.whole_files import replace_file
 
         parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
         state = {name: part.state_dict() for name, part in parts.items()}
         save_state(self.options.out, {**state, "step": self.step, "options": self.asked})
+        shown = self.write_weights()
+        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
+        self.losses.clear()
+        self._tell(means | validate(shown, self.held_out, self.options.seed))
+
+    def write_weights(self) -> "VisibilityNet":
+        """Writes the averaged weights; a network that has them."""
+        from safetensors.torch import save
+
+        from unirender.models.visibility import VisibilityNet
+        from unirender.whole_files import replace_file
+
         shown = channels_last(VisibilityNet())
         self.ema.copy_to(shown)
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
         with writing(path := self.options.out / WEIGHTS_FILE):
             replace_file(path, save(halves))
-        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
-        self.losses.clear()
-        self._tell(means | validate(shown, self.held_out, self.options.seed))
+        return shown
 
     def _tell(self, values: Mapping[str, float]) -> None:
         line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
@@ -230,9 +242,14 @@ def channels_last(net: "VisibilityNet") -> "VisibilityNet":
 
 
 def split(items: "Sequence[VisibilityItem]") -> "tuple[list[VisibilityItem], list[VisibilityItem]]":
-    """The objects to learn from, and those that are held out (of less than `HELD_OUT`, the last one)."""
-    held_out = [items[i] for i in range(HELD_OUT - 1, len(items), HELD_OUT)] or [items[-1]]
-    own = [item for item in items if not any(item is other for other in held_out)]
+    """The objects to learn from, and those that are held out (of less than `HELD_OUT`, the last one).
+
+    All views of one object are on one side.
+    """
+    names = [item.object or str(number) for number, item in enumerate(items)]
+    objects = list(dict.fromkeys(names))
+    apart = set(objects[HELD_OUT - 1 :: HELD_OUT] or objects[-1:])
+    own, held_out = ([i for i, name in zip(items, names, strict=True) if (name in apart) == side] for side in (0, 1))
     return own or list(items), held_out
 
 

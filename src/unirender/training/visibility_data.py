@@ -27,6 +27,7 @@ from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow
 from unirender.training.derived import one_thread
 from unirender.training.groups import list_shards, read_groups, split_of
+from unirender.training.same_objects import object_of
 from unirender.whole_files import file_sha256
 from unirender.worker_pool import WorkerPool
 
@@ -48,6 +49,7 @@ class VisibilityItem:
         depth: along the view axis where there is a surface, up to a factor.
         weight: of the directions of each class and bin.
         hidden: of those of them that are hidden.
+        object: its name, which other views of it have too; empty: nobody knows.
     """
 
     normal: Float[np.ndarray, "h w 3"] | Float16[np.ndarray, "h w 3"]
@@ -55,6 +57,7 @@ class VisibilityItem:
     depth: Float[np.ndarray, "h w"]
     weight: UInt8[np.ndarray, "p c k"] | Float[np.ndarray, "p c k"]
     hidden: UInt8[np.ndarray, "p c k"] | Float[np.ndarray, "p c k"]
+    object: str = ""
 
     def turned(self, turns: int, mirror: bool) -> "VisibilityItem":
         """Seen by a camera that is turned about its axis by quarter turns, and then mirrored left and right."""
@@ -147,8 +150,10 @@ def look_at(
         classes = shadow.classes(part, directions)
         weight.append(bin_weights(cosine, classes, directions))
         hidden.append(bin_weights(np.where(visible[part], 0, cosine), classes, directions))
-    stored = (np.clip(np.round(STEPS * np.concatenate(value)), 0, 255).astype(np.uint8) for value in (weight, hidden))
-    return VisibilityItem(normal.astype(np.float16), surface, np.where(surface, shadow.depth, 0), *stored)
+    weights, hides = (
+        np.clip(np.round(STEPS * np.concatenate(value)), 0, 255).astype(np.uint8) for value in (weight, hidden)
+    )
+    return VisibilityItem(normal.astype(np.float16), surface, np.where(surface, shadow.depth, 0), weights, hides)
 
 
 def _place(sha256: str) -> Path:
@@ -179,7 +184,8 @@ _FIELDS = ("normal", "surface", "depth", "weight", "hidden")
 def _stored(place: Path) -> list[VisibilityItem]:
     with np.load(place / "items.npz") as arrays:
         keys = dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays.files)
-        return [VisibilityItem(*(arrays[f"{key}/{name}"] for name in _FIELDS)) for key in keys]
+        maps = {key: {name: arrays[f"{key}/{name}"] for name in _FIELDS} for key in keys}
+        return [VisibilityItem(**own, object=object_of(key)) for key, own in maps.items()]
 
 
 def _pooled(values: np.ndarray) -> Float[np.ndarray, "h w c"]:
