@@ -16,6 +16,7 @@ albedo in the direction v; the sum is split because the light and F are averaged
 """
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,7 @@ COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced o
 LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
 LOBES = 4  # at a time: their samples stay in the processor's cache
 GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
+TABLES = Path(__file__).with_name("environment_brdf.npy")  # what `integrate_environment_brdf` gives, [2 n r], float64
 
 
 def fresnel(albedo: Any, metallic: Any) -> Any:
@@ -84,7 +86,7 @@ def mean_fresnel(
 def environment_brdf(
     n_v: Float[np.ndarray, "*size"], roughness: Float[np.ndarray, "*size"]
 ) -> tuple[Float[np.ndarray, "*size"], Float[np.ndarray, "*size"]]:
-    """Karis's scale A and bias B of F0, interpolated (bilinearly) in a table that is integrated at the first call.
+    """Karis's scale A and bias B of F0, interpolated (bilinearly) in a table.
 
     Args:
         n_v: cosine between normal and view direction; clipped to [0, 1].
@@ -103,12 +105,17 @@ def environment_brdf(
 
 @functools.cache
 def environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
-    """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1; integrated at the first call."""
+    """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1, from the file that ships."""
+    a, b = np.load(TABLES)
+    return a, b
+
+
+def integrate_environment_brdf() -> Float[np.ndarray, "2 n r"]:
+    """What `TABLES` holds. It ships since to integrate takes a quarter of a second, in every process that renders."""
     n_v = np.maximum(np.linspace(0, 1, COSINES), GRAZING)
     alpha = np.maximum(np.square(np.linspace(0, 1, ROUGHNESSES)), MIN_ALPHA)
     blocks = [[_integrate_lobes(rows, float(r)) for r in alpha] for rows in np.split(n_v, COSINES // LOBES)]
-    a, b = np.array(blocks).transpose(2, 0, 3, 1).reshape(2, COSINES, ROUGHNESSES)
-    return a, b
+    return np.array(blocks).transpose(2, 0, 3, 1).reshape(2, COSINES, ROUGHNESSES)
 
 
 def _integrate_lobes(
