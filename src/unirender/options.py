@@ -209,8 +209,8 @@ class InputOptions:
     """The picture."""
 
     picture: Annotated[Path, tyro.conf.Positional]
-    """PNG, JPG or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a folder of them,
-    too."""
+    """PNG, JPG, TIFF, WebP, BMP or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a
+    folder of them, too."""
     mask: Path | None = None
     """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
     None: the alpha channel, else the whole frame."""
