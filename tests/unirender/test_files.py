@@ -296,9 +296,14 @@ def test_a_stream_that_breaks_leaves_what_was_there_and_nothing_aside(tmp_path: 
     """What it wrote would else fill the disk whose end it met."""
     path = tmp_path / "state"
     path.write_bytes(b"old")
-    with pytest.raises(OSError, match=r"No space left on device: .*state'"), whole_file(path) as file:
-        file.write(b"half")
-        raise OSError(28, "No space left on device")
+
+    def fill() -> None:
+        with whole_file(path) as file:
+            file.write(b"half")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"No space left on device: .*state'"):
+        fill()
     assert path.read_bytes() == b"old"
     assert [each.name for each in tmp_path.iterdir()] == ["state"]
     with whole_file(path) as file:
