@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
@@ -69,10 +69,20 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     """
     maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
-    n_v = dots(unit_normals(maps["normal"]), view)
-    reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
-    radiance = lobes(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"], reflectance)
-    return (radiance * maps["mask"]).astype(np.float32)
+    covered = np.flatnonzero(maps["mask"])
+    seen = {name: _pixels(value, covered) for name, value in maps.items()}
+    n_v = dots(unit_normals(seen["normal"]), _pixels(view, covered))
+    reflectance = mean_fresnel(fresnel(seen["albedo"], seen["metallic"]), n_v, seen["roughness"])
+    radiance = lobes(seen["albedo"], seen["metallic"], seen["diffuse"], seen["specular"], reflectance)
+    image = np.zeros((maps["mask"].size, 3), np.float32)
+    image[covered] = radiance * seen["mask"]
+    return image.reshape(view.shape)
+
+
+def _pixels(picture: Float[np.ndarray, "h w c"], which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
+    """Those pixels, by their place in the flat picture."""
+    flat = picture.reshape(-1, picture.shape[-1])
+    return flat if len(which) == len(flat) else flat.take(which, axis=0)
 
 
 def mean_fresnel(
