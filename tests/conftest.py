@@ -38,7 +38,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--regenerate",
         action="store_true",
-        help="rewrite the stored references (mean and variance EXR) instead of comparing; refused when CI=true",
+        help="rewrite the stored references instead of comparing; refused when CI=true",
     )
 
 

@@ -67,6 +67,10 @@ def test_nothing_heavy_is_imported_by(modules: str, tmp_path: Path) -> None:
     assert not set(HEAVY) & set(loaded.split())
 
 
+def test_of_two_modules_that_need_each_other_either_can_come_first(tmp_path: Path) -> None:
+    run_python("import unirender_reference.textures", tmp_path)  # the shapes are coloured by it, and share its noise
+
+
 def lint_imports(folder: Path) -> str:
     """Returns what import-linter says of a copy of the three packages; empty where every contract is kept."""
     command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]

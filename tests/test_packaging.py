@@ -68,6 +68,7 @@ def test_the_wheel_holds_its_data_and_stays_small(wheel: Path) -> None:
         r"unirender/checkpoints/tiny/.*config\.json",
         r"unirender/checkpoints/small/.*\.safetensors",
         r"unirender/checkpoints/small/.*config\.json",
+        r"unirender/environment_brdf\.npy",
         r"unirender_reference/data/lights/.+",
         r"unirender_evaluation/data/lpips_alex\.safetensors",
         r"unirender_evaluation/data/suites/tiny\.toml",

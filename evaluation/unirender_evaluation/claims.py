@@ -12,8 +12,26 @@ from unirender_evaluation.task import LIGHT
 MASKED = Variant("masked", "srgb", "raw")
 
 
+class MaskedNumber:
+    """What a quantity scores in a metric, inside the mask and in display values."""
+
+    quantity: str
+    metric: str
+    scale: Scale
+
+    @property
+    def kind(self) -> Metric:
+        """The metric that it is about."""
+        return ALL_METRICS[self.metric]
+
+    @property
+    def key(self) -> str:
+        """Under which records hold it."""
+        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
+
+
 @dataclass(frozen=True)
-class Claim:
+class Claim(MaskedNumber):
     """`a` against `b` on one number. `expected`: "beats" is a claim, "stated" only states the distance. `remark`: what
     a reader must know beside the figure. `scale`: how the number is aligned, where its metric has such variants."""
 
@@ -26,15 +44,6 @@ class Claim:
     expected: str = "beats"
     remark: str = ""
     scale: Scale = "raw"
-
-    @property
-    def kind(self) -> Metric:
-        """The metric that it is about."""
-        return ALL_METRICS[self.metric]
-
-    @property
-    def key(self) -> str:
-        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
 
 
 OPTIMISED, REFINED = "nvdiffrec-mitsuba", "ours-mitsuba-refinement"

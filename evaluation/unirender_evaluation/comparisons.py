@@ -5,12 +5,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric, Variant
+from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import Estimate, beats, paired_difference
 
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
+OTHERS = ("trivial", "baseline", "optimisation")  # kinds of rows that ours are held against
 ZERO = 1e-6  # and the absolute one, of values near zero
 ROUNDING = 1e-5  # relative difference of two rows' values that decides nothing, far below the last printed digit
 
@@ -120,20 +121,18 @@ def verdicts(
     records: Sequence[Record],
     run: RunInfo,
     *,
-    variant: Variant = DEFAULT_VARIANT,
     kind: str = "ours",
-    against: Sequence[str] = ("trivial", "baseline", "optimisation"),
 ) -> list[tuple[Column, Comparison]]:
-    """Every row of one kind against every row of other kinds, column by column; `records` is one `Selection`.
+    """Every row of one kind against every row of the kinds `OTHERS`, column by column; `records` is one `Selection`.
 
     Pairs that share no sample, or have an infinite difference (identical images), have no verdict and are left out.
     """
     present = list(dict.fromkeys(record.method for record in records))
     ours = [key for key in present if run.method(key).kind == kind]
-    others = [key for key in present if run.method(key).kind in against and key not in ours]
+    others = [key for key in present if run.method(key).kind in OTHERS and key not in ours]
     found = []
     for column in spec.columns:
-        key = column.key(variant)
+        key = column.key(DEFAULT_VARIANT)
         values = values_by_method(records, key)
         for a in ours:
             for b in others:

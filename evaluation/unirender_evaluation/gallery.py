@@ -186,7 +186,7 @@ def _magma(error: Float[np.ndarray, "h w"]) -> Picture:
     return np.asarray(colormaps["magma"](np.clip(error, 0, 1)), dtype=np.float32)[..., :3]
 
 
-def hero(gallery: Sequence[GalleryItem], run: RunInfo, most: int = HERO_WIDTH) -> dict[str, Any] | None:
+def hero(gallery: Sequence[GalleryItem], run: RunInfo) -> dict[str, Any] | None:
     """What was given, and what the first row of ours made of it on the median sample: picked by rank, not by eye."""
     kinds = [[info.key for info in run.methods if info.kind == kind] for kind in LEADING]
     ours = set(next(filter(None, kinds), []))
@@ -196,9 +196,13 @@ def hero(gallery: Sequence[GalleryItem], run: RunInfo, most: int = HERO_WIDTH) -
     item = min(candidates, key=lambda item: abs(2 * item.place - item.count - 1))
     method = next(key for key in item.predictions if key in ours)
     return {
-        "given": [_named(name, picture, item, most) for name, picture in item.given.items()],
+        "given": [_named(name, picture, item, HERO_WIDTH) for name, picture in item.given.items()],
         "pairs": [
-            {"name": name, "ours": _shown(picture, item, most), "truth": _shown(item.truth[name], item, most)}
+            {
+                "name": name,
+                "ours": _shown(picture, item, HERO_WIDTH),
+                "truth": _shown(item.truth[name], item, HERO_WIDTH),
+            }
             for name, picture in item.predictions[method].items()
         ],
         "caption": f"{run.method(method).label} on the sample of {item.rank or 'median'} score: "

@@ -56,20 +56,17 @@ PEAK_ANGLE = Metric(
 )
 
 
-def light_values(
-    found: Float[np.ndarray, "h w 3"], true: Float[np.ndarray, "th tw 3"], quantity: str = "environment"
-) -> dict[str, float]:
+def light_values(found: Float[np.ndarray, "h w 3"], true: Float[np.ndarray, "th tw 3"]) -> dict[str, float]:
     """Metric key -> value of a light, both metrics.
 
     Args:
         found: lat-long radiance, any resolution, any scale.
         true: the same; both in the same axes.
-        quantity: name in the metric keys.
     """
     p, t = (resample_environment(light, SHAPE) for light in (found, true))
     return {
-        metrics.metric_key(quantity, SCALED_LOG_RMSE): scaled_log_rmse(p, t),
-        metrics.metric_key(quantity, PEAK_ANGLE): peak_angle_deg(p, t),
+        metrics.metric_key("environment", SCALED_LOG_RMSE): scaled_log_rmse(p, t),
+        metrics.metric_key("environment", PEAK_ANGLE): peak_angle_deg(p, t),
     }
 
 

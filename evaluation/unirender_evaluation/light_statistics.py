@@ -5,10 +5,8 @@ come from.
 """
 
 import json
-import sys
 from collections.abc import Iterator
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from unirender.lighting import mean_radiance, resample_environment
 from unirender.whole_files import replace_file
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.metrics import LOG_EPSILON
-from unirender_evaluation.training_statistics import shard_files
+from unirender_evaluation.training_statistics import main, shard_files, stored_statistics
 
 FILE = "data/light_statistics.toml"
 SUFFIX = ".environment.exr"
@@ -30,9 +28,7 @@ SUFFIX = ".environment.exr"
 @cache
 def light_statistics() -> dict[str, Any]:
     """`rows` (16 x RGB, display units, from +y down) and `provenance`."""
-    import tomllib
-
-    return tomllib.loads((resources.files("unirender_evaluation") / FILE).read_text(encoding="utf-8"))
+    return stored_statistics(FILE)
 
 
 def light_means(folder: Path) -> Iterator[tuple[Float[np.ndarray, "16 3"], float]]:
@@ -72,9 +68,4 @@ def write_statistics(folder: Path, path: Path) -> str:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m unirender_evaluation.light_statistics DATA")
-    try:
-        sys.stdout.write(write_statistics(Path(sys.argv[1]), Path(str(resources.files("unirender_evaluation") / FILE))))
-    except UnirenderError as error:
-        sys.exit(str(error))
+    main("unirender_evaluation.light_statistics", write_statistics, FILE)

@@ -25,6 +25,7 @@ from safetensors import safe_open
 
 from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for, shipped_names, trained_pixels
+from unirender.whole_files import replace_file
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.records import Record
@@ -189,7 +190,7 @@ def store(folder: Path, results: Results, tables: Sequence[Table]) -> None:
         for number, table in enumerate(tables)
     ]
     for name, table in zip(names, tables, strict=True):
-        (folder / name).write_text(to_markdown(table))
+        (folder / name).write_text(to_markdown(table), encoding="utf-8")
     for path in folder.glob("[0-9][0-9]-*.md"):
         if path.name not in names:
             path.unlink()
@@ -224,11 +225,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             command = "make bench" if shipped else run_command(suite, results.records)
             head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
             slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
-            text = fill(arguments.readme.read_text(), slot, f"{head}\n\n{selection(tables, shown)}")
+            text = fill(arguments.readme.read_text(encoding="utf-8"), slot, f"{head}\n\n{selection(tables, shown)}")
             if suite == STANDING_SUITE:
                 text = fill(text, "standing", standing_text(results))
             facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=trained_pixels)))
-            arguments.readme.write_text(fill(text, "checkpoint", facts))
+            replace_file(arguments.readme, fill(text, "checkpoint", facts))
         if arguments.stored:
             store(arguments.stored / folder, results, tables)
     except (UnirenderError, OSError) as error:

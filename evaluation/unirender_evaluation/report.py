@@ -37,6 +37,7 @@ from unirender_evaluation.table_formats import (
 )
 from unirender_evaluation.tables import Cell, Row, Table
 
+TITLE = "Rendering and inverse rendering, scored against path tracing"
 TEMPLATES = Path(__file__).parent / "templates"
 STATES = ("HOLDS", "FAILS", "open", "stated")  # how a line of it may begin
 DENSE = 8  # columns: from here on the interval stands below its mean
@@ -62,7 +63,6 @@ def write_report(
     specs: Mapping[str, TableSpec] | None = None,
     sheets: Mapping[Place, Sheet] | None = None,
     verdict: str = "",
-    title: str = "Rendering and inverse rendering, scored against path tracing",
 ) -> Path:
     """Writes the report, atomically.
 
@@ -75,7 +75,6 @@ def write_report(
         specs: columns, for tables beyond `TABLES`.
         sheets: pictures of samples for the table of samples.
         verdict: what `verdict.verdict_text` says of the run; empty = the report has no such list.
-        title: heading of the page.
 
     Returns:
         The path.
@@ -92,7 +91,7 @@ def write_report(
     most = shown_width(gallery)
     samples = sample_sections(tables, records, run, sheets or {})
     page = environment.get_template("report.html.j2").render(
-        title=title,
+        title=TITLE,
         lede=_lede(run, tables),
         watermark=next((table.watermark for table in tables if table.watermark), None),
         resolution=run.resolution,

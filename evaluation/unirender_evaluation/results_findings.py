@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.claims import MASKED
+from unirender_evaluation.claims import MASKED, MaskedNumber
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant, metric_key
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
-from unirender_evaluation.table_list import ALL_METRICS
 
 NOT_RUN = "not run"
 _MATERIAL = re.compile(r"_m(\d{3})_r(\d{3})$")  # of a sample with one number each; others have maps of their own
@@ -28,7 +27,7 @@ _THIRDS = (("0 to 0.3", 0.0, 0.35), ("0.4 to 0.6", 0.35, 0.65), ("0.7 to 1", 0.6
 
 
 @dataclass(frozen=True)
-class Question:
+class Question(MaskedNumber):
     """One number of row `a` against that of row `b`, or of the best trivial row (`against_trivial`).
 
     `scale`: how it is aligned, where its metric has such variants.
@@ -42,15 +41,6 @@ class Question:
     a: str
     b: str = ""
     scale: Scale = "raw"
-
-    @property
-    def kind(self) -> Metric:
-        """The metric that it is about."""
-        return ALL_METRICS[self.metric]
-
-    @property
-    def key(self) -> str:
-        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
 
 
 def run_line(results: Results) -> str:

@@ -103,10 +103,6 @@ def paired_difference(
     a: Mapping[str, float],
     b: Mapping[str, float],
     clusters: Mapping[str, Hashable] | None = None,
-    *,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-    seed: int = SEED,
 ) -> Estimate:
     """Mean of a - b over the samples that both have, with its paired interval.
 
@@ -114,9 +110,6 @@ def paired_difference(
         a: sample -> value.
         b: sample -> value.
         clusters: sample -> what is drawn, e.g. its object; None = every sample for itself.
-        confidence: share of the interval.
-        resamples: bootstrap draws.
-        seed: of the draws.
 
     Raises:
         UnirenderError: if the two share no sample, or a difference is not finite (two identical images: inf - inf).
@@ -134,7 +127,7 @@ def paired_difference(
             "has an infinite PSNR; compare the MSE"
         )
     labels = None if clusters is None else [clusters[sample] for sample in common]
-    return mean_estimate(differences, labels, confidence=confidence, resamples=resamples, seed=seed)
+    return mean_estimate(differences, labels)
 
 
 def beats(

@@ -85,10 +85,10 @@ def _even_remainder(
     return draws[np.argmin(off(draws))]
 
 
-def constant_mse(materials: list[list[Material]], value: float = 0.5) -> tuple[float, float]:
-    """MSE that the constant `value` scores for (metallic, roughness) over all scenes' materials."""
+def constant_mse(materials: list[list[Material]]) -> tuple[float, float]:
+    """MSE that the constant 0.5 scores for (metallic, roughness) over all scenes' materials."""
     flat = np.array([material for scene in materials for material in scene])
-    mse = np.mean((flat - value) ** 2, axis=0)
+    mse = np.mean((flat - 0.5) ** 2, axis=0)
     return float(mse[0]), float(mse[1])
 
 

@@ -8,17 +8,19 @@ Written to `data/training_statistics.toml`, which states where the numbers come 
 import json
 import sys
 import tarfile
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.exr import Channels, channels_rgb, read_exr_bytes
+from unirender.whole_files import replace_file
 
 FILE = "data/training_statistics.toml"
 
@@ -26,9 +28,12 @@ FILE = "data/training_statistics.toml"
 @cache
 def training_statistics() -> dict[str, Any]:
     """`albedo_srgb` (display values), `normal` (unit, camera axes) and `provenance`."""
-    import tomllib
+    return stored_statistics(FILE)
 
-    return tomllib.loads((resources.files("unirender_evaluation") / FILE).read_text(encoding="utf-8"))
+
+def stored_statistics(name: str) -> dict[str, Any]:
+    """A TOML file of the package."""
+    return tomllib.loads((resources.files("unirender_evaluation") / name).read_text(encoding="utf-8"))
 
 
 def object_means(folder: Path) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -87,14 +92,26 @@ def write_statistics(folder: Path, path: Path) -> str:
         )
         + "\n"
     )
-    path.write_text(text, encoding="utf-8")
+    replace_file(path, text)
     return text
 
 
-if __name__ == "__main__":
+def main(module: str, write: Callable[[Path, Path], str], name: str) -> NoReturn:
+    """Entry point of a module that measures a dataset folder: 0, or 1 with one line on standard error.
+
+    Args:
+        module: its name, as it is run.
+        write: measures the folder and writes the file; returns the file's text.
+        name: of the file, in the package.
+    """
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m unirender_evaluation.training_statistics DATA")
+        sys.exit(f"usage: python -m {module} DATA")
     try:
-        sys.stdout.write(write_statistics(Path(sys.argv[1]), Path(str(resources.files("unirender_evaluation") / FILE))))
+        sys.stdout.write(write(Path(sys.argv[1]), Path(str(resources.files("unirender_evaluation") / name))))
     except UnirenderError as error:
         sys.exit(str(error))
+    sys.exit(0)
+
+
+if __name__ == "__main__":
+    main("unirender_evaluation.training_statistics", write_statistics, FILE)

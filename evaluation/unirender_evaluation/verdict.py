@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import FEW, paired_difference
@@ -85,9 +85,7 @@ class CeilingBreach:
         return f"{self.method} exceeds the noise ceiling on {where} by at least {self.low_db:.2f} dB"
 
 
-def ceiling_breaches(
-    records: Sequence[Record], ceiling: str = "noise-ceiling", exempt: Sequence[str] = ()
-) -> list[CeilingBreach]:
+def ceiling_breaches(records: Sequence[Record], exempt: Sequence[str] = ()) -> list[CeilingBreach]:
     """Rows whose paired PSNR interval against the noise ceiling lies above 0; empty in a sound benchmark.
 
     (The ceilings of SSIM and LPIPS are scores of a picture with a little noise of its own: a good row may pass them.)
@@ -96,13 +94,13 @@ def ceiling_breaches(
     noise have an infinite ceiling, which nothing breaches.
     """
     breaches = []
-    for table, protocol in dict.fromkeys((r.table, r.protocol) for r in records if r.method == ceiling):
+    for table, protocol in dict.fromkeys((r.table, r.protocol) for r in records if r.method == CEILING):
         chosen = Selection(table, protocol).of(records)
         clusters = {r.sample: r.object for r in chosen}
-        bound = [r for r in chosen if r.method == ceiling]
+        bound = [r for r in chosen if r.method == CEILING]
         for key in sorted({key for r in bound for key in r.values if ".psnr" in key}):
             limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
-            for method in sorted({r.method for r in chosen} - {ceiling, *exempt}):
+            for method in sorted({r.method for r in chosen} - {CEILING, *exempt}):
                 rows = (r for r in chosen if r.method == method and key in r.values and r.sample in limit)
                 values = {r.sample: r.values[key] for r in rows}
                 if not values:

@@ -160,7 +160,11 @@ NOT_IN_RECORDS = (
 NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
 PARTS: Mapping[str, Part] = {
     "core": Part(
-        {"unirender": ("*.py",), "unirender_evaluation": ("*.py", "physics/*.py"), "unirender_reference": LIGHT_READER},
+        {
+            "unirender": ("*.py", "*.npy"),
+            "unirender_evaluation": ("*.py", "physics/*.py"),
+            "unirender_reference": LIGHT_READER,
+        },
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
         (
             *(f"unirender/{name}.py" for name in OUTSIDE),

@@ -89,7 +89,7 @@ def masked_noise_mse(
 
 def noise_floor_db(mean: Picture, variance: Picture, mask: Mask, premultiplied: bool) -> float:
     """Masked sRGB PSNR in dB that a noise-free prediction would score, by the delta method; inf without noise."""
-    return _decibels(masked_noise_mse(mean, variance, mask, premultiplied))
+    return decibels(masked_noise_mse(mean, variance, mask, premultiplied))
 
 
 def floor_range(mean: Picture, variance: Picture, mask: Mask, premultiplied: bool) -> tuple[float, float]:
@@ -113,7 +113,7 @@ def floor_range(mean: Picture, variance: Picture, mask: Mask, premultiplied: boo
     pixels = (mask * (down * (1 + skew) + up * (1 - skew)) / 2).sum(axis=-1)
     total = mask.sum(dtype=np.float64) * m.shape[-1]
     error, spread = pixels.sum() / total, math.sqrt(np.square(pixels).sum()) / total
-    return _decibels(error), _decibels(error + SIGMAS * spread)
+    return decibels(error), decibels(error + SIGMAS * spread)
 
 
 def measured_floor_db(picture: Estimate, converged: Estimate, mask: Mask, premultiplied: bool) -> float:
@@ -134,7 +134,7 @@ def measured_floor_db(picture: Estimate, converged: Estimate, mask: Mask, premul
     )
     error = float((mask * np.square(shown - true)).sum() / (3 * mask.sum(dtype=np.float64)))
     left_db, _ = floor_range(converged.mean[..., :3], converged.variance[..., :3], mask, premultiplied)
-    return _decibels(max(error - 10 ** (-left_db / 10), 0.0))
+    return decibels(max(error - 10 ** (-left_db / 10), 0.0))
 
 
 def full_spp(wanted: float, batches: int, pixels: int) -> int:
@@ -234,5 +234,6 @@ def floor_provenance(found: Mapping[str, FloorEstimate]) -> dict[str, str]:
     return entries
 
 
-def _decibels(error: float) -> float:
+def decibels(error: float) -> float:
+    """PSNR of a mean squared error, for a peak of 1; inf for an error of exactly 0."""
     return math.inf if error == 0 else -10 * math.log10(error)

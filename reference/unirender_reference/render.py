@@ -44,6 +44,7 @@ __all__ = [
     "SceneSpec",
     "assemble_sample",
     "geometry_spp",
+    "material_text",
     "render_sample",
     "renderer_of",
     "renderer_provenance",
@@ -273,8 +274,8 @@ def assemble_sample(
         **provenance,
         "depth": str(IMAGE_DEPTH),
         "light": spec.light.name,
-        "roughness": _value(spec.roughness),
-        "metallic": _value(spec.metallic),
+        "roughness": material_text(spec.roughness),
+        "metallic": material_text(spec.metallic),
         "exposure_seed": str(spec.exposure_seed),
         "exposure_factor": repr(factor),
         "nan_pixels": str(sum(estimate.nan_pixels for estimate in estimates.values())),
@@ -286,7 +287,8 @@ def assemble_sample(
     return Sample(image.mean[..., :3], intrinsics, variance, header)
 
 
-def _value(value: float | None) -> str:
+def material_text(value: float | None) -> str:
+    """A roughness or metallic in header attributes; None: the object's own map."""
     return "map" if value is None else f"{value:g}"
 
 

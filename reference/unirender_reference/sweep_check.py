@@ -40,12 +40,11 @@ def brute_force(
     spp: int,
     seed: int,
     batches: int,
-    depth: int = IMAGE_DEPTH,
 ) -> Pairs:
     """Every pair with a seed of its own; arguments as `render_sweep`."""
     found = [
         [
-            renderer.image(environment, r, m, spp, derive_seed(seed, "pair", i, j), depth, batches)
+            renderer.image(environment, r, m, spp, derive_seed(seed, "pair", i, j), IMAGE_DEPTH, batches)
             for j, m in enumerate(metallic_values)
         ]
         for i, r in enumerate(roughness_values)

@@ -5,13 +5,14 @@ A solid texture is a function from points of R^3 (the object about in [-1, 1]^3)
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from unirender.color import srgb_decode
-from unirender_reference.shapes.noise import soft_step, value_noise
+from unirender_reference.shapes.noise import ValueNoise, soft_step, value_noise
 
 DARKEST, BRIGHTEST = 0.015, 0.95
 
@@ -57,16 +58,124 @@ def _ramp(value: np.ndarray, palette: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(value, stops, palette[:, k]) for k in range(3)], -1)
 
 
+@dataclass(frozen=True)
+class _Pattern:
+    """What the kinds of patterns are made of.
+
+    Attributes:
+        palette: two to four colours.
+        noise: a field that blurs, bends or is the pattern.
+        axis: unit direction of stripes, veins, rings and gradients.
+        frequency: of what is repeated.
+        phase: shift of what is repeated.
+        warp: how much the noise, in float32, bends; 0 or more. As numpy's own float64 it makes that float64.
+        sites: places of cells and spots.
+        site_color: a colour of the palette for each of them.
+        size: of spots, in mean distances of the sites.
+        share: level of speckles; above 0 cells have joints.
+    """
+
+    palette: Float[np.ndarray, "colors 3"]
+    noise: ValueNoise
+    axis: Float[np.ndarray, "3"]
+    frequency: float
+    phase: Float[np.ndarray, "3"]
+    warp: np.float64
+    sites: KDTree
+    site_color: Float[np.ndarray, "sites 3"]
+    size: float
+    share: float
+
+    def along(self, points: np.ndarray) -> np.ndarray:
+        """Place along the axis."""
+        return points.astype(np.float64) @ self.axis
+
+    def swing(self, points: np.ndarray) -> np.ndarray:
+        """Place along the axis in periods, bent."""
+        bent = self.warp * 2 * self.noise(points * 2)
+        return self.along(points) * self.frequency + self.phase[0] + bent
+
+    def nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distances to the two nearest sites, and which these are; the points are bent."""
+        bent = self.warp * np.stack([self.noise(points * 2 + k) for k in range(3)], -1)
+        distance, index = self.sites.query(points.astype(np.float64) + bent, k=2)
+        return np.asarray(distance), np.asarray(index)
+
+
+def _checker(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    cell = np.floor(points.astype(np.float64) * of.frequency + of.phase).astype(int)
+    return of.palette[cell.sum(-1) % len(of.palette)]
+
+
+def _stripes(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    return of.palette[np.floor(of.swing(points) * 1.5).astype(int) % len(of.palette)]
+
+
+def _bands(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    return _ramp(0.5 + 0.5 * np.sin(2 * np.pi * of.swing(points) * 0.5), of.palette)
+
+
+def _gradient(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    return _ramp(np.clip(0.5 + 0.5 * of.along(points) + 0.3 * of.warp * of.noise(points * 2), 0, 1), of.palette)
+
+
+def _wood(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    off = points.astype(np.float64) - of.along(points)[..., None] * of.axis + 0.4 * of.phase
+    grain = 0.5 * of.noise.fractal(points * [1, 3, 1], 2)
+    rings = (np.linalg.norm(off, axis=-1) * 2.5 * of.frequency + grain) % 1
+    return _ramp(rings**1.5, of.palette[:2])
+
+
+def _marble(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    veins = np.sin(2 * np.pi * (of.along(points) * of.frequency * 0.5 + of.noise.fractal(points * 1.5, 4)))
+    return _ramp(np.abs(veins) ** 0.6, of.palette)
+
+
+def _clouds(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    return _ramp(np.clip(0.5 + 0.9 * of.noise.fractal(points * of.frequency, 4), 0, 1), of.palette)
+
+
+def _speckle(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    grain = of.noise.fractal(points * (4 + 3 * of.frequency), 2)
+    return of.palette[0] + (of.palette[1] - of.palette[0]) * soft_step(grain - of.share, 0.1)[..., None]
+
+
+def _cells(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    distance, nearest = of.nearest(points)
+    inside = soft_step(distance[..., 1] - distance[..., 0] - 0.06, 0.03)[..., None]
+    color = of.site_color[nearest[..., 0]]
+    joint = of.palette[0] if of.share > 0 else color
+    return joint + (color - joint) * inside
+
+
+def _spots(of: _Pattern, points: np.ndarray) -> np.ndarray:
+    distance, nearest = of.nearest(points)
+    radius = of.size * 1.1 / len(of.site_color) ** (1 / 3)
+    inside = soft_step(radius - distance[..., 0], 0.03)[..., None]
+    color = of.palette[1 + nearest[..., 0] % (len(of.palette) - 1)]
+    return of.palette[0] + (color - of.palette[0]) * inside
+
+
+# of each kind its chance and its colours
+KINDS: dict[str, tuple[float, Callable[[_Pattern, np.ndarray], np.ndarray]]] = {
+    "checker": (0.1, _checker),
+    "stripes": (0.12, _stripes),
+    "clouds": (0.14, _clouds),
+    "cells": (0.12, _cells),
+    "marble": (0.12, _marble),
+    "spots": (0.1, _spots),
+    "gradient": (0.1, _gradient),
+    "wood": (0.07, _wood),
+    "speckle": (0.06, _speckle),
+    "bands": (0.07, _bands),
+}
+
+
 def random_texture(rng: np.random.Generator) -> tuple[str, SolidTexture]:
     """Draws a kind of pattern and its parameters; returns its name and the texture."""
     palette = random_palette(rng)
     noise = value_noise(rng)
-    kind = str(
-        rng.choice(
-            ["checker", "stripes", "clouds", "cells", "marble", "spots", "gradient", "wood", "speckle", "bands"],
-            p=[0.1, 0.12, 0.14, 0.12, 0.12, 0.1, 0.1, 0.07, 0.06, 0.07],
-        )
-    )
+    kind = str(rng.choice(list(KINDS), p=[chance for chance, _ in KINDS.values()]))
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     frequency = rng.uniform(1.0, 4.0)
@@ -76,40 +185,6 @@ def random_texture(rng: np.random.Generator) -> tuple[str, SolidTexture]:
     sites = KDTree(rng.uniform(-1.2, 1.2, (count, 3)))
     site_color = palette[rng.integers(len(palette), size=count)]
     size, share = rng.uniform(0.35, 0.8), rng.uniform(-0.35, 0.35)
-
-    def texture(points: np.ndarray) -> np.ndarray:
-        p = points.astype(np.float64)
-        if kind == "checker":
-            parity = np.floor(p * frequency + phase).astype(int).sum(-1) % len(palette)
-            return palette[parity]
-        if kind in ("stripes", "bands", "wood", "marble", "gradient"):
-            along = p @ axis
-            if kind == "gradient":
-                return _ramp(np.clip(0.5 + 0.5 * along + 0.3 * warp * noise(points * 2), 0, 1), palette)
-            if kind == "wood":
-                around = np.linalg.norm(p - along[..., None] * axis + 0.4 * phase, axis=-1)
-                rings = (around * 2.5 * frequency + 0.5 * noise.fractal(points * [1, 3, 1], 2)) % 1
-                return _ramp(rings**1.5, palette[:2])
-            if kind == "marble":
-                veins = np.sin(2 * np.pi * (along * frequency * 0.5 + noise.fractal(points * 1.5, 4)))
-                return _ramp(np.abs(veins) ** 0.6, palette)
-            swing = along * frequency + phase[0] + warp * 2 * noise(points * 2)
-            if kind == "stripes":
-                return palette[np.floor(swing * 1.5).astype(int) % len(palette)]
-            return _ramp(0.5 + 0.5 * np.sin(2 * np.pi * swing * 0.5), palette)
-        if kind == "clouds":
-            return _ramp(np.clip(0.5 + 0.9 * noise.fractal(points * frequency, 4), 0, 1), palette)
-        if kind == "speckle":
-            grain = noise.fractal(points * (4 + 3 * frequency), 2)
-            return palette[0] + (palette[1] - palette[0]) * soft_step(grain - share, 0.1)[..., None]
-        shifted = p + warp * np.stack([noise(points * 2 + k) for k in range(3)], -1)
-        distance, nearest = map(np.asarray, sites.query(shifted, k=2))
-        if kind == "cells":
-            edge = soft_step(distance[..., 1] - distance[..., 0] - 0.06, 0.03)[..., None]
-            joint = palette[0] if share > 0 else site_color[nearest[..., 0]]
-            return joint + (site_color[nearest[..., 0]] - joint) * edge
-        radius = size * 1.1 / count ** (1 / 3)
-        inside = soft_step(radius - distance[..., 0], 0.03)[..., None]
-        return palette[0] + (palette[1 + nearest[..., 0] % (len(palette) - 1)] - palette[0]) * inside
-
-    return kind, lambda points: np.clip(texture(points), DARKEST, BRIGHTEST).astype(np.float32)
+    pattern = _Pattern(palette, noise, axis, frequency, phase, warp, sites, site_color, size, share)
+    color = KINDS[kind][1]
+    return kind, lambda points: np.clip(color(pattern, points), DARKEST, BRIGHTEST).astype(np.float32)

@@ -16,10 +16,11 @@ albedo in the direction v; the sum is split because the light and F are averaged
 """
 
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
@@ -31,6 +32,7 @@ COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced o
 LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
 LOBES = 4  # at a time: their samples stay in the processor's cache
 GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
+TABLES = Path(__file__).with_name("environment_brdf.npy")  # what `integrate_environment_brdf` gives, [2 n r], float64
 
 
 def fresnel(albedo: Any, metallic: Any) -> Any:
@@ -67,10 +69,20 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     """
     maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
-    n_v = dots(unit_normals(maps["normal"]), view)
-    reflectance = mean_fresnel(fresnel(maps["albedo"], maps["metallic"]), n_v, maps["roughness"])
-    radiance = lobes(maps["albedo"], maps["metallic"], maps["diffuse"], maps["specular"], reflectance)
-    return (radiance * maps["mask"]).astype(np.float32)
+    covered = np.flatnonzero(maps["mask"])
+    seen = {name: _pixels(value, covered) for name, value in maps.items()}
+    n_v = dots(unit_normals(seen["normal"]), _pixels(view, covered))
+    reflectance = mean_fresnel(fresnel(seen["albedo"], seen["metallic"]), n_v, seen["roughness"])
+    radiance = lobes(seen["albedo"], seen["metallic"], seen["diffuse"], seen["specular"], reflectance)
+    image = np.zeros((maps["mask"].size, 3), np.float32)
+    image[covered] = radiance * seen["mask"]
+    return image.reshape(view.shape)
+
+
+def _pixels(picture: Float[np.ndarray, "h w c"], which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:
+    """Those pixels, by their place in the flat picture."""
+    flat = picture.reshape(-1, picture.shape[-1])
+    return flat if len(which) == len(flat) else flat.take(which, axis=0)
 
 
 def mean_fresnel(
@@ -84,7 +96,7 @@ def mean_fresnel(
 def environment_brdf(
     n_v: Float[np.ndarray, "*size"], roughness: Float[np.ndarray, "*size"]
 ) -> tuple[Float[np.ndarray, "*size"], Float[np.ndarray, "*size"]]:
-    """Karis's scale A and bias B of F0, interpolated (bilinearly) in a table that is integrated at the first call.
+    """Karis's scale A and bias B of F0, interpolated (bilinearly) in a table.
 
     Args:
         n_v: cosine between normal and view direction; clipped to [0, 1].
@@ -103,12 +115,17 @@ def environment_brdf(
 
 @functools.cache
 def environment_brdf_tables() -> tuple[Float[np.ndarray, "n r"], Float[np.ndarray, "n r"]]:
-    """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1; integrated at the first call."""
+    """A and B at evenly spaced n.v (rows) and roughnesses (columns), both from 0 to 1, from the file that ships."""
+    a, b = np.load(TABLES)
+    return a, b
+
+
+def integrate_environment_brdf() -> Float[np.ndarray, "2 n r"]:
+    """What `TABLES` holds. It ships since to integrate takes a quarter of a second, in every process that renders."""
     n_v = np.maximum(np.linspace(0, 1, COSINES), GRAZING)
     alpha = np.maximum(np.square(np.linspace(0, 1, ROUGHNESSES)), MIN_ALPHA)
     blocks = [[_integrate_lobes(rows, float(r)) for r in alpha] for rows in np.split(n_v, COSINES // LOBES)]
-    a, b = np.array(blocks).transpose(2, 0, 3, 1).reshape(2, COSINES, ROUGHNESSES)
-    return a, b
+    return np.array(blocks).transpose(2, 0, 3, 1).reshape(2, COSINES, ROUGHNESSES)
 
 
 def _integrate_lobes(

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 Sampler = Literal["ddim", "unipc"]
+Material = Literal["scalar", "map"]
 
 MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
 
@@ -172,6 +173,9 @@ class DecompositionOptions:
     longer; 6 give most of it."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
+    material: Material | None = None
+    """scalar: one roughness and one metallic for the object; map: one for each pixel. None: as the checkpoint was
+    trained, scalar for those shipped."""
 
     def check(self, mode: str) -> None:
         """Looks at the values.
@@ -209,8 +213,8 @@ class InputOptions:
     """The picture."""
 
     picture: Annotated[Path, tyro.conf.Positional]
-    """PNG, JPG or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a folder of them,
-    too."""
+    """PNG, JPG, TIFF, WebP, BMP or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a
+    folder of them, too."""
     mask: Path | None = None
     """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
     None: the alpha channel, else the whole frame."""

@@ -59,7 +59,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender", ("composite.py", "lighting.py", "intrinsics.py", "symmetries.py")),
+        ("core", "unirender", ("composite.py", "environment_brdf.npy", "lighting.py", "symmetries.py")),
         ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "methods.py", "tasks.py", "predictions.py")),
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),

@@ -19,7 +19,7 @@ from unirender.exr import image_channels, intrinsics_channels, on_pole_grid, rea
 from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_sha256
-from unirender.whole_files import replace_file
+from unirender.whole_files import replace_file, whole_file
 
 RNG = np.random.default_rng(0)
 
@@ -294,6 +294,27 @@ def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         replace_file(path, "newer")
     assert path.read_bytes() == b"new"
     assert [file.name for file in path.parent.iterdir()] == ["file"]
+
+
+def test_a_stream_that_breaks_leaves_what_was_there_and_nothing_aside(tmp_path: Path) -> None:
+    """What it wrote would else fill the disk whose end it met."""
+    path = tmp_path / "state"
+    path.write_bytes(b"old")
+
+    def fill() -> None:
+        with whole_file(path) as file:
+            file.write(b"half")
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(OSError, match=r"No space left on device: .*state'"):
+        fill()
+    assert path.read_bytes() == b"old"
+    assert [each.name for each in tmp_path.iterdir()] == ["state"]
+    with whole_file(path) as file:
+        file.write(b"new")
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert [each.name for each in tmp_path.iterdir()] == ["state"]
 
 
 def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The pipeline with an untrained model: shapes, sizes, seeds, anchoring, errors. Scores are the benchmark's task."""
 
 import inspect
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.options import MOST_STEPS
+from unirender.options import MOST_STEPS, DecompositionOptions
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 from unirender.pipelines.editing import (
@@ -36,6 +36,7 @@ from unirender.pipelines.editing import (
 )
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import constant_map
+from unirender.pipelines.settings import TAKING_APART
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 
@@ -182,6 +183,10 @@ def test_materials_are_scalars_or_maps(pipeline: UniRenderPipeline) -> None:
     assert np.ptp(get(scalar.intrinsics, "roughness")[inside]) < 1e-6
     assert np.ptp(get(per_pixel.intrinsics, "roughness")[inside]) > 1e-3
     assert scalar.roughness == pytest.approx(per_pixel.roughness, abs=1e-5)
+
+
+def test_the_commands_have_every_setting_of_a_decomposition() -> None:
+    assert asdict(DecompositionOptions()) == TAKING_APART
 
 
 def test_seed_decides(pipeline: UniRenderPipeline) -> None:

@@ -69,7 +69,7 @@ def test_losses_after_a_kill_are_those_without(tmp_path: Path) -> None:
     assert len(before) < STEPS / LOG_EVERY
     altered = shutil.copytree(killed, tmp_path / "altered")
     torn = (killed / STATE_FILE).read_bytes()[:1000]
-    (killed / f"{STATE_FILE}.partial").write_bytes(torn)  # as if killed while it wrote the state
+    (killed / f".{STATE_FILE}.part").write_bytes(torn)  # as if killed while it wrote the state
     for process in [start(data, killed), start(data, whole)]:
         finish(process)
     assert logged(killed) == logged(whole)  # bit for bit
@@ -79,4 +79,4 @@ def test_losses_after_a_kill_are_those_without(tmp_path: Path) -> None:
     train(options, TRAIN, altered)
     assert [line["step"] for line in logged(altered)] == [line["step"] for line in logged(whole)]
     assert logged(altered) != logged(whole)  # the twin: resumed with other random numbers
-    assert not (killed / f"{STATE_FILE}.partial").exists()
+    assert not (killed / f".{STATE_FILE}.part").exists()

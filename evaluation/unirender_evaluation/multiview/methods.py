@@ -56,12 +56,13 @@ class Optimized:
     """Our optimiser, all stages and ingredients.
 
     Args:
-        name: of the row.
         config: of `unirender_reference.optimize.run.optimize`; None: its default.
     """
 
-    def __init__(self, name: str = OPTIMISED, config: OptimizeConfig | None = None) -> None:
-        self.name, self.settings = name, OptimizeConfig() if config is None else config
+    name = OPTIMISED
+
+    def __init__(self, config: OptimizeConfig | None = None) -> None:
+        self.settings = OptimizeConfig() if config is None else config
 
     @property
     def config(self) -> dict[str, Any]:
@@ -78,8 +79,8 @@ class PlainLoop:
 
     name = PLAIN
 
-    def __init__(self, iterations: int = PLAIN_ITERATIONS) -> None:
-        self.settings = RefineConfig.plain(iterations)
+    def __init__(self) -> None:
+        self.settings = RefineConfig.plain(PLAIN_ITERATIONS)
 
     @property
     def config(self) -> dict[str, Any]:

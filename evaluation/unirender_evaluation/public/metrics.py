@@ -23,7 +23,7 @@ from scipy.ndimage import binary_erosion, correlate1d
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000
+from unirender_evaluation.metrics import SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000, psnr_from_mse
 
 ERODED = 5  # pixels, side of the square by which Stanford-ORB shrinks its masks
 PEAK_HDR, PEAK_LDR = 4.0, 1.0  # radiance at which PSNR-H and PSNR-L clip
@@ -104,8 +104,7 @@ def orb_psnr(p: Rgb, t: Rgb, m: OneMask, *, peak: float, lift: bool, encode: boo
 
 
 def _frame_psnr(p: Rgb, t: Rgb) -> float:
-    error = float(np.square(p.astype(np.float64) - t).mean())
-    return math.inf if error == 0 else -10 * math.log10(error)
+    return psnr_from_mse(float(np.square(p.astype(np.float64) - t).mean()))
 
 
 def psnr_h(p: Rgb, t: Rgb, m: OneMask, aligned: bool) -> OrbPsnr:

@@ -16,6 +16,7 @@ from unirender_reference.render import Renderer
 SIZE = 16
 SPP = 256
 FINE = 3
+FINER = 24  # rows and columns of the quadrature, for each of the map
 TEXELS = ((4, 0), (7, 23), (3, 12), (8, 17))  # rows and columns of a 12 x 24 map: both borders, both sides
 # roughness, metallic, and the quadrature: rays along a pixel, nodes of a lobe. Narrow lobes need rays, wide ones nodes.
 IMAGE_MATERIALS = ((0.15, 0.9, 4, 12), (0.4, 0.5, 3, 20), (0.8, 0.0, 2, 20))
@@ -105,9 +106,9 @@ def _lobes(seed: int) -> Float[np.ndarray, "32 64 3"]:
     return (lobes @ rng.uniform(1, 6, (4, 3)) + rng.uniform(0.1, 0.3, 3)).astype(np.float32)
 
 
-def _lit_directions(light: Float[np.ndarray, "h w 3"], fine: int = 24) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of a grid `fine` times finer than the map where it shines, and radiance times solid angle there."""
-    rows, columns = (light.shape[0] - 1) * fine, light.shape[1] * fine
+def _lit_directions(light: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of a grid `FINER` times finer than the map where it shines, and radiance times solid angle there."""
+    rows, columns = (light.shape[0] - 1) * FINER, light.shape[1] * FINER
     theta = (np.arange(rows) + 0.5) * np.pi / rows
     phi = (np.arange(columns) + 0.5) * 2 * np.pi / columns
     theta, phi = (grid.ravel() for grid in np.meshgrid(theta, phi, indexing="ij"))

@@ -126,13 +126,13 @@ class Passes:
     def write(self, renders: "Renders", folder: Path) -> None:
         """Writes the two files."""
         from unirender.exr import write_exr
-        from unirender_reference.render import renderer_provenance
+        from unirender_reference.render import material_text, renderer_provenance
 
         attributes = {
             **renderer_provenance(renders.renderer),
             "light": renders.light,
-            "roughness": _described(self.roughness),
-            "metallic": _described(self.metallic),
+            "roughness": material_text(self.roughness),
+            "metallic": material_text(self.metallic),
             "spp": str(self.spp),
             "seed": str(self.seed),
             "exposure_factor": repr(renders.factor),
@@ -268,7 +268,3 @@ def _picture(channels: "dict[str, np.ndarray]", name: str) -> "np.ndarray":
     from unirender.exr import channels_rgb
 
     return channels_rgb(channels, name)
-
-
-def _described(value: float | None) -> str:
-    return "map" if value is None else f"{value:g}"

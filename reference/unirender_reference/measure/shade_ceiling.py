@@ -5,7 +5,6 @@ missing light (shadows, interreflection) and averaging (highlights narrower than
 whose predictions are shaded again (closed loop) cannot be expected to score better.
 """
 
-import math
 import statistics
 from dataclasses import dataclass
 from typing import Any
@@ -105,7 +104,8 @@ def masked_psnr(image: Any, truth: Any, mask: Any) -> float:
     import numpy as np
 
     from unirender.color import srgb_encode, unpremultiply
+    from unirender_reference.noise import decibels
 
     a, b = (srgb_encode(np.clip(unpremultiply(linear, mask), 0, 1)).astype(np.float64) for linear in (image, truth))
     error = float((mask * np.square(a - b)).sum() / (3 * mask.sum(dtype=np.float64)))
-    return math.inf if error == 0 else -10 * math.log10(error)
+    return decibels(error)

@@ -36,45 +36,12 @@ def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
         UnirenderError: the object lacks texture coordinates or a texture.
     """
     pictures = texture_pixels(obj)
-    assert obj.uv is not None  # texture_pixels has looked
-    body = bytearray()
-    views: list[dict[str, int]] = []
-
-    def view(data: bytes, **more: int) -> int:
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data), **more})
-        body.extend(data + b"\0" * (-len(data) % 4))
-        return len(views) - 1
-
-    accessors: list[dict[str, Any]] = []
-
-    def accessor(values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
-        where = view(np.ascontiguousarray(values).tobytes(), target=target)
-        accessors.append({"bufferView": where, "componentType": component, "count": len(values), "type": kind, **more})
-        return len(accessors) - 1
-
-    vertices = obj.vertices.astype("<f4")
-    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
-    attributes = {
-        "POSITION": accessor(vertices, "VEC3", FLOAT, ARRAY_BUFFER, **bounds),
-        "NORMAL": accessor(obj.normals.astype("<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
-        "TEXCOORD_0": accessor(obj.uv.astype("<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
-    }
-    indices = accessor(obj.faces.astype("<u4").reshape(-1), "SCALAR", UNSIGNED, ELEMENT_BUFFER)
+    buffer = _Buffer()
+    primitive = {**_geometry(obj, buffer), "material": 0}
     images = [
-        {"bufferView": view(png_bytes(pixels)), "mimeType": "image/png", "name": name}
+        {"bufferView": buffer.view(png_bytes(pixels)), "mimeType": "image/png", "name": name}
         for name, pixels in pictures.items()
     ]
-    index = {name: {"index": k} for k, name in enumerate(pictures)}
-    material: dict[str, Any] = {
-        "name": obj.name,
-        "doubleSided": True,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": index["base_color"],
-            "metallicRoughnessTexture": index["metallic_roughness"],
-        },
-    }
-    if "normal" in index:
-        material["normalTexture"] = index["normal"]
     node: dict[str, Any] = {"mesh": 0, "name": obj.name}
     if place is not None:
         node |= {"translation": place.center.tolist(), "scale": [place.radius] * 3}
@@ -83,17 +50,74 @@ def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
-        "materials": [material],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [_material(obj.name, list(pictures))],
         "textures": [{"source": k, "sampler": 0} for k in range(len(images))],
         "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": REPEAT, "wrapT": REPEAT}],
         "images": images,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(body)}],
+        "accessors": buffer.accessors,
+        "bufferViews": buffer.views,
+        "buffers": [{"byteLength": len(buffer.body)}],
     }
     text = json.dumps(document, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
+    return _container(text + b" " * (-len(text) % 4), bytes(buffer.body))
+
+
+class _Buffer:
+    """The binary chunk, and what the document says of its parts."""
+
+    def __init__(self) -> None:
+        self.body = bytearray()
+        self.views: list[dict[str, int]] = []
+        self.accessors: list[dict[str, Any]] = []
+
+    def view(self, data: bytes, **more: int) -> int:
+        """Appends a part; returns the index of its view."""
+        self.views.append({"buffer": 0, "byteOffset": len(self.body), "byteLength": len(data), **more})
+        self.body.extend(data + b"\0" * (-len(data) % 4))
+        return len(self.views) - 1
+
+    def accessor(self, values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
+        """Appends an array; returns the index of its accessor."""
+        where = self.view(np.ascontiguousarray(values).tobytes(), target=target)
+        self.accessors.append(
+            {"bufferView": where, "componentType": component, "count": len(values), "type": kind, **more}
+        )
+        return len(self.accessors) - 1
+
+
+def _geometry(obj: MeshObject, buffer: _Buffer) -> dict[str, Any]:
+    """Attributes and indices of the mesh's primitive, whose arrays go into the buffer."""
+    assert obj.uv is not None  # texture_pixels has looked
+    vertices = obj.vertices.astype("<f4")
+    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
+    attributes = {
+        "POSITION": buffer.accessor(vertices, "VEC3", FLOAT, ARRAY_BUFFER, **bounds),
+        "NORMAL": buffer.accessor(obj.normals.astype("<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
+        "TEXCOORD_0": buffer.accessor(obj.uv.astype("<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
+    }
+    indices = buffer.accessor(obj.faces.astype("<u4").reshape(-1), "SCALAR", UNSIGNED, ELEMENT_BUFFER)
+    return {"attributes": attributes, "indices": indices}
+
+
+def _material(name: str, pictures: list[str]) -> dict[str, Any]:
+    """The material, whose textures are the pictures of these names in their order."""
+    index = {picture: {"index": k} for k, picture in enumerate(pictures)}
+    material: dict[str, Any] = {
+        "name": name,
+        "doubleSided": True,
+        "pbrMetallicRoughness": {
+            "baseColorTexture": index["base_color"],
+            "metallicRoughnessTexture": index["metallic_roughness"],
+        },
+    }
+    if "normal" in index:
+        material["normalTexture"] = index["normal"]
+    return material
+
+
+def _container(text: bytes, body: bytes) -> bytes:
+    """The file of a JSON chunk and a binary one, whose lengths are multiples of 4."""
     chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(body), BINARY_CHUNK) + body
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 

@@ -17,6 +17,7 @@ from unirender.errors import UnirenderError
 from unirender_reference.optimize.descent import interpolation
 from unirender_reference.optimize.differences import difference_matrix, side_by_side
 
+POINTS = 8  # along each side of a cell, over which a map is averaged
 LEAST_SINE = 0.15  # of theta, in the weights of differences: columns meet at the poles
 
 
@@ -88,11 +89,11 @@ class LightGrid:
         """The cells as an environment map on Mitsuba's grid (which interpolates between texels)."""
         return cells.reshape(self.rows, self.columns, 3).astype(np.float32)
 
-    def averages(self, environment: Float[np.ndarray, "h w 3"], oversampling: int = 8) -> Float[np.ndarray, "j 3"]:
-        """Mean radiance of an environment map over each cell (midpoint rule, `oversampling` points along each side)."""
+    def averages(self, environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "j 3"]:
+        """Mean radiance of an environment map over each cell (midpoint rule, `POINTS` of them along each side)."""
         height, width = environment.shape[:2]
         upper, lower = self.cosines
-        part = (np.arange(oversampling) + 0.5) / oversampling
+        part = (np.arange(POINTS) + 0.5) / POINTS
         theta = np.arccos(np.clip(upper[:, None] + (lower - upper)[:, None] * part, -1, 1)).ravel()
         y, x = (
             theta / np.pi * (height - 1),
@@ -107,7 +108,7 @@ class LightGrid:
         above = texels(top, left) * (1 - right) + texels(top, left + 1) * right
         below = texels(top + 1, left) * (1 - right) + texels(top + 1, left + 1) * right
         fine = above * (1 - down) + below * down
-        blocks = fine.reshape(self.rows, oversampling, self.columns, oversampling, 3)
+        blocks = fine.reshape(self.rows, POINTS, self.columns, POINTS, 3)
         return blocks.mean(axis=(1, 3)).reshape(-1, 3).astype(np.float32)
 
 

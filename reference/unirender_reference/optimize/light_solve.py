@@ -7,7 +7,6 @@ approximation: the derivative of the eliminated scales is projected out). Priors
 nearly neutral in colour.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,14 +66,12 @@ def solve_light(
     prior: LightPrior,
     iterations: int,
     tolerance: float = 2e-3,
-    on_step: Callable[[Solved], None] | None = None,
 ) -> Solved:
     """The least cost that Levenberg-Marquardt finds from `start`.
 
     Args:
         iterations: at most.
         tolerance: ends where a step lowers the cost by less than this share.
-        on_step: called after each step.
     """
     present, damping = evaluate(fit, start, prior), 1e-2
     for _ in range(iterations):
@@ -90,8 +87,6 @@ def solve_light(
             return present
         gain = 1 - trial.cost / present.cost
         present, damping = trial, max(damping / 4, 1e-6)
-        if on_step is not None:
-            on_step(present)
         if gain < tolerance:
             return present
     return present

@@ -23,16 +23,13 @@ MOST_DIFFERENCE = 0.5  # beyond which a border costs no more
 SWEEPS = 12
 
 
-def search_materials(
-    fit: PixelFit, appearance: Appearance, position: Float[np.ndarray, "n 3"], pull: float = PULL
-) -> Appearance:
+def search_materials(fit: PixelFit, appearance: Appearance, position: Float[np.ndarray, "n 3"]) -> Appearance:
     """The appearance with a roughness and a metallic for each patch.
 
     Args:
         fit: matrices and pixels.
         appearance: light and the present materials, which every patch starts from.
         position: of each pixel on the surface.
-        pull: of neighbours on one another.
     """
     values = np.array([(r, m) for r in NODES for m in METALLIC])
     costs = _costs(fit, appearance)
@@ -42,7 +39,7 @@ def search_materials(
     distance = np.minimum(np.abs(values[:, None] - values[None]).sum(axis=2), MOST_DIFFERENCE)
     rng = np.random.default_rng(0)
     for _ in range(SWEEPS):
-        best = (costs + pull * distance[chosen[around]].sum(axis=1)).argmin(axis=1)
+        best = (costs + PULL * distance[chosen[around]].sum(axis=1)).argmin(axis=1)
         turn = rng.random(len(chosen)) < 0.5  # not all at once: two neighbours that follow each other never settle
         chosen = np.where(turn, best, chosen)
     found = values[chosen]

@@ -1,7 +1,6 @@
 """Where a refinement stands: maps, moments and the iteration, in memory and in a file."""
 
 import dataclasses
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.whole_files import whole_file
 from unirender_reference.optimize.descent import PyramidAdam
 from unirender_reference.optimize.light_grid import interpolated_light
 from unirender_reference.optimize.parameters import NAMES, Name, to_map, to_parameter
@@ -72,12 +72,8 @@ class RefineState:
         arrays |= {f"first.{name}": values for name, values in self.first.items()}
         for name, moments in self.moments.items():
             arrays |= {f"moment.{name}.{index}": array for index, array in enumerate(moments.arrays())}
-        temporary = path.with_name(path.name + ".partial")
-        with temporary.open("wb") as file:
+        with whole_file(path) as file:
             np.savez(file, iteration=self.iteration, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
 
     @classmethod
     def load(cls, path: Path, start: Solution, config: RefineConfig) -> "RefineState":

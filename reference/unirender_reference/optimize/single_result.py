@@ -47,50 +47,75 @@ def result(
         known_mesh: normals and shadows are the mesh's.
         trust: what part of the changes of albedo and of a predicted light is kept.
     """
-    picture, covered, size = fit.picture, mask > 0, mask.shape[:2]
-    grid = picture.transport.grid
-
-    def wide(values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
-        return enlarge(picture, values, size)
-
-    change = np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo
-    albedo = np.exp(np.log(maps["albedo"] + DARKEST) + trust.albedo * wide(change)) - DARKEST
-    albedo = np.clip(albedo, 0, 1)
-    if init is None and picture.block > 1:
-        albedo = albedo * _ratio(unpremultiply(image_linear, mask), _blurred(picture, image_linear, mask))
+    albedo = _changed_albedo(fit, at, maps["albedo"], trust, mask.shape[:2])
+    if init is None and fit.picture.block > 1:
+        straight = unpremultiply(image_linear, mask)
+        albedo = albedo * _ratio(straight, _blurred(fit.picture, image_linear, mask))
     gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
     if init is None:
         gauge = np.full(3, gauge.mean())
-    albedo = albedo / np.maximum(gauge, DARK)
     light = fit.environment(at) * gauge
-    if init is not None and init.environment is not None:
-        predicted = resample_environment(init.environment, (grid.rows, grid.columns)).reshape(light.shape)
-        light = np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
-    specular, diffuse = (wide(values) for values in light_buffers(fit, at, fit.environment(at) * gauge))
-    if init is not None and init.specular is not None and init.diffuse is not None:
-        start = fit.start()
-        before = (init.specular, init.diffuse)
-        if not known_mesh:  # what a normal map cannot show of the light stands in the prediction alone
-            before = (wide(values) for values in light_buffers(fit, start, fit.environment(start)))
-        specular, diffuse = (
-            own * _ratio(new, old) ** trust.shading
-            for own, new, old in zip((init.specular, init.diffuse), (specular, diffuse), before, strict=True)
-        )
-    normal = maps["normal"]
-    if known_mesh:
-        normal = wide(picture.normal)
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    specular, diffuse = _shading(fit, at, light, init, known_mesh, trust, mask.shape[:2])
     found = {
-        "albedo": np.clip(albedo, 0, 1),
-        "normal": normal,
+        "albedo": np.clip(albedo / np.maximum(gauge, DARK), 0, 1),
+        "normal": _mesh_normal(fit.picture, mask.shape[:2]) if known_mesh else maps["normal"],
         "roughness": np.clip(maps["roughness"] + at.roughness, 0, 1),
         "metallic": np.clip(maps["metallic"] + at.metallic, 0, 1),
         "specular": specular,
         "diffuse": diffuse,
     }
-    found = {name: np.where(covered, values, 0).astype(np.float32) for name, values in found.items()}
-    environment = grid.environment(light)
+    found = {name: np.where(mask > 0, values, 0).astype(np.float32) for name, values in found.items()}
+    environment = fit.picture.transport.grid.environment(_trusted_light(fit, light, init, trust))
     return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
+
+
+def _changed_albedo(
+    fit: Fit, at: Unknowns, start: Float[np.ndarray, "h w 3"], trust: Trust, size: tuple[int, int]
+) -> Float[np.ndarray, "h w 3"]:
+    """The start with what is trusted of the change that the search found."""
+    change = enlarge(fit.picture, np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo, size)
+    return np.clip(np.exp(np.log(start + DARKEST) + trust.albedo * change) - DARKEST, 0, 1)
+
+
+def _trusted_light(
+    fit: Fit, light: Float[np.ndarray, "j 3"], init: Intrinsics | None, trust: Trust
+) -> Float[np.ndarray, "j 3"]:
+    """The light that was found, between it and a predicted one."""
+    if init is None or init.environment is None:
+        return light
+    grid = fit.picture.transport.grid
+    predicted = resample_environment(init.environment, (grid.rows, grid.columns)).reshape(light.shape)
+    return np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
+
+
+def _shading(
+    fit: Fit,
+    at: Unknowns,
+    light: Float[np.ndarray, "j 3"],
+    init: Intrinsics | None,
+    known_mesh: bool,
+    trust: Trust,
+    size: tuple[int, int],
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
+    """s and d under the light that was found; predicted ones move towards them."""
+    specular, diffuse = (enlarge(fit.picture, values, size) for values in light_buffers(fit, at, light))
+    if init is None or init.specular is None or init.diffuse is None:
+        return specular, diffuse
+    before = (init.specular, init.diffuse)
+    if not known_mesh:  # what a normal map cannot show of the light stands in the prediction alone
+        start = fit.start()
+        before = (enlarge(fit.picture, own, size) for own in light_buffers(fit, start, fit.environment(start)))
+    specular, diffuse = (
+        own * _ratio(new, old) ** trust.shading
+        for own, new, old in zip((init.specular, init.diffuse), (specular, diffuse), before, strict=True)
+    )
+    return specular, diffuse
+
+
+def _mesh_normal(picture: Picture, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
+    """The mesh's normals at the picture's own size."""
+    normal = enlarge(picture, picture.normal, size)
+    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
 
 
 def light_buffers(

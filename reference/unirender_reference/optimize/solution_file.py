@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
+from unirender.whole_files import whole_file
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject
 
@@ -25,12 +25,8 @@ def write_solution_file(path: Path, found: Solution | MeshObject) -> None:
     arrays = {name: getattr(obj, name) for name in ARRAYS if getattr(obj, name) is not None}
     arrays |= {_ENVIRONMENT: found.environment} if isinstance(found, Solution) else {}
     text = json.dumps({"name": obj.name, "family": obj.family, "provenance": dict(obj.provenance)})
-    temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("wb") as file:
+    with whole_file(path) as file:
         np.savez(file, **arrays, text=np.array(text))
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def read_solution_file(path: Path) -> Solution | MeshObject:

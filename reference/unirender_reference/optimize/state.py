@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
+from unirender.whole_files import whole_file
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
@@ -187,18 +187,13 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _replace(path: Path, content: Mapping[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("w", encoding="utf-8") as stream:
-        json.dump(content, stream, indent=1)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
+    with whole_file(path) as file:
+        file.write(json.dumps(content, indent=1).encode())
 
 
 def _cut(path: Path, lines: int) -> None:
     """Keeps the first lines of a history: a killed run may have written some that it will write again."""
     written = path.read_text(encoding="utf-8").splitlines(keepends=True) if path.exists() else []
     if len(written) > lines:
-        temporary = path.with_name(f".{path.name}.part")
-        temporary.write_text("".join(written[:lines]), encoding="utf-8")
-        temporary.replace(path)
+        with whole_file(path) as file:
+            file.write("".join(written[:lines]).encode())

@@ -21,6 +21,7 @@ from unirender_reference.sheets import LIGHT, environment_preview, table_sheet
 
 RELIT = ("blender-studio", "blender-sunset", "pmndrs-forest", "blender-night")
 TURNS, ELEVATION_DEG = 8, 15.0
+TILE, TILE_SPP = 96, 36  # pixels along each side of a picture of the turntable, and its samples per pixel
 SHOWN_VIEWS, LEAST_SIDE = 8, 96
 MOST_LETTERS = 18  # of a picture's name above its column
 
@@ -49,17 +50,12 @@ def short_names(names: Sequence[str]) -> list[str]:
     return [name if len(name) <= MOST_LETTERS else f"…{name[1 - MOST_LETTERS :]}" for name in shown]
 
 
-def turntable(solution: Solution, side: int = 96, spp: int = 36) -> Image.Image:
+def turntable(solution: Solution) -> Image.Image:
     """The object all around: a row under the light that was found, and one under each light of `RELIT`.
 
     The other lights are turned up or down to the mean luminance of the found one.
-
-    Args:
-        solution: what is shown.
-        side: pixels along each side of a tile.
-        spp: samples per pixel.
     """
-    views = [_blank_view(360.0 * k / TURNS, side) for k in range(TURNS)]
+    views = [_blank_view(360.0 * k / TURNS, TILE) for k in range(TURNS)]
     brightness = _mean_luminance(solution.environment)
     lights = {"found light": solution.environment}
     for name in RELIT:
@@ -68,8 +64,8 @@ def turntable(solution: Solution, side: int = 96, spp: int = 36) -> Image.Image:
     rows = []
     for light in lights.values():
         lit = dataclasses.replace(solution, environment=light.astype(np.float32))
-        images = solution_images(lit, views, spp)
-        preview = environment_preview(resample_environment(light, (side // 2, side)))
+        images = solution_images(lit, views, TILE_SPP)
+        preview = environment_preview(resample_environment(light, (TILE // 2, TILE)))
         rows.append([preview, *(_over(image[..., :3], image[..., 3:]) for image in images)])
     turns = [f"{360 * k // TURNS}°" for k in range(TURNS)]
     return table_sheet(rows, list(lights), ["light", *turns])

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender_reference import textures  # which imports `shapes.noise`: whoever comes first finds the other begun
 from unirender_reference.shapes import implicit, parametric
 from unirender_reference.shapes.material_maps import Maps, SolidMaterial, random_material
 from unirender_reference.shapes.mesh_object import MeshObject, unit_sphere
 from unirender_reference.shapes.surface import Frame, Part, corner_normals, pack_textures, split_corners
-from unirender_reference.textures import random_color, random_texture
 
 Split = Literal["train", "test"]
 SPLIT = {"train": 0x7421, "test": 0x7E57}
@@ -120,10 +120,10 @@ def _finish(
 ) -> MeshObject:
     """Colours the parts, joins and turns them, and gives them normals; `materials` is empty or has one a part."""
     normals = [corner_normals(part.vertices, part.faces, part.crease_deg) for part in parts]
-    pattern, albedo, uvs = "constant", random_color(rng), None
+    pattern, albedo, uvs = "constant", textures.random_color(rng), None
     if textured or len(parts) > 1:
-        kinds, textures = zip(*[_part_texture(rng, part, textured) for part in parts], strict=True)
-        albedo, frames = pack_textures(textures)
+        kinds, planes = zip(*[_part_texture(rng, part, textured) for part in parts], strict=True)
+        albedo, frames = pack_textures(planes)
         uvs = [frame.place(part.corner_uv) for frame, part in zip(frames, parts, strict=True)]
         pattern = "+".join(kinds)
     maps = [material.bake(part.position_map) for material, part in zip(materials, parts, strict=False)]
@@ -168,7 +168,7 @@ def pack_maps(maps: list[Maps]) -> tuple[dict[str, np.ndarray], list[Frame]]:
 def _part_texture(rng: np.random.Generator, part: Part, textured: bool) -> tuple[str, Float[np.ndarray, "h w 3"]]:
     """Bakes a texture on a part's position map, scaled to its extent."""
     if not textured or rng.random() < 0.15:
-        return "constant", np.broadcast_to(random_color(rng), part.position_map.shape).astype(np.float32)
-    kind, texture = random_texture(rng)
+        return "constant", np.broadcast_to(textures.random_color(rng), part.position_map.shape).astype(np.float32)
+    kind, texture = textures.random_texture(rng)
     low, high = part.position_map.min((0, 1)), part.position_map.max((0, 1))
     return kind, texture((part.position_map - (low + high) / 2) / (np.linalg.norm(high - low) / 2))

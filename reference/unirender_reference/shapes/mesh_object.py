@@ -180,16 +180,10 @@ def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> Sphere:
     return Sphere(center, radius)
 
 
-def unit_sphere(
-    vertices: Float[np.ndarray, "n 3"], moved: Float[np.ndarray, "k 3"] | None = None
-) -> Float[np.ndarray, "k 3"]:
-    """Moves and scales points so that the bounding sphere of `vertices` has radius 1 about the origin.
-
-    Args:
-        vertices: the points that count.
-        moved: the points to return (a mesh with unused vertices); `vertices` if None.
+def unit_sphere(vertices: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Moves and scales points so that their bounding sphere has radius 1 about the origin.
 
     Raises:
         UnirenderError: the points have no extent.
     """
-    return bounding_sphere(vertices).to_unit(vertices if moved is None else moved).astype(np.float32)
+    return bounding_sphere(vertices).to_unit(vertices).astype(np.float32)

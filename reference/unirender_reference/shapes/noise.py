@@ -34,16 +34,14 @@ class ValueNoise:
         far = along_x(0, 1) + (along_x(1, 1) - along_x(0, 1)) * ty
         return near + (far - near) * tz
 
-    def fractal(
-        self, points: Float[np.ndarray, "*shape 3"], octaves: int, gain: float = 0.5
-    ) -> Float[np.ndarray, "*shape"]:
-        """Sum of `octaves` copies, each at twice the frequency and `gain` times the amplitude, scaled into [-1, 1]."""
+    def fractal(self, points: Float[np.ndarray, "*shape 3"], octaves: int) -> Float[np.ndarray, "*shape"]:
+        """Sum of `octaves` copies, each at twice the frequency and half the amplitude, scaled into [-1, 1]."""
         total = np.zeros(points.shape[:-1], np.float32)
         amplitude = 1.0
         for octave in range(octaves):
             total += amplitude * self(points * 2.0**octave + 7.31 * octave)
-            amplitude *= gain
-        return total * ((1 - gain) / (1 - gain**octaves))
+            amplitude *= 0.5
+        return total * (0.5 / (1 - 0.5**octaves))
 
 
 def value_noise(rng: np.random.Generator) -> ValueNoise:

@@ -37,8 +37,8 @@ def lathe(profile: Float[np.ndarray, "rows 2"], outline: Float[np.ndarray, "colu
     return grid_part(surface, crease_deg=crease_deg)
 
 
-def _circle(columns: int = COLUMNS) -> np.ndarray:
-    angle = _angles(columns)
+def _circle() -> np.ndarray:
+    angle = _angles()
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
@@ -67,11 +67,12 @@ def rounded_box(rng: np.random.Generator) -> Part:
     return rounded_box_part(half, radius)
 
 
-def rounded_box_part(half: Float[np.ndarray, "3"], radius: float, cells: int = 6, flat: int = 10) -> Part:
-    """Minkowski sum of a box and a ball: a cube's grid whose outer `cells` rings make the quarter-round edges."""
+def rounded_box_part(half: Float[np.ndarray, "3"], radius: float) -> Part:
+    """Minkowski sum of a box and a ball: a cube's grid whose outer rings make the quarter-round edges."""
+    rings, flat = 6, 10  # cells across half an edge, and along the flat part of a side
     inner = half - radius
     span = np.linspace(-1, 1, flat + 1)  # the flat part of each side, as a fraction of `inner`
-    turn = np.tan(np.linspace(-np.pi / 4, np.pi / 4, 2 * cells + 1)) if radius > 0 else np.zeros(1)
+    turn = np.tan(np.linspace(-np.pi / 4, np.pi / 4, 2 * rings + 1)) if radius > 0 else np.zeros(1)
     before, after = turn[turn < 0], turn[turn > 0]
     lattice = np.concatenate([before, np.zeros(flat + 1), after])  # how far outside the flat part, as a slope
     side = np.concatenate([-np.ones(len(before)), span, np.ones(len(after))])

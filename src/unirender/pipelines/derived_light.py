@@ -107,7 +107,7 @@ def _lit(surface: Intrinsics, light: Light, sharp: Bool[np.ndarray, "h w"] | boo
     normal, mask = surface.require("normal", "mask").values()
     frame = Frame.reduced(mask, LIGHT_SIDE)
     small = frame.enter_intrinsics(surface)
-    maps = {name: frame.leave_map(value, mask) for name, value in small.maps.items() if name != "mask"}
+    maps = dict(frame.leave_maps({name: value for name, value in small.maps.items() if name != "mask"}, mask))
     distance = lengths(unit_normal(maps["normal"]) - normal)[..., 0]
     exact = sharp | (distance > NORMAL_DETAIL)
     if surface.roughness is not None:

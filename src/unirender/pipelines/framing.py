@@ -5,6 +5,7 @@ model's size passes through untouched.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,8 @@ LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
 STRAY = 0.001  # of what counts: parts of the mask that together hold less are not looked for
 THUMBNAIL_SIDE = 32  # pixels
+
+Maps = Mapping[str, Float[np.ndarray, "_ _ c"]]  # of several numbers of channels
 
 
 @dataclass(frozen=True)
@@ -138,16 +141,28 @@ class Frame:
         self, value: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]
     ) -> Float[np.ndarray, "s s c"]:
         """A map that is not premultiplied -> square: coverage-weighted mean, 0 without coverage."""
-        return value if self.identity else divide(self.enter(value * mask), self.enter(mask))
+        return self.enter_maps({"map": value}, mask)["map"]
+
+    def enter_maps(self, maps: Maps, mask: Float[np.ndarray, "h w 1"]) -> Maps:
+        """Several of them, by name; the coverage enters once."""
+        if self.identity:
+            return maps
+        inside = self.enter(mask)
+        return {name: divide(self.enter(value * mask), inside) for name, value in maps.items()}
 
     def leave_map(
         self, value: Float[np.ndarray, "s s c"], mask: Float[np.ndarray, "h w 1"]
     ) -> Float[np.ndarray, "h w c"]:
         """A map that is not premultiplied -> picture; 0 where the picture's mask is 0."""
+        return self.leave_maps({"map": value}, mask)["map"]
+
+    def leave_maps(self, maps: Maps, mask: Float[np.ndarray, "h w 1"]) -> Maps:
+        """Several of them, by name; the coverage enters and leaves once."""
         if not self.identity:
             inside = self.enter(mask)
-            value = divide(self.leave(value * inside), self.leave(inside))
-        return np.where(mask > 0, value, 0).astype(np.float32)
+            back = self.leave(inside)
+            maps = {name: divide(self.leave(value * inside), back) for name, value in maps.items()}
+        return {name: np.where(mask > 0, value, 0).astype(np.float32) for name, value in maps.items()}
 
     def enter_intrinsics(self, intrinsics: Intrinsics, environment_size: tuple[int, int] | None = None) -> Intrinsics:
         """All maps and the camera -> square; the mask has to be known.
@@ -158,7 +173,7 @@ class Frame:
         """
         mask = intrinsics.require("mask")["mask"]
         maps = {name: value for name, value in intrinsics.maps.items() if name not in ("mask", "environment")}
-        changes = {name: self.enter_map(value, mask) for name, value in maps.items()}
+        changes = dict(self.enter_maps(maps, mask))
         if "normal" in changes:
             changes["normal"] = unit_normal(changes["normal"])
         environment = intrinsics.environment

@@ -61,12 +61,12 @@ def _leave(
     if frame.identity:
         return rendered * (mask > 0)
     inside = small.require("mask")["mask"]
-    radiance = frame.leave_map(divide(rendered, inside), mask)
     if not {"albedo", "specular", "diffuse"} <= set(intrinsics.present):
-        return np.clip(radiance, 0, 1) * mask
+        return np.clip(frame.leave_map(divide(rendered, inside), mask), 0, 1) * mask
     # The detail of a larger picture is in its closed form; the model adds what it lacks, in display values.
     closed_form = network.conditioning.physics_prior or PRIORS["split_sum"]
-    small_image = frame.leave_map(divide(closed_form.image(small), inside), mask)
+    pictures = {"rendered": divide(rendered, inside), "closed form": divide(closed_form.image(small), inside)}
+    radiance, small_image = frame.leave_maps(pictures, mask).values()
     change = encode_srgb(radiance) - encode_srgb(small_image)
     large_image = divide(closed_form.image(intrinsics), mask)
     return srgb_decode(np.clip(encode_srgb(large_image) + change, 0, 1)) * mask

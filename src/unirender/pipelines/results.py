@@ -93,7 +93,7 @@ def predicted_intrinsics(
 
     What is covered and outside the frame's square gets the mean of the materials, and 0 of the other maps.
     """
-    sized = {name: frame.leave_map(maps[name], mask) for name in PREDICTED if name != "environment"}
+    sized = dict(frame.leave_maps({name: maps[name] for name in PREDICTED if name != "environment"}, mask))
     sized["normal"] = unit_normal(sized["normal"])
     seen = frame.seen(mask)
     unseen = (mask > 0) & (seen == 0)

@@ -1,9 +1,7 @@
 """The training state on disk: one file, written aside, synced and renamed, so that a killed run loses nothing older."""
 
-import contextlib
 import dataclasses
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -13,6 +11,7 @@ import torch
 
 from unirender.errors import UnirenderError
 from unirender.training.config import TrainConfig
+from unirender.whole_files import whole_file
 from unirender.writing import writing
 
 STATE_FILE = "state.pt"
@@ -25,19 +24,11 @@ def save_state(folder: Path, state: dict[str, Any]) -> Path:
     Raises:
         UnirenderError: it cannot be written; the state that was there stays.
     """
-    path, partial = folder / STATE_FILE, folder / f"{STATE_FILE}.partial"
+    path = folder / STATE_FILE
     with writing(path):
         folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with partial.open("wb") as file:
-                torch.save(state, file)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
-            raise
+        with whole_file(path) as file:
+            torch.save(state, file)
     return path
 
 

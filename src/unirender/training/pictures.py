@@ -20,9 +20,9 @@ COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "envi
 
 
 @torch.no_grad()
-def training_sheet(loss: LossFunction, batch: Maps, rows: int = SHEET_ROWS) -> UInt8[np.ndarray, "h w 3"]:
+def training_sheet(loss: LossFunction, batch: Maps) -> UInt8[np.ndarray, "h w 3"]:
     """Two lines a sample, truth above prediction: image (rendered from true maps), then the maps (from the image)."""
-    batch = {name: value[:rows] for name, value in batch.items()}
+    batch = {name: value[:SHEET_ROWS] for name, value in batch.items()}
     generator = torch.Generator().manual_seed(0)
     parts = (loss.model, loss.conditioning, loss.scheduler)
     given = torch.ones(len(batch["image"]), len(TRIPLETS), dtype=torch.bool, device=batch["image"].device)

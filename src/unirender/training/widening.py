@@ -108,13 +108,12 @@ def widened(config: ModelConfig, other: DualStreamModel, vae: nn.Module | None =
 
 
 @torch.no_grad()
-def widen(network: DualStreamModel, other: DualStreamModel, generator: torch.Generator | None = None) -> None:
+def widen(network: DualStreamModel, other: DualStreamModel) -> None:
     """Gives `network` the weights of a narrower one.
 
     Args:
         network: to be changed, on the CPU.
         other: on the CPU.
-        generator: of the noise on what is new.
 
     Raises:
         UnirenderError: `can_widen` says no.
@@ -127,7 +126,7 @@ def widen(network: DualStreamModel, other: DualStreamModel, generator: torch.Gen
         )
     widths = zip(other.config["block_out_channels"], network.config["block_out_channels"], strict=True)
     levels = [repeated(old, new, network.config["norm_num_groups"]) for old, new in widths]
-    growth = _Growth(levels, generator or torch.Generator().manual_seed(0))
+    growth = _Growth(levels, torch.Generator().manual_seed(0))
     pyramid = growth.unet(network.attribute_unet, other.attribute_unet)
     growth.unet(network.image_unet, other.image_unet)
     for name in ("attributes_to_image", "image_to_attributes"):

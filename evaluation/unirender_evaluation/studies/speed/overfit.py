@@ -161,9 +161,9 @@ def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype:
     return points
 
 
-def reached(points: list[Point], direction: str, bound: float = AIM_DB) -> float | None:
-    """Minutes at the first measure that is at least that good; None: never."""
-    return next((point.minutes for point in points if point.psnr[direction] >= bound), None)
+def reached(points: list[Point], direction: str) -> float | None:
+    """Minutes at the first measure of at least `AIM_DB`; None: never."""
+    return next((point.minutes for point in points if point.psnr[direction] >= AIM_DB), None)
 
 
 def overfit_part(data: Path, minutes: float, device: Any, dtype: Any) -> Part:

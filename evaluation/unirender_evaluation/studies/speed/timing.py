@@ -51,14 +51,14 @@ class Timing:
         return {"median_s": self.median, "repeats_s": list(self.seconds)}
 
 
-def timed(action: Callable[[], Any], repeats: int, warmup: int = 1) -> Timing:
-    """Runs an action and measures it; the first `warmup` runs do not count."""
+def timed(action: Callable[[], Any], repeats: int) -> Timing:
+    """Runs an action and measures it; the first run does not count."""
     found = []
-    for index in range(warmup + repeats):
+    action()
+    for _ in range(repeats):
         start = time.perf_counter()
         action()
-        if index >= warmup:
-            found.append(time.perf_counter() - start)
+        found.append(time.perf_counter() - start)
     return Timing(tuple(found))
 
 

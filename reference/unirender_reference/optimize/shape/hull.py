@@ -16,6 +16,7 @@ from unirender_reference.optimize.shape.topology import face_vectors, neighbours
 
 HALF = 1.05  # half side of the grid: the unit sphere and a margin that no mask reaches
 FINER = 8  # places along the side of a pixel at which the coverage is read
+RELAXATIONS = 5  # of the vertices of marching cubes
 SMALLEST_PIECE = 0.02  # of the largest piece's surface; smaller ones are splinters of the hull
 WIDE, WIDE_CELLS = 2.0, 32  # half side and cells of a grid that tells whether the masks bound the object at all
 
@@ -90,7 +91,7 @@ def hull_reach(masks: Float[np.ndarray, "k h w"], cameras: Cameras) -> float:
 
 
 def extract(
-    field: Float[np.ndarray, "side side side"], relaxations: int = 5
+    field: Float[np.ndarray, "side side side"],
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
     """The surface where a grid over [-HALF, HALF]^3 is 0, positive inside: even triangles, without splinters.
 
@@ -106,7 +107,7 @@ def extract(
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used].astype(np.float64), faces.reshape(-1, 3)
     average = neighbours(len(vertices), faces)
-    for _ in range(relaxations):
+    for _ in range(RELAXATIONS):
         step = average @ vertices - vertices
         normal = vertex_normals(vertices, faces)
         vertices = vertices + step - np.einsum("ni,ni->n", step, normal)[:, None] * normal
