@@ -20,6 +20,7 @@ from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
+from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.table_formats import format_number, print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.table_text import TextTable, plain_paragraph
@@ -319,6 +320,23 @@ def test_markdown_is_a_table() -> None:
     assert len(lines) == 2 + len(table().rows)
     assert len({line.count("|") for line in lines}) == 1
     assert "| **23.20** | **26.15** ± 0.18 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
+
+
+def test_means_of_two_objects_have_no_interval_in_any_format() -> None:
+    records = [record for record in RECORDS if record.object in ("o0", "o1")]
+    of_two = build_table(TABLES["inverse"], records, RUN, protocol="single-image", variant=Variant("masked"))
+    printed = StringIO()
+    print_table(Console(file=printed, width=200), of_two)
+    for text in (to_markdown(of_two), to_latex(of_two), printed.getvalue()):
+        assert "21.15" in text
+        assert "±" not in text.replace(UNPRINTED, "")
+        assert "pm$" not in text.replace(r"no $\pm$", "")
+    assert UNPRINTED in of_two.notes
+    complete = build_table(TABLES["inverse"], inverse("ours"), RUN, protocol="single-image")
+    assert UNPRINTED not in complete.notes
+    (found,) = json.loads(to_json([of_two]))
+    ours = next(row for row in found["rows"] if row["key"] == "ours")
+    assert ours["cells"][0]["measured"]["low"] < 21.15 < ours["cells"][0]["measured"]["high"]
 
 
 def test_latex_is_balanced_booktabs() -> None:
