@@ -328,6 +328,21 @@ def test_markdown_is_a_table() -> None:
     assert "| **23.20** | **26.15** ± 0.18 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
 
 
+def test_latex_has_units_minus_signs_and_rows_that_are_no_options() -> None:
+    """A row of `[x]` or `*x` would be the length, or the star, of the line break before it."""
+    column = Column("Light", "light", replace(METRICS["psnr"], name="loss", label="loss"), published=False)
+    spec = TableSpec(
+        "inverse", "Light", (column, Column("Light", "light", METRICS["psnr"], published=False)), ("single-image",)
+    )
+    run = replace(RUN, methods=(MethodInfo("a", "[x]", "external"), MethodInfo("b", "*x", "external")))
+    keys = [c.key(Variant()) for c in spec.columns]
+    records = [Record("inverse", "single-image", m, "s", "o", dict.fromkeys(keys, -1.5)) for m in "ab"]
+    text = to_latex(build_table(spec, records, run, protocol="single-image"))
+    assert r"Method & loss (dB)$\uparrow$ & PSNR$\uparrow$" in text
+    assert r"{}[x] & \textbf{$-$1.50} & \textbf{$-$1.50}" in text
+    assert r"{}*x & \textbf{$-$1.50}" in text
+
+
 def test_in_a_narrow_cell_what_belongs_together_stays_on_a_line() -> None:
     texts = ["Ours (n = 48)", "**26.5** ± 1.2 (n = 24)", "+5.3 [+4.6, -6.0]", "a ± b [c, d]"]
     made = [
