@@ -79,14 +79,14 @@ STUDIES = (
         (
             Plot(
                 "sampling.png",
-                "PSNR of albedo and of the render over steps, a line for each number of samples",
-                "PSNR against steps; the dashed level is mode `mean`.",
+                "PSNR of albedo and of the render over steps less that of mode mean, a line for each number of samples",
+                "PSNR against steps, less that of mode `mean` on the same pictures; bars: the paired 95 % intervals.",
             ),
             Plot(
                 "calibration.png",
-                "error over spread by map, on logarithmic axes",
-                "Error of the samples' mean against their spread, in each map's own units; on the dashed line the "
-                "spread is the error.",
+                "error over spread, a panel for each map, on logarithmic axes",
+                "Error of the samples' mean against their spread, in each map's own units, pixels grouped by spread. A "
+                "dot's area is its share of the pixels; a spread below 0.004 stands at the left edge.",
             ),
         ),
     ),

@@ -204,14 +204,15 @@ def _cell(cell: Cell, decimals: int, few: int | None) -> dict[str, Any]:
         view["sort"] = cell.published
     if cell.measured is not None:
         value, spread = format_estimate(cell.measured, decimals)
-        low, high = (format_number(x, decimals) if x == x else "-" for x in (cell.measured.low, cell.measured.high))
+        ends = (cell.measured.low, cell.measured.high)
+        interval = f"95 % interval [{', '.join(format_number(x, decimals) for x in ends)}], " if spread else ""
         view |= {
             "value": value,
             "spread": spread,
             "n": "" if few is None else f"n = {few}",
             "sort": cell.measured.mean,
             "rank": {1: "best", 2: "second"}.get(cell.measured_rank or 0, ""),
-            "title": f"95 % interval [{low}, {high}], n = {cell.measured.n}, {cell.measured.clusters} objects",
+            "title": f"{interval}n = {cell.measured.n}, {cell.measured.clusters} objects",
         }
     return view
 

@@ -19,6 +19,7 @@ from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
+from unirender_evaluation.table_text import markdown_row
 
 NOT_RUN = "not run"
 _MATERIAL = re.compile(r"_m(\d{3})_r(\d{3})$")  # of a sample with one number each; others have maps of their own
@@ -253,4 +254,4 @@ def _table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -
     if any(len(line) != len(head) for line in lines):
         raise UnirenderError(f"table: got lines of {sorted({len(line) for line in lines})} cells, expected {len(head)}")
     rule = [":--" if i < left else "--:" for i in range(len(head))]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *lines)) + "\n"
+    return "\n".join(map(markdown_row, (head, rule, *lines))) + "\n"

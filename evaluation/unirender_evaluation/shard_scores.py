@@ -19,7 +19,8 @@ from unirender.training.same_objects import object_of
 from unirender_evaluation.methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
-from unirender_evaluation.statistics import INTERVAL, mean_estimate
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
+from unirender_evaluation.table_formats import MISSING, format_estimate
 from unirender_evaluation.table_text import TextTable
 
 COLUMNS = {  # header -> metric of `score_maps`, decimals
@@ -126,38 +127,39 @@ def shard_tables(found: Sequence[Scored], what: str, titled: str = "") -> list[T
     """
     read = f"{what} Masked, sRGB, raw; ± half of the {INTERVAL}."
     maps = f"{read} Pictures are seen at 8 bits. Roughness and metallic: mean over the object against its number."
-    tables = [TextTable(f"Pictures of data sets{titled}", *_cells(found, COLUMNS), (maps,))]
+    tables = [_table(f"Pictures of data sets{titled}", found, COLUMNS, maps)]
     if any(key in one.scores for one in found for key, _ in RENDERS.values()):
         renders = (
             f"{read} Given: rendered from the true maps; given light: from those but s and d, which the whole light "
             "says; closed form: what the renderer begins with there."
         )
-        tables.append(TextTable(f"Renderings of data sets{titled}", *_cells(found, RENDERS), (renders,)))
+        tables.append(_table(f"Renderings of data sets{titled}", found, RENDERS, renders))
     return tables
 
 
-def _cells(
-    found: Sequence[Scored], columns: Mapping[str, tuple[str, int]]
-) -> tuple[tuple[str, ...], tuple[tuple[tuple[str, ...], ...], ...]]:
-    """Headers and sections of a table."""
-    sections = []
+def _table(title: str, found: Sequence[Scored], columns: Mapping[str, tuple[str, int]], note: str) -> TextTable:
+    """Rows by folder and metallic."""
+    sections, estimates = [], []
     for folder in dict.fromkeys(one.folder for one in found):
         of_folder = [one for one in found if one.folder == folder]
-        rows = [_row(f"{folder}: all", of_folder, columns)]
+        groups = {f"{folder}: all": of_folder}
         for metallic in sorted({one.metallic for one in of_folder if one.metallic is not None}):
-            rows.append(_row(f"metallic {metallic:g}", [one for one in of_folder if one.metallic == metallic], columns))
+            groups[f"metallic {metallic:g}"] = [one for one in of_folder if one.metallic == metallic]
+        rows = []
+        for name, own in groups.items():
+            means = [_mean(own, key) for key, _ in columns.values()]
+            texts = (_text(mean, decimals) for mean, (_, decimals) in zip(means, columns.values(), strict=True))
+            rows.append((name, str(len({one.object for one in own})), str(len(own)), *texts))
+            estimates += means
         sections.append(tuple(rows))
-    return ("data", "objects", "pictures", *columns), tuple(sections)
+    titles = ("data", "objects", "pictures", *columns)
+    return TextTable(title, titles, tuple(sections), (note, *unprinted_note(estimates)))
 
 
-def _row(name: str, found: Sequence[Scored], columns: Mapping[str, tuple[str, int]]) -> tuple[str, ...]:
-    cells = []
-    for key, decimals in columns.values():
-        with_value = [one for one in found if key in one.scores]
-        if not with_value:
-            cells.append("-")
-            continue
-        mean = mean_estimate([one.scores[key] for one in with_value], [one.object for one in with_value])
-        interval = "" if np.isnan(mean.half_width) else f" ± {mean.half_width:.{decimals}f}"
-        cells.append(f"{mean.mean:.{decimals}f}{interval}")
-    return (name, str(len({one.object for one in found})), str(len(found)), *cells)
+def _mean(found: Sequence[Scored], key: str) -> Estimate | None:
+    own = [one for one in found if key in one.scores]
+    return mean_estimate([one.scores[key] for one in own], [one.object for one in own]) if own else None
+
+
+def _text(mean: Estimate | None, decimals: int) -> str:
+    return MISSING if mean is None else " ".join(format_estimate(mean, decimals)).strip()

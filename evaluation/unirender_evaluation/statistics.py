@@ -6,13 +6,15 @@ same records give the same interval on every machine.
 
 Of a few objects the bootstrap's interval is too narrow: of two it excludes the truth half of the time, of four one time
 in five, of ten one in ten. Below `FEW` objects the interval is Student's t over them, with the variance of a ratio of
-sums since objects may have unequal numbers of samples (Cochran 1977, section 6.4).
+sums since objects may have unequal numbers of samples (Cochran 1977, section 6.4). Of two objects it holds the truth
+as often as of many, by being 12.7 standard errors wide to each side: paired tests use it, but beside a mean it tells a
+reader nothing, so that a ± is printed from `FEWEST_PRINTED` objects on (`Estimate.printed_half_width`).
 
 "A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
 """
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +26,10 @@ CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 0
 FEW = 20  # objects below which the interval is Student's
+FEWEST_PRINTED = 3  # objects from which on half of the interval is printed beside a number, with ±
 METHOD = f"bootstrap, {RESAMPLES} draws, seed {SEED}, or Student's t below {FEW}"  # as protocol lines say it
 INTERVAL = f"{CONFIDENCE:.0%} interval over objects ({METHOD})"  # as notes do
+UNPRINTED = "Numbers of two objects have no ±: with one degree of freedom their interval says next to nothing."
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,17 @@ class Estimate:
     def half_width(self) -> float:
         """Half the width of the interval, NaN where there is none."""
         return (self.high - self.low) / 2
+
+    @property
+    def printed_half_width(self) -> float:
+        """What stands behind ±: the same, NaN also of fewer than `FEWEST_PRINTED` objects."""
+        return self.half_width if self.clusters >= FEWEST_PRINTED else math.nan
+
+
+def unprinted_note(estimates: Iterable[Estimate | None]) -> tuple[str, ...]:
+    """The note below a table that has numbers without ± for being of few objects; empty where it has none."""
+    without = (e for e in estimates if e and math.isnan(e.printed_half_width) and not math.isnan(e.half_width))
+    return (UNPRINTED,) if any(without) else ()
 
 
 def mean_estimate(

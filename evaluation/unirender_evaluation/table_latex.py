@@ -5,6 +5,7 @@ import unicodedata
 from collections.abc import Iterable
 from itertools import groupby
 
+from unirender_evaluation.metrics import Metric
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.table_counts import cell_counts
 from unirender_evaluation.table_formats import (
@@ -47,7 +48,7 @@ def to_latex(table: Table) -> str:
         start += span
     second, third = ["Method"], [""]
     for column in table.columns:
-        name = _tex(column.metric.label) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
+        name = _tex(_named(column.metric)) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
         second.append(rf"\multicolumn{{2}}{{c}}{{{name}}}" if doubled[id(column)] else name)
         third += ["paper", "here"] if doubled[id(column)] else [""]
     lines = [
@@ -88,6 +89,11 @@ def _latex_cells(row: Row, table: Table) -> list[str]:
     return texts
 
 
+def _named(metric: Metric) -> str:
+    """A metric with its unit, which a PSNR, as everywhere in print, is taken to have."""
+    return f"{metric.label} ({metric.unit})" if metric.unit and metric.name != "psnr" else metric.label
+
+
 def _tex_stacked(text: str, width: int) -> str:
     """The text in as many lines as it needs where one has `width` letters."""
     lines = [_tex(line) for line in textwrap.wrap(text, width, break_long_words=False)]
@@ -109,7 +115,8 @@ def _tex_rank(text: str, rank: int | None) -> str:
 
 
 def _tex_number(text: str) -> str:
-    return text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
+    text = text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
+    return f"$-${text[1:]}" if text.startswith("-") and text != MISSING else text
 
 
 # Characters that mean something to TeX, or are no letters of its fonts; `--` would become a dash.
@@ -156,4 +163,6 @@ def _is_strange(character: str) -> bool:
 
 
 def _tex_row(texts: Iterable[str]) -> str:
-    return " & ".join(texts) + r" \\"
+    """A row; what it begins with is no option of the command before it, as [ and * would be."""
+    line = " & ".join(texts)
+    return ("{}" if line.startswith(("[", "*")) else "") + line + r" \\"

@@ -8,6 +8,7 @@ from unirender_evaluation.comparisons import exact_fit, values_of
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import TableSpec
+from unirender_evaluation.statistics import unprinted_note
 from unirender_evaluation.table_counts import cell_counts, label_n
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"
     fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
     if fewer:
         notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
+    notes += unprinted_note(cell.measured for row in rows for cell in row.cells)
     if any(cell.dagger for row in rows for cell in row.cells):
         notes.append(
             "† The published value is worse than the constant 0.5, measured on materials distributed as in the paper."

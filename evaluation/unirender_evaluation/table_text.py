@@ -16,6 +16,7 @@ from rich.table import Table as RichTable
 OWN_MARKUP = re.compile(r"(?<!`)`[^`<>\\]+`(?!`)|\*\*[-+\d.,±∞% ]+\*\*")
 # What begins or ends markup where it stands: HTML, entities, emphasis, code, mathematics, links.
 MARKUP = re.compile(r"[`\\]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|[*~$](?=\S)|(?<![^\W_])_(?=\S)|\](?=[(\[])")
+NUMBERS = re.compile(r"± (?=[\d.∞])|\(n = \d+\)|\[[-+\d.∞]+, [-+\d.∞]+\]")  # what stays on one line of a cell
 BLOCK = re.compile(r"^(\d*)([-+*#>.)\[])")  # what makes a line a list, a heading, a quotation, a link's definition
 
 
@@ -45,8 +46,16 @@ def plain_paragraph(text: str) -> str:
 
 
 def markdown_row(texts: Iterable[str]) -> str:
-    """A row of a table; `texts` are Markdown."""
-    return "| " + " | ".join(text.replace("|", r"\|") for text in texts) + " |"
+    """A row of a table; `texts` are Markdown.
+
+    Where a column is narrow, half an interval stays with its sign, a count with its n, an interval in one piece: their
+    spaces are no-break spaces.
+    """
+
+    def together(found: re.Match[str]) -> str:
+        return found[0].replace(" ", "\N{NO-BREAK SPACE}")
+
+    return "| " + " | ".join(NUMBERS.sub(together, text.replace("|", r"\|")) for text in texts) + " |"
 
 
 @dataclass(frozen=True)

@@ -327,6 +327,20 @@ def test_a_port_that_is_taken_is_named(server: Server) -> None:
     assert "loading" not in done.stdout  # it is said before the model is loaded
 
 
+def test_the_keyboard_is_seen_where_it_is(server: Server, tmp_path: Path) -> None:
+    ring = "const e = document.activeElement; return [e.type, getComputedStyle(e).outlineStyle]"
+    with visit(server, tmp_path) as page:
+        page.press("#example-2", "enter")
+        page.wait("return document.querySelector('#maps img')")
+        for before, kind in (
+            ("#example-3", "radio"),
+            ("#metallic [type=number]", "range"),
+            ("#turn [type=range]", "checkbox"),
+        ):
+            page.press(before, "tab")
+            assert page.ask(ring) == [kind, "solid"]
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_a_phone_does_not_scroll_sideways(server: Server, tmp_path: Path, theme: str) -> None:
     with visit(server, tmp_path, PHONE, 844, theme) as page:

@@ -1,6 +1,7 @@
 """What the demo does without a browser: uploads and their limits, edits and lights, Mitsuba's check, archives, HTML."""
 
 import asyncio
+import base64
 import dataclasses
 import io
 import json
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from demo_files import ball, nan_exr, png, radiance
+from PIL import Image
 from tiny_models import make_pipeline
 
 from unirender.cli import main
@@ -236,6 +238,16 @@ def test_the_spread_is_of_the_samples(pipeline: UniRenderPipeline, subject: Subj
         np.testing.assert_array_equal(value, again[name])
     assert max(float(value.max()) for value in std.values()) > 0
     assert panels.spread_panel(std, subject.mask, 2).count("<img") == len(std)
+
+
+def test_a_material_that_is_known_is_dark_in_the_spread() -> None:
+    """One number for the object: scaled by its own largest value it was white, however small."""
+    mask = np.ones((8, 8, 1), np.float32)
+    std = {name: np.full((8, 8, 1), 0.05, np.float32) for name in ("roughness", "albedo")}
+    html = panels.spread_panel(std, mask, 5)
+    shown = [base64.b64decode(part.split('"')[0]) for part in html.split("base64,")[1:]]
+    assert [int(np.asarray(Image.open(io.BytesIO(data)))[4, 4, 0]) for data in shown] == [26, 255]
+    assert "up to 0.05; white: 0.5" in html
 
 
 def test_archives_hold_what_is_seen_and_leave_nothing_behind(

@@ -34,7 +34,8 @@ def question(a: str, b: str) -> Question:
 
 def lines(table: str) -> list[list[str]]:
     """The cells of a Markdown table's lines, without its head."""
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    plain = table.replace("\N{NO-BREAK SPACE}", " ")
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in plain.splitlines()[2:]]
 
 
 def with_materials(metallic: tuple[int, ...], values: tuple[float, ...]) -> Results:

@@ -14,7 +14,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.shard_scores import COLUMNS, RENDERS, minus, scored, shard_tables
 from unirender_evaluation.shard_scores_command import BenchShards
-from unirender_evaluation.statistics import mean_estimate
+from unirender_evaluation.statistics import UNPRINTED, mean_estimate
 
 SIZE = 16
 
@@ -76,25 +76,28 @@ def test_the_table_has_a_row_for_each_folder_and_metallic(folder: Path) -> None:
 
 
 def test_the_groups_of_one_object_count_as_one(tmp_path: Path) -> None:
-    """As of `unirender dataset --vary one-at-a-time`: two objects of three groups each."""
+    """As of `unirender dataset --vary one-at-a-time`: three objects of two groups each."""
     made = {
         f"train-{i:06d}_g{k}": group_members("one-at-a-time", SIZE, 1, (40,), (0, 100), 3 * i + k)
-        for i in range(2)
-        for k in range(3)
+        for i in range(3)
+        for k in range(2)
     }
     write_shard(tmp_path / "shard-000000.tar", made)
     found = list(scored(Halves(), tmp_path, objects=60, pairs=100, seed=0))
     assert len({one.group for one in found}) == 6
-    assert {one.object for one in found} == {"train-000000", "train-000001"}
+    assert {one.object for one in found} == {"train-000000", "train-000001", "train-000002"}
     key, decimals = COLUMNS["albedo (dB) ↑"]
     clustered, wrong = (
         mean_estimate([one.scores[key] for one in found], [getattr(one, of) for one in found])
         for of in ("object", "group")
     )
     cells = shard_tables(found, "Halves.")[0].sections[0][0]
-    assert cells[1:3] == ("2", "12")
+    assert cells[1:3] == ("3", "12")
     assert cells[3].endswith(f"± {clustered.half_width:.{decimals}f}")
     assert not cells[3].endswith(f"± {wrong.half_width:.{decimals}f}")
+    (table,) = shard_tables([one for one in found if one.object != "train-000002"], "Halves.")
+    assert not any("±" in cell for cell in table.sections[0][0])
+    assert table.notes[1:] == (UNPRINTED,)
     drawn = list(scored(Halves(), tmp_path, objects=1, pairs=4, seed=0))
     assert (len(drawn), len({one.object for one in drawn})) == (4, 1)
 

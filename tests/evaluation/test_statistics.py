@@ -7,7 +7,14 @@ import pytest
 import scipy.stats
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.statistics import FEW, beats, mean_estimate, paired_difference
+from unirender_evaluation.statistics import (
+    FEW,
+    UNPRINTED,
+    beats,
+    mean_estimate,
+    paired_difference,
+    unprinted_note,
+)
 
 
 def coverage(clustered: bool, use_clusters: bool, trials: int = 300) -> float:
@@ -84,6 +91,15 @@ def test_what_has_no_interval_says_so(values: list[float], labels: list[str] | N
     assert math.isnan(estimate.low)
     assert math.isnan(estimate.half_width)
     assert estimate.mean == np.mean(values)
+
+
+def test_the_interval_of_two_objects_is_not_printed() -> None:
+    two, three, one = (mean_estimate([1.0, 1.2, 4.0][:count]) for count in (2, 3, 1))
+    assert two.half_width == pytest.approx(12.706 * 0.1, rel=1e-4)  # it is there, for tests and files
+    assert math.isnan(two.printed_half_width)
+    assert three.printed_half_width == three.half_width
+    assert unprinted_note([one, two, None]) == (UNPRINTED,)
+    assert unprinted_note([one, three, None]) == ()  # one object has none at all: nothing is kept back
 
 
 @pytest.mark.parametrize("values", [[], [1.0, math.nan]])

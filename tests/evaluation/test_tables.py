@@ -20,9 +20,10 @@ from unirender_evaluation.protocol import mask_source
 from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import TABLES, Column, TableSpec
+from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.table_formats import format_number, print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
-from unirender_evaluation.table_text import TextTable, plain_paragraph
+from unirender_evaluation.table_text import TextTable, markdown_row, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
 
 METHODS = (
@@ -34,6 +35,7 @@ METHODS = (
 )
 RUN = RunInfo("tiny", "abcdef0123456789", 64, METHODS, coverage=0.34, lpips=("alex",), mitsuba="3.9.1", truth_spp=2048)
 LEVEL = {"ours": 21.0, "sample": 20.0, "input": 12.0, "ceiling": 45.0}
+NO_BREAK = "\N{NO-BREAK SPACE}"
 MATERIAL = {"ours": 0.06, "sample": 0.07, "constant": 0.1, "ceiling": 0.0}
 
 
@@ -58,6 +60,11 @@ RECORDS = [record for key in ("ours", "constant", "input", "ceiling") for record
 
 def table(mask: str = "whole", run: RunInfo = RUN) -> Table:
     return build_table(TABLES["inverse"], RECORDS, run, protocol="single-image", variant=Variant.parse(mask))
+
+
+def spaced(found: Table) -> str:
+    """Its Markdown, with spaces that may break in place of those that may not."""
+    return to_markdown(found).replace(NO_BREAK, " ")
 
 
 def row(found: Table, label: str) -> Row:
@@ -141,7 +148,7 @@ def counted(albedo: Mapping[str, int], metallic: Mapping[str, int]) -> Table:
 
 def labels(found: Table) -> list[str]:
     """The rows' labels as printed, without those of the paper."""
-    return [line.split(" | ")[0][2:] for line in to_markdown(found).splitlines() if re.match(r"\| (a|b)\b", line)]
+    return [line.split(" | ")[0][2:] for line in spaced(found).splitlines() if re.match(r"\| (a|b)\b", line)]
 
 
 def fewer(found: Table) -> str:
@@ -158,7 +165,7 @@ def test_a_cell_on_fewer_samples_than_its_columns_fullest_says_so_and_is_not_ran
     assert fewer(found) == "c (Albedo n = 2)."
     buffer = StringIO()
     print_table(Console(file=buffer, width=200), found)
-    for text in (to_markdown(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+    for text in (spaced(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
         (line,) = (line for line in text.splitlines() if re.match(r"(\| )? ?c ", line))
         assert line.count("(n = 2)") == 1
         assert text.count("n = 2") == 1 + (text.count("Albedo n = 2"))
@@ -168,13 +175,13 @@ def test_a_row_that_answers_one_question_in_full_is_complete() -> None:
     found = counted({"a": 8, "b": 8}, {"a": 4, "b": 4, "c": 4})
     assert fewer(found) == ""
     assert [row(found, "c").cells[i].measured_rank for i, c in enumerate(found.columns) if c.group == "Metallic"] == [1]
-    assert "(n =" not in to_markdown(found)
+    assert "(n =" not in spaced(found)
 
 
 def test_the_n_behind_a_label_is_that_of_no_other_cell() -> None:
     found = counted({"a": 8, "b": 4}, {"a": 4, "b": 1})
     assert labels(found) == ["a", "b (n = 4)"]
-    assert to_markdown(found).count("(n = 1)") == 1
+    assert spaced(found).count("(n = 1)") == 1
     assert fewer(found) == "b (n = 4, Metallic n = 1)."
     assert labels(counted({"a": 8, "b": 4}, {"a": 4, "b": 4})) == ["a", "b (n = 4)"]  # of all of its cells
     mixed = counted({"a": 8, "b": 5}, {"a": 4, "b": 4})  # complete in metallic, where n is 4
@@ -189,7 +196,7 @@ def test_a_cell_on_the_same_share_of_its_column_has_its_own_n() -> None:
     assert fewer(found) == "b (n = 4, Metallic n = 2)."
     buffer = StringIO()
     print_table(Console(file=buffer, width=200), found)
-    for text in (to_markdown(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+    for text in (spaced(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
         (full,) = (line for line in text.splitlines() if re.match(r"(\| )? ?a ", line))
         (half,) = (line for line in text.splitlines() if re.match(r"(\| )? ?b ", line))
         assert "n =" not in full
@@ -315,10 +322,53 @@ def test_variants_that_a_table_cannot_tell_apart_are_one_table() -> None:
 
 
 def test_markdown_is_a_table() -> None:
-    lines = [line for line in to_markdown(table()).splitlines() if line.startswith("|")]
+    lines = [line for line in spaced(table()).splitlines() if line.startswith("|")]
     assert len(lines) == 2 + len(table().rows)
     assert len({line.count("|") for line in lines}) == 1
     assert "| **23.20** | **26.15** ± 0.18 |" in next(line for line in lines if line.startswith("| Ours (mean)"))
+
+
+def test_latex_has_units_minus_signs_and_rows_that_are_no_options() -> None:
+    """A row of `[x]` or `*x` would be the length, or the star, of the line break before it."""
+    column = Column("Light", "light", replace(METRICS["psnr"], name="loss", label="loss"), published=False)
+    spec = TableSpec(
+        "inverse", "Light", (column, Column("Light", "light", METRICS["psnr"], published=False)), ("single-image",)
+    )
+    run = replace(RUN, methods=(MethodInfo("a", "[x]", "external"), MethodInfo("b", "*x", "external")))
+    keys = [c.key(Variant()) for c in spec.columns]
+    records = [Record("inverse", "single-image", m, "s", "o", dict.fromkeys(keys, -1.5)) for m in "ab"]
+    text = to_latex(build_table(spec, records, run, protocol="single-image"))
+    assert r"Method & loss (dB)$\uparrow$ & PSNR$\uparrow$" in text
+    assert r"{}[x] & \textbf{$-$1.50} & \textbf{$-$1.50}" in text
+    assert r"{}*x & \textbf{$-$1.50}" in text
+
+
+def test_in_a_narrow_cell_what_belongs_together_stays_on_a_line() -> None:
+    texts = ["Ours (n = 48)", "**26.5** ± 1.2 (n = 24)", "+5.3 [+4.6, -6.0]", "a ± b [c, d]"]
+    made = [
+        f"Ours (n{NO_BREAK}={NO_BREAK}48)",
+        f"**26.5** ±{NO_BREAK}1.2 (n{NO_BREAK}={NO_BREAK}24)",
+        f"+5.3 [+4.6,{NO_BREAK}-6.0]",
+        texts[-1],
+    ]
+    assert markdown_row(texts) == f"| {' | '.join(made)} |"
+
+
+def test_means_of_two_objects_have_no_interval_in_any_format() -> None:
+    records = [record for record in RECORDS if record.object in ("o0", "o1")]
+    of_two = build_table(TABLES["inverse"], records, RUN, protocol="single-image", variant=Variant("masked"))
+    printed = StringIO()
+    print_table(Console(file=printed, width=200), of_two)
+    for text in (to_markdown(of_two), to_latex(of_two), printed.getvalue()):
+        assert "21.15" in text
+        assert "±" not in text.replace(UNPRINTED, "")
+        assert "pm$" not in text.replace(r"no $\pm$", "")
+    assert UNPRINTED in of_two.notes
+    complete = build_table(TABLES["inverse"], inverse("ours"), RUN, protocol="single-image")
+    assert UNPRINTED not in complete.notes
+    (found,) = json.loads(to_json([of_two]))
+    ours = next(row for row in found["rows"] if row["key"] == "ours")
+    assert ours["cells"][0]["measured"]["low"] < 21.15 < ours["cells"][0]["measured"]["high"]
 
 
 def test_latex_is_balanced_booktabs() -> None:
@@ -398,6 +448,7 @@ def test_our_own_names_and_sentences_are_left_as_they_are() -> None:
     ours = "see `unirender bench physics`, my_method (roughness >= 0.3)"
     assert plain_paragraph(ours) == ours
     line = TextTable("t", ("a", "b"), (((r"<b>|`transport.rounds = 0`", "27.50 (**-2.12 ± 1.83**)"),),)).markdown()
+    line = line.replace(NO_BREAK, " ")
     assert line.splitlines()[4] == r"| &lt;b>\|`transport.rounds = 0` | 27.50 (**-2.12 ± 1.83**) |"
 
 

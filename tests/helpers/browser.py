@@ -21,7 +21,8 @@ from typing import Any
 
 INSTALL = "install both (Debian: apt-get install chromium chromium-driver)"
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the key of an element's reference, fixed by W3C WebDriver
-KEYS = {"right": "\ue014", "left": "\ue012", "home": "\ue011", "end": "\ue010", "enter": "\ue007", "escape": "\ue00c"}
+KEYS = {"right": "\ue014", "left": "\ue012", "home": "\ue011", "end": "\ue010"}
+KEYS |= {"enter": "\ue007", "escape": "\ue00c", "tab": "\ue004"}
 DOWNLOADS = "downloads"
 PATIENCE = 120  # seconds; a busy machine starts Chromium slowly
 OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--force-device-scale-factor=1")

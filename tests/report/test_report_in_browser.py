@@ -123,6 +123,23 @@ def test_on_paper_every_column_is_within_the_page(tmp_path: Path) -> None:
         assert opened.ask(wide) > 0, "the twin"
 
 
+def test_on_paper_it_is_light_and_says_which_number_the_samples_show(page: Path, tmp_path: Path) -> None:
+    """Also where it was read in the dark; what says how to click is left out."""
+    shown = "return [...document.querySelectorAll(arguments[0])].filter(e => e.offsetHeight > 0).length"
+    paper = "return getComputedStyle(document.documentElement).getPropertyValue('--paper')"
+    with Browser.start(tmp_path, PAPER, 800) as opened:
+        opened.open(page)
+        light = opened.ask(paper)
+        opened.click("#theme")
+        assert opened.ask(paper) != light
+        assert opened.ask(shown, ".screen") > 1
+        opened.ask(ON_PAPER)
+        assert opened.ask(paper) == light
+        assert opened.ask(shown, "#sample-tools select") == 2
+        for hidden in (".screen", "#sample-find", "#which", "#theme", "footer button"):
+            assert opened.ask(shown, hidden) == 0, hidden
+
+
 def test_without_scripts_each_panel_has_its_heading_and_there_are_no_tabs(page: Path, tmp_path: Path) -> None:
     text = re.sub(r"<script.*?</script>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     (tmp_path / "plain.html").write_text(text, encoding="utf-8")

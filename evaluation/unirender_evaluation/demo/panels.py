@@ -14,7 +14,9 @@ from unirender_evaluation.demo.session import Check, Subject, View
 from unirender_evaluation.gallery import data_uri, image_picture, map_pictures
 
 LIGHT_SHAPE = (32, 64)  # rows and columns at which lights are shown
+MOST_SPREAD = 0.5  # standard deviation of a material at which it is shown white: it is somewhere between 0 and 1
 
+MATERIALS = ("roughness", "metallic")
 NAMES = {
     "albedo": "Albedo",
     "normal": "Normal",
@@ -104,13 +106,18 @@ def check_panel(found: Check, intrinsics: Intrinsics) -> str:
 
 
 def spread_panel(std: Mapping[str, np.ndarray], mask: Mask, samples: int) -> str:
-    """Standard deviations over samples; each map is scaled by its own largest value, which stands below it."""
+    """Standard deviations over samples, with what is white below each.
+
+    A material, often one number for the object, is shown against `MOST_SPREAD`, so that black and white say whether it
+    is known; every other map against its own largest value, so that it is seen where the samples differ.
+    """
     figures = []
     for name, value in std.items():
         grey = value.mean(axis=-1, keepdims=True)
         most = float(grey.max())
-        picture = np.repeat(grey / max(most, 1e-9), 3, axis=-1).astype(np.float32)
-        note = f"white: {most:.2g}"
+        white = MOST_SPREAD if name in MATERIALS else most
+        picture = np.repeat(grey / max(white, 1e-9), 3, axis=-1).astype(np.float32)
+        note = f"up to {most:.2g}; white: {white:.2g}" if name in MATERIALS else f"white: {most:.2g}"
         if name == "environment":
             figures.append(figure(NAMES[name], resample_environment(picture, LIGHT_SHAPE), note=note, kind="light"))
         else:

@@ -28,9 +28,10 @@ from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.physics.tests import TESTS
 from unirender_evaluation.physics.tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
-from unirender_evaluation.statistics import Estimate, mean_estimate
+from unirender_evaluation.statistics import Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
+from unirender_evaluation.table_formats import MISSING, format_estimate
 from unirender_evaluation.truth_render import item_seed
 
 MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
@@ -174,14 +175,15 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
         heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
         lines.append(f"| {heading} | {expected} | {' | '.join(cells)} | {verdict}: {test.twin_is} |")
     protocol = " · ".join(f"{name}: {value}" for name, value in settings.items())
+    notes = unprinted_note(estimate for finding in found for estimate in finding.rows.values())
+    lines += [line for note in notes for line in ("", note)]
     return "\n".join([*lines, "", f"Protocol: {protocol}.", ""])
 
 
 def _cell(estimate: Estimate | None, decimals: int) -> str:
     if estimate is None:
-        return "-"
-    width = estimate.half_width
-    return f"{estimate.mean:.{decimals}f}" + (f" ± {width:.{decimals}f}" if width == width else "")
+        return MISSING
+    return " ".join(format_estimate(estimate, decimals)).strip()
 
 
 def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[Finding]:

@@ -20,6 +20,7 @@ from unirender_evaluation.multiview.methods import Optimized, PlainLoop
 from unirender_evaluation.multiview.scoring import score_solution
 from unirender_evaluation.multiview.tables import PROTOCOL
 from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.studies.cells import signed
 from unirender_evaluation.studies.folder import open_folder
 from unirender_evaluation.studies.optimiser.commands import BenchIngredients
@@ -227,9 +228,14 @@ def test_the_table_says_what_was_measured() -> None:
     lines, _ = lines_of((20.0, 24.0, 28.0), (18.9, 23.0, 27.1))
     (table,) = tables(lines, settings=False)
     assert table.sections[1][0][1] == "23.00 (**-1.00 ± 0.25**)"
+    assert UNPRINTED not in to_markdown(lines, ())
     lines, _ = lines_of((20.0,), (19.0,))  # no interval
     (table,) = tables(lines, settings=False)
     assert table.sections[1][0][1] == "19.00 (-1.00)"
+    lines, _ = lines_of((20.0, 24.0), (18.9, 23.1))  # none that is printed
+    (table,) = tables(lines, settings=False)
+    assert table.sections[1][0][1] == "21.00 (-1.00)"
+    assert UNPRINTED in to_markdown(lines, ())
 
 
 @pytest.mark.parametrize("width", [80, 130])

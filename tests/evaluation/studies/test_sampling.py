@@ -19,7 +19,7 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.studies.sampling.calibration import Calibration, calibrate, pool
 from unirender_evaluation.studies.sampling.command import BenchSampling
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Case, SamplingStudy, Setting, measure
-from unirender_evaluation.studies.sampling.plots import draw_reliability
+from unirender_evaluation.studies.sampling.plots import PANELS, draw_reliability, from_mean
 from unirender_evaluation.studies.sampling.run import run
 from unirender_evaluation.studies.sampling.tables import COLUMNS, calibration_table, quality_table, tables
 from unirender_evaluation.versions import MODEL, Versions
@@ -227,6 +227,24 @@ def test_tables_show_what_was_measured(what: SamplingStudy, records: list[Record
     assert content["calibration"].keys() == {"sample-1x3", "sample-2x3"}
     for name in ("sampling.png", "calibration.png"):
         assert (what.out / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_plot_over_steps_pairs_by_picture() -> None:
+    """Pictures differ by 10 dB, the setting from mode `mean` by 0.5 dB on each: the bar is 0, not 12."""
+    setting, (column, _) = Setting("sample", 4, 5), PANELS
+    scores = {MEAN: (15.0, 20.0, 25.0), setting: (14.5, 19.5, 24.5)}
+    made = [
+        Record("sampling", DECOMPOSE, own.key, f"s{k}", f"o{k}", {column.key(DEFAULT_VARIANT): value})
+        for own, values in scores.items()
+        for k, value in enumerate(values)
+    ]
+    found = from_mean(made, setting, column)
+    assert found is not None
+    assert (found.mean, found.n) == (-0.5, 3)
+    assert found.half_width == pytest.approx(0, abs=1e-12)
+    assert from_mean(made[:3], setting, column) is None
+    infinite = replace(made[-1], values={column.key(DEFAULT_VARIANT): math.inf})
+    assert from_mean([*made[:-1], infinite], setting, column) is None
 
 
 def test_one_sample_has_no_calibration(what: SamplingStudy, records: list[Record]) -> None:

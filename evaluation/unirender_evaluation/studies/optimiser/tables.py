@@ -15,7 +15,7 @@ from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, METHOD, Estimate, paired_difference
+from unirender_evaluation.statistics import CONFIDENCE, METHOD, Estimate, paired_difference, unprinted_note
 from unirender_evaluation.studies.cells import Cell, cell_text
 from unirender_evaluation.studies.optimiser.ingredients import FULL, GROUPS, Ingredient, changes
 from unirender_evaluation.table_formats import header
@@ -106,7 +106,8 @@ def to_markdown(lines: Sequence[Line], protocol: Sequence[tuple[str, str]]) -> s
         NOTE,
     ]
     body = [table.markdown().rstrip("\n") for table in tables(lines, settings=True)]
-    return "\n\n".join([*head, *body, f"Protocol: {protocol_text([*protocol, interval()])}."]) + "\n"
+    line = f"Protocol: {protocol_text([*protocol, interval()])}."
+    return "\n\n".join([*head, *_unprinted(lines), *body, line]) + "\n"
 
 
 def show(console: Console, lines: Sequence[Line], protocol: Sequence[tuple[str, str]]) -> None:
@@ -115,8 +116,12 @@ def show(console: Console, lines: Sequence[Line], protocol: Sequence[tuple[str, 
     for shown in [EVERY] if console.width >= WIDE else [slice(half), slice(half, None)]:
         for table in tables(lines, settings=False, shown=shown):
             table.show(console)
-    for text in (NOTE, protocol_text([*protocol, interval()])):
+    for text in (NOTE, *_unprinted(lines), protocol_text([*protocol, interval()])):
         console.print(text, style="dim", highlight=False, markup=False)
+
+
+def _unprinted(lines: Sequence[Line]) -> tuple[str, ...]:
+    return unprinted_note(cell.difference for line in lines for cell in line.cells)
 
 
 def interval() -> tuple[str, str]:

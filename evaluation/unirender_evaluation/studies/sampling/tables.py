@@ -8,7 +8,7 @@ from typing import Any
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.cells import study_column
 from unirender_evaluation.studies.sampling.calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Setting
@@ -88,8 +88,9 @@ def quality_table(records: Sequence[Record], settings: Sequence[Setting]) -> Tex
     counts = sorted({setting.samples for setting in sampled})
     sections = [tuple(row(s) for s in settings if s == MEAN)]
     sections += [tuple(row(s) for s in sampled if s.samples == count) for count in counts]
+    note = unprinted_note(estimate(records, s.key, c.key(DEFAULT_VARIANT)) for s in settings for c in COLUMNS)
     titles = ("mode", "steps", "samples", *(f"{column.group} {header(column)}" for column in COLUMNS))
-    return TextTable(f"Steps and samples: n = {_scenes(records)}", titles, tuple(sections), (QUALITY_NOTE,))
+    return TextTable(f"Steps and samples: n = {_scenes(records)}", titles, tuple(sections), (QUALITY_NOTE, *note))
 
 
 def calibration_table(records: Sequence[Record], setting: Setting) -> TextTable:

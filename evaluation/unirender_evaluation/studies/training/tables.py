@@ -9,7 +9,7 @@ from typing import Any
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import INTERVAL, paired_difference
+from unirender_evaluation.statistics import INTERVAL, paired_difference, unprinted_note
 from unirender_evaluation.studies.cells import Cell, cell_text, study_column
 from unirender_evaluation.studies.training.choices import PLAIN, QUESTIONS, Choice
 from unirender_evaluation.table_formats import header
@@ -48,19 +48,19 @@ def cells(records: Sequence[Record], method: str) -> tuple[Cell, ...]:
 
 def table(rows: Sequence[Choice], records: Sequence[Record]) -> TextTable:
     """A row for each choice, those that answer one question together."""
-    sections = []
+    sections, differences = [], []
     for group, members in groupby(rows, key=lambda row: row.group):
         lines = []
         for row in members:
-            texts = [
-                cell_text(c, column.metric.decimals)
-                for c, column in zip(cells(records, row.name), COLUMNS, strict=True)
-            ]
+            own = cells(records, row.name)
+            differences += [cell.difference for cell in own]
+            texts = [cell_text(cell, column.metric.decimals) for cell, column in zip(own, COLUMNS, strict=True)]
             lines.append((f"{QUESTIONS[group]}: {row.label}" if group else row.label, *texts))
         sections.append(tuple(lines))
     titles = ("training", *(f"{column.group} {header(column)}" for column in COLUMNS))
     count = len({record.sample for record in records})
-    return TextTable(f"Choices of training: n = {count}", titles, tuple(sections), (NOTE,))
+    notes = (NOTE, *unprinted_note(differences))
+    return TextTable(f"Choices of training: n = {count}", titles, tuple(sections), notes)
 
 
 def to_json(rows: Sequence[Choice], records: Sequence[Record], run: Mapping[str, Any]) -> str:

@@ -10,7 +10,7 @@ from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import INTERVAL, mean_estimate
+from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.unknown_mesh.scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
 from unirender_evaluation.table_formats import format_estimate, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
@@ -86,20 +86,24 @@ def _table(
         )
         for record in records
     ]
-    means = [_mean(records, key, column) for key, column in zip(keys, columns, strict=True)]
+    means = [_mean(records, key) for key in keys]
+    texts = (_mean_text(mean, column) for mean, column in zip(means, columns, strict=True))
     titles = ("object", *(f"{column.group} {header(column)}".strip() for column in columns))
-    return TextTable(title, titles, (tuple(rows), ((f"mean (n = {len(records)})", *means),)), notes)
+    sections = (tuple(rows), ((f"mean (n = {len(records)})", *texts),))
+    return TextTable(title, titles, sections, (*notes, *unprinted_note(means)))
 
 
 def _cell(value: float | None, column: Column) -> str:
     return "-" if value is None else format_number(value, column.metric.decimals)
 
 
-def _mean(records: Sequence[Record], key: str, column: Column) -> str:
+def _mean(records: Sequence[Record], key: str) -> Estimate | None:
     values = [record.values[key] for record in records if key in record.values]
-    if not values:
-        return "-"
-    return " ".join(format_estimate(mean_estimate(values), column.metric.decimals)).strip()
+    return mean_estimate(values) if values else None
+
+
+def _mean_text(mean: Estimate | None, column: Column) -> str:
+    return "-" if mean is None else " ".join(format_estimate(mean, column.metric.decimals)).strip()
 
 
 def aim_notes(records: Sequence[Record]) -> tuple[str, ...]:
