@@ -4,6 +4,7 @@ Every file is written here, most of them byte by byte: the loader must not be te
 """
 
 import json
+import re
 import struct
 
 import numpy as np
@@ -320,6 +321,17 @@ def test_stl_of_words_in_capitals_or_with_zeros(tmp_path, padding):
     text = text.replace("\n", "\0\n", 1) if padding == "a name" else text
     text = text.replace("\n", "\r") if padding == "ends of lines" else text
     (tmp_path / "a.stl").write_text(text + "\0" * 4096 * (padding == "the end"), newline="")
+    assert len(load_mesh(tmp_path / "a.stl").faces) == 12
+
+
+@pytest.mark.parametrize("broken", [r"(?<=outer loop)\n", r"\n(?=vertex)", r"(?<=0)\n(?=outer)", r"(?<=endfacet)\n"])
+def test_stl_of_words_whose_lines_end_elsewhere(tmp_path, broken):
+    """Only numbers are told apart by the ends of lines; a solid may be named by any words."""
+    text = re.sub(" *\n *", "\n", str(trimesh.creation.box().export(file_type="stl_ascii"))).strip() + "\n"
+    text = re.sub("^(end)?solid.*", r"\1solid facet of a vertex", text, flags=re.MULTILINE)
+    named = re.sub(broken, " ", text)
+    assert named.count("\n") < text.count("\n")
+    (tmp_path / "a.stl").write_text(named, newline="")
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 

@@ -398,6 +398,8 @@ def test_names_that_differ_in_case_alone_are_found(tmp_path):
         ("a.stl", b"solid nothing\nendsolid nothing\n", "no faces|cannot be read"),
         ("a.stl", STL_FACET.replace(b"1 0 0", b"1 0") * 3 + STL_END, "the line b'vertex 1 0', expected three numbers"),
         ("a.stl", STL_FACET.replace(b"endloop", b"vertex 1 1 0\nendloop") * 3 + STL_END, "has facets of 4 vertices"),
+        ("a.stl", STL_FACET.replace(b"1 0 0", b"1 0 vertex") + STL_END, "the line b'vertex 1 0 vertex', expected"),
+        ("a.stl", STL_FACET.replace(b"facet normal", b"normal") + STL_FACET + STL_END, "before its first facet"),
         ("a.ply", PLY + b"comment TextureFile ../a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "'../a.png' lies outside"),
         ("a.ply", PLY + b"comment TextureFile a.png\n" + PLY_TRIANGLE + b"3 0 1 2\n", "texture 'a.png' is missing"),
         ("a.ply", PLY + b"comment TextureFile a\ncomment TextureFile b\n" + PLY_TRIANGLE + b"3 0 1 2\n", "names 2"),

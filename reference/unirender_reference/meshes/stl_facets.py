@@ -12,8 +12,12 @@ from unirender_reference.meshes.limits import check_faces
 HEADER, FACET = 84, 50  # bytes of a binary file: its header with the count, and each facet
 ATTRIBUTES = "attributes of facets"  # among what is ignored
 END = 65536  # bytes in which the last solid ends; zeros may follow
-MARKS = re.compile(rb"^[ \t]*(?:endfacet[ \t]+)?(f)acet|^[ \t]*(v)ertex", re.MULTILINE)
-VERTEX = re.compile(rb"^[ \t]*vertex(?![ \t]+\S+[ \t]+\S+[ \t]+\S+[ \t\r]*$)[^\r\n]*", re.MULTILINE)
+NAMES = re.compile(rb"solid(?!\S)[^\r\n]*")  # of solids: any words
+# The keywords, wherever they stand in a line; what is looked for behind their letters is found fast.
+MARKS = re.compile(rb"facet(?<!\Sfacet)(?!\S)|vertex(?<!\Svertex)(?!\S)")
+NO_POINT = re.compile(
+    rb"vertex(?<!\Svertex)(?!(?:[ \t]+(?!vertex)\S+){3}[ \t\r]*(?:$|vertex(?!\S)))[^\r\n]*", re.MULTILINE
+)
 
 
 def whole_stl(path: Path, head: bytes) -> tuple[io.BytesIO | None, set[str]]:
@@ -54,9 +58,12 @@ def _of_text(data: bytes) -> io.BytesIO | None:
     if b"endsolid" not in words[-END:]:
         raise UnirenderError("truncated: its last solid does not end, expected 'endsolid'; copy it again")
     check_faces(words.count(b"endfacet"))
-    if odd := VERTEX.search(words):
+    words = NAMES.sub(b"", words)
+    if odd := NO_POINT.search(words):
         raise UnirenderError(f"has the line {odd[0].strip()[:60]!r}, expected three numbers; export it again")
-    marks = b"".join(found[1] or found[2] for found in MARKS.finditer(words))
+    marks = b"".join(found[0][:1] for found in MARKS.finditer(words))
+    if marks.startswith(b"v"):
+        raise UnirenderError("has vertices before its first facet; export it again")
     if marks != b"fvvv" * (len(marks) // 4):
         sizes = {len(vertices) for vertices in marks.split(b"f")[1:]} - {3}
         raise UnirenderError(f"has facets of {', '.join(map(str, sorted(sizes)))} vertices, expected triangles")
