@@ -208,6 +208,10 @@ WRONG = {
     "both": (ply("ascii", [VERTICES, faces_of(QUAD), ("tristrips", *faces_of(QUAD)[1:])]), "both faces and tristrips"),
     "no z": (ply("ascii", [("vertex", POINT[:2], [[0, 0]]), faces_of(QUAD)]), "vertices have no z"),
     "a type": (ply("ascii", [VERTICES, faces_of(QUAD)]).replace(b"float z", b"half z"), "the line b'property half z'"),
+    "rows below 0": (  # which took lines away from the faces
+        ply("ascii", [VERTICES, faces_of(QUAD)]).replace(b"end_header", b"element edge -1\nend_header"),
+        "the line b'element edge -1'",
+    ),
     "an order": (ply("ascii", [VERTICES]).replace(b"ascii", b"binary"), "the line b'format binary 1.0'"),
     "no order": (ply("ascii", [VERTICES]).replace(b"format ascii 1.0\n", b""), "no line 'format'|not understood"),
     "a name twice": (ply("ascii", [VERTICES]).replace(b"float z", b"float y"), "two properties of one name"),

@@ -135,7 +135,7 @@ def read_header(head: bytes) -> PlyHeader:
                     raise ValueError
             elif keyword == "element":
                 name, rows = words
-                if name in elements:
+                if name in elements or int(rows) < 0:
                     raise ValueError
                 properties = []
                 elements[name] = PlyElement(int(rows), properties)
