@@ -58,11 +58,14 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """For a block that writes a file: an error that names none, as a full disk's does, gets its name."""
+    """For a block that writes a file: an error of the system that names none, as a full disk's does, gets its name.
+
+    One without a number is a library's own, such as Pillow's or NumPy's; with a name it would not show its words.
+    """
     try:
         yield
     except OSError as error:
-        if error.filename is None:
+        if error.errno is not None and error.filename is None:
             error.filename = str(path)
         raise
 

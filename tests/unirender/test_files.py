@@ -317,6 +317,12 @@ def test_a_stream_that_breaks_leaves_what_was_there_and_nothing_aside(tmp_path: 
     assert [each.name for each in tmp_path.iterdir()] == ["state"]
 
 
+def test_an_error_of_a_library_keeps_its_words(tmp_path: Path) -> None:
+    """NumPy says so of a full disk, without a number; with a file's name Python would print that alone."""
+    with pytest.raises(OSError, match=r"^16 requested and 8 written$"), whole_file(tmp_path / "state"):
+        raise OSError("16 requested and 8 written")
+
+
 def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Path) -> None:
     """Its rows are areas, ours lie on the poles: taken as it is, light from above would be weighed wrongly."""
     mask = np.ones((8, 8, 1), dtype=np.float32)
