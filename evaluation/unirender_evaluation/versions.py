@@ -111,6 +111,7 @@ OUTSIDE = (
     "process_ends",
     "remarks",
     "shipped",
+    "system_errors",
     "worker_pool",
     "writing",
 )

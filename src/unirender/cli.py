@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.command_line import Ended, causes, interrupted, out_of_memory, parse, refused_by_system
+from unirender.command_line import Ended, causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.notices import NoticeHandler, notice
 from unirender.process_ends import READER_LEFT, drop_output, end, open_streams, quick_start, reader_left
+from unirender.system_errors import out_of_memory, refused_by_system
 from unirender.training.average import Average
 from unirender.training.calibrate import Calibrate
 from unirender.training.command import Train

@@ -15,9 +15,10 @@ import pytest
 from optimizer_runs import rendered_views, truth
 
 from unirender import cli
-from unirender.command_line import causes, interrupted, refused_by_system
+from unirender.command_line import causes, interrupted
 from unirender.files import write_png
 from unirender.process_ends import open_streams
+from unirender.system_errors import refused_by_system
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 

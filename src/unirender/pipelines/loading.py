@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError, safe_open
 
-from unirender.command_line import out_of_memory
 from unirender.errors import UnirenderError
 from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
+from unirender.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
 OF_FILES = (OSError, SafetensorError)
