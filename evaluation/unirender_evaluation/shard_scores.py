@@ -20,7 +20,7 @@ from unirender_evaluation.methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
-from unirender_evaluation.table_formats import MISSING, format_estimate
+from unirender_evaluation.table_formats import estimate_text
 from unirender_evaluation.table_text import TextTable
 
 COLUMNS = {  # header -> metric of `score_maps`, decimals
@@ -148,7 +148,7 @@ def _table(title: str, found: Sequence[Scored], columns: Mapping[str, tuple[str,
         rows = []
         for name, own in groups.items():
             means = [_mean(own, key) for key, _ in columns.values()]
-            texts = (_text(mean, decimals) for mean, (_, decimals) in zip(means, columns.values(), strict=True))
+            texts = (estimate_text(mean, decimals) for mean, (_, decimals) in zip(means, columns.values(), strict=True))
             rows.append((name, str(len({one.object for one in own})), str(len(own)), *texts))
             estimates += means
         sections.append(tuple(rows))
@@ -159,7 +159,3 @@ def _table(title: str, found: Sequence[Scored], columns: Mapping[str, tuple[str,
 def _mean(found: Sequence[Scored], key: str) -> Estimate | None:
     own = [one for one in found if key in one.scores]
     return mean_estimate([one.scores[key] for one in own], [one.object for one in own]) if own else None
-
-
-def _text(mean: Estimate | None, decimals: int) -> str:
-    return MISSING if mean is None else " ".join(format_estimate(mean, decimals)).strip()

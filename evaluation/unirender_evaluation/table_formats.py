@@ -42,6 +42,11 @@ def format_estimate(estimate: Estimate, decimals: int) -> tuple[str, str]:
     return format_number(estimate.mean, decimals), "" if math.isnan(width) else f"± {format_number(width, decimals)}"
 
 
+def estimate_text(estimate: Estimate | None, decimals: int) -> str:
+    """Mean and half width as one text; `MISSING` where nothing was measured."""
+    return MISSING if estimate is None else " ".join(format_estimate(estimate, decimals)).strip()
+
+
 def header(column: Column) -> str:
     """Metric with its unit and direction."""
     unit = f" ({column.metric.unit})" if column.metric.unit else ""

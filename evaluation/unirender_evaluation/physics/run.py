@@ -31,7 +31,7 @@ from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
-from unirender_evaluation.table_formats import MISSING, format_estimate
+from unirender_evaluation.table_formats import estimate_text
 from unirender_evaluation.truth_render import item_seed
 
 MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
@@ -170,7 +170,7 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
     for finding in found:
         test = finding.test
         expected = test.expected if isinstance(test.expected, str) else f"{test.expected:g}"
-        cells = [_cell(finding.rows.get(row), test.metric.decimals) for row in ROWS]
+        cells = [estimate_text(finding.rows.get(row), test.metric.decimals) for row in ROWS]
         verdict = "PASS" if finding.refused else "FAIL"
         heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
         lines.append(f"| {heading} | {expected} | {' | '.join(cells)} | {verdict}: {test.twin_is} |")
@@ -178,12 +178,6 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
     notes = unprinted_note(estimate for finding in found for estimate in finding.rows.values())
     lines += [line for note in notes for line in ("", note)]
     return "\n".join([*lines, "", f"Protocol: {protocol}.", ""])
-
-
-def _cell(estimate: Estimate | None, decimals: int) -> str:
-    if estimate is None:
-        return MISSING
-    return " ".join(format_estimate(estimate, decimals)).strip()
 
 
 def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[Finding]:

@@ -12,7 +12,7 @@ from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, u
 from unirender_evaluation.studies.cells import study_column
 from unirender_evaluation.studies.sampling.calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Setting
-from unirender_evaluation.table_formats import MISSING, format_estimate, format_number, header, json_number
+from unirender_evaluation.table_formats import MISSING, estimate_text, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 
 DIGITS = 3
@@ -78,10 +78,7 @@ def quality_table(records: Sequence[Record], settings: Sequence[Setting]) -> Tex
 
     def row(setting: Setting) -> tuple[str, ...]:
         found = [(column, estimate(records, setting.key, column.key(DEFAULT_VARIANT))) for column in COLUMNS]
-        cells = (
-            MISSING if value is None else " ".join(format_estimate(value, column.metric.decimals)).strip()
-            for column, value in found
-        )
+        cells = (estimate_text(value, column.metric.decimals) for column, value in found)
         return (setting.mode, f"{setting.steps}", f"{setting.samples}", *cells)
 
     sampled = [setting for setting in settings if setting != MEAN]
@@ -107,7 +104,7 @@ def calibration_table(records: Sequence[Record], setting: Setting) -> TextTable:
                 f"{pooled.rms_spread:.{DIGITS}f}",
                 format_number(pooled.ratio, 2),
                 *(
-                    _estimate_text(estimate(records, setting.key, f"{name}.spread.{key}"))
+                    estimate_text(estimate(records, setting.key, f"{name}.spread.{key}"), 2)
                     for key in ("coverage", "rank")
                 ),
                 MISSING if pooled.rank_scenes is None else f"{pooled.rank_scenes:.2f}",
@@ -170,10 +167,6 @@ def to_json(records: Sequence[Record], settings: Sequence[Setting], protocol: Pr
 
 def _scenes(records: Sequence[Record]) -> int:
     return len({record.sample for record in records})
-
-
-def _estimate_text(found: Estimate | None) -> str:
-    return MISSING if found is None else " ".join(format_estimate(found, 2)).strip()
 
 
 def _pooled(pooled: Pooled) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.unknown_mesh.scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
-from unirender_evaluation.table_formats import format_estimate, format_number, header, json_number
+from unirender_evaluation.table_formats import estimate_text, format_number, header, json_number
 from unirender_evaluation.table_text import TextTable
 from unirender_reference.multiview import ELEVATIONS_DEG
 
@@ -87,7 +87,7 @@ def _table(
         for record in records
     ]
     means = [_mean(records, key) for key in keys]
-    texts = (_mean_text(mean, column) for mean, column in zip(means, columns, strict=True))
+    texts = (estimate_text(mean, column.metric.decimals) for mean, column in zip(means, columns, strict=True))
     titles = ("object", *(f"{column.group} {header(column)}".strip() for column in columns))
     sections = (tuple(rows), ((f"mean (n = {len(records)})", *texts),))
     return TextTable(title, titles, sections, (*notes, *unprinted_note(means)))
@@ -100,10 +100,6 @@ def _cell(value: float | None, column: Column) -> str:
 def _mean(records: Sequence[Record], key: str) -> Estimate | None:
     values = [record.values[key] for record in records if key in record.values]
     return mean_estimate(values) if values else None
-
-
-def _mean_text(mean: Estimate | None, column: Column) -> str:
-    return "-" if mean is None else " ".join(format_estimate(mean, column.metric.decimals)).strip()
 
 
 def aim_notes(records: Sequence[Record]) -> tuple[str, ...]:
