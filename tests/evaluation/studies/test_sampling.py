@@ -16,6 +16,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.options import MOST_STEPS
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.studies.sampling.calibration import Calibration, calibrate, pool
 from unirender_evaluation.studies.sampling.command import BenchSampling
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Case, SamplingStudy, Setting, measure
@@ -219,6 +220,7 @@ def test_tables_show_what_was_measured(what: SamplingStudy, records: list[Record
     own = [r for r in records if r.method == "sample-2x3" and r.protocol == DECOMPOSE]
     error = np.mean([record.values["albedo.spread.squared_error"] for record in own])
     assert calibrated.sections[0][0][1] == f"{math.sqrt(error):.3f}"
+    assert UNPRINTED in calibrated.notes
     text = (what.out / "sampling.md").read_text()
     assert table.markdown() in text
     assert "Protocol: pictures: 2 of 2 objects" in text

@@ -93,20 +93,20 @@ def quality_table(records: Sequence[Record], settings: Sequence[Setting]) -> Tex
 def calibration_table(records: Sequence[Record], setting: Setting) -> TextTable:
     """A map a row."""
     rows = []
+    means: list[Estimate | None] = []
     for name in MAPS:
         if not (found := calibrations(records, setting, name)):
             continue
         pooled = pool(found)
+        own = [estimate(records, setting.key, f"{name}.spread.{key}") for key in ("coverage", "rank")]
+        means += own
         rows.append(
             (
                 name,
                 f"{pooled.rms_error:.{DIGITS}f}",
                 f"{pooled.rms_spread:.{DIGITS}f}",
                 format_number(pooled.ratio, 2),
-                *(
-                    estimate_text(estimate(records, setting.key, f"{name}.spread.{key}"), 2)
-                    for key in ("coverage", "rank")
-                ),
+                *(estimate_text(mean, 2) for mean in own),
                 MISSING if pooled.rank_scenes is None else f"{pooled.rank_scenes:.2f}",
                 str(len(found)),
             )
@@ -122,7 +122,7 @@ def calibration_table(records: Sequence[Record], setting: Setting) -> TextTable:
         "n",
     )
     title = f"Calibration of mode sample, {setting.steps} steps, {setting.samples} samples: n = {_scenes(records)}"
-    return TextTable(title, titles, (tuple(rows),), (CALIBRATION_NOTE, UNITS_NOTE))
+    return TextTable(title, titles, (tuple(rows),), (CALIBRATION_NOTE, UNITS_NOTE, *unprinted_note(means)))
 
 
 def ratio_table(records: Sequence[Record], settings: Sequence[Setting], samples: int) -> TextTable:
