@@ -233,12 +233,17 @@ def test_sizes_and_keys_of_several_shards_are_named_with_their_shards(tmp_path: 
 
 
 def test_meshes_of_one_name_in_two_parts_are_two_objects(tmp_path: Path) -> None:
-    """`chair.glb` of one catalogue and of another, or one object under other lights; a copy of a part is none."""
-    parts = {"one": members(), "other": group_members("basis", 16, 1, (40,), (0, 50, 100), 1)}
+    """`chair.glb` of one catalogue and of another, or one object of other materials; a copy of a part is none."""
+    parts = {
+        "one": members(),
+        "other": group_members("basis", 16, 1, (40,), (0, 50, 100), 1),
+        "rough": group_members("independent", 16, 1, (80,), (0,), 0),
+        "smooth": group_members("independent", 16, 1, (40,), (0,), 0),
+    }
     for part, group in parts.items():
         (tmp_path / part).mkdir()
         write_shard(tmp_path / part / "shard-000000.tar", {"chair-0123_g0": group})
-    assert GroupDataset(tmp_path).keys == ("chair-0123_g0",) * 2
+    assert GroupDataset(tmp_path).keys == ("chair-0123_g0",) * 4
     shutil.copytree(tmp_path / "one", tmp_path / "copy")
     with pytest.raises(UnirenderError, match=r"twice \(chair-0123_g0 in copy/shard-.*, one/shard-.*no copies; take"):
         GroupDataset(tmp_path)

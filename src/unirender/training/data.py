@@ -111,7 +111,8 @@ class GroupDataset:
         """Looks for groups that are there twice; meshes of one name in two parts are two objects.
 
         Raises:
-            UnirenderError: two groups of one folder have one key, or two of any have key, surface and lights in common.
+            UnirenderError: two groups of one folder have one key, or two of any have key, surface, materials and lights
+                in common.
         """
         counts, where = Counter(self.keys), dict[tuple[str, str], str]()
         twice: list[str] = []
@@ -120,6 +121,7 @@ class GroupDataset:
                 continue
             lights = sorted({pair.light for pair in group.pairs})
             content = shard.shared[group.shared].tobytes() + shard.environment[lights].tobytes()
+            content += repr([(pair.metallic, pair.roughness) for pair in group.pairs]).encode()
             for same in (f"folder {shard.name.rpartition('/')[0]}", hashlib.sha256(content).hexdigest()):
                 if (first := where.setdefault((group.key, same), shard.name)) != shard.name:
                     twice.append(f"{group.key} in {first}, {shard.name}")
