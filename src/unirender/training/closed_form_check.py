@@ -13,7 +13,7 @@ from unirender.training.data import GroupDataset
 from unirender.training.members import BLACK
 
 PICTURES = 32  # that are looked at, spread over the data
-FACTOR = 1.4  # either way; of rendered data sets the median is within a few per cent of 1
+FACTOR = 1.4  # either way; rendered data sets stay well within it
 
 
 def brightness(data: GroupDataset) -> float:
