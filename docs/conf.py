@@ -8,6 +8,7 @@ from docutils import nodes
 from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 from jupyter_client.manager import KernelManager
+from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.util import logging
 from sphinx.writers.html5 import HTML5Translator
@@ -113,6 +114,14 @@ def _tables(folder: Path) -> str:
     return "\n\n".join(path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.md")))
 
 
+def _exact_types(app: Sphinx, doctree: nodes.document) -> None:
+    """A signature's types have their whole names, so they are found by them. Sphinx would look through all that is
+    documented for each that is not among it (`object`, `Tensor`), and find a field of the same name."""
+    for reference in doctree.findall(addnodes.pending_xref):
+        if reference.get("refspecific") is False:
+            del reference["refspecific"]
+
+
 def _intervals(app: Sphinx, doctree: nodes.document) -> None:
     """Half an interval stays on one line with its sign, and a row's count with its `n`: a column may be narrower."""
     for text in list(doctree.findall(nodes.Text)):
@@ -121,16 +130,21 @@ def _intervals(app: Sphinx, doctree: nodes.document) -> None:
             text.parent.replace(text, nodes.Text(kept))
 
 
+def _formulas(app: Sphinx, doctree: nodes.document) -> None:
+    """Each formula becomes MathML, which browsers draw by themselves: MathJax would be fetched from another host."""
+    for formula in doctree.findall(lambda node: isinstance(node, (nodes.math, nodes.math_block))):
+        block = isinstance(formula, nodes.math_block)
+        try:
+            markup = tex2mathml(formula.astext().strip(), as_block=block)
+        except MathError as error:
+            logging.getLogger(__name__).warning("formula %r: %s", formula.astext(), error, location=formula)
+            markup = ""
+        markup = _OVERLINE.sub(r'<mrow class="overline">\1</mrow>', markup)  # no browser stretches docutils' bar
+        formula["mathml"] = f'<div class="math">{markup}</div>' if block else markup
+
+
 def _mathml(writer: HTML5Translator, node: nodes.math | nodes.math_block) -> None:
-    """A formula as MathML, which browsers draw by themselves: MathJax would be fetched from another host."""
-    block = isinstance(node, nodes.math_block)
-    try:
-        markup = tex2mathml(node.astext().strip(), as_block=block)
-    except MathError as error:
-        logging.getLogger(__name__).warning("formula %r: %s", node.astext(), error, location=node)
-        raise nodes.SkipNode from error
-    markup = _OVERLINE.sub(r'<mrow class="overline">\1</mrow>', markup)  # no browser stretches docutils' bar
-    writer.body.append(f'<div class="math">{markup}</div>' if block else markup)
+    writer.body.append(node["mathml"])
     raise nodes.SkipNode
 
 
@@ -144,6 +158,8 @@ def _short_navigation(app: Sphinx, page: str, template: str, context: dict[str, 
 def setup(app: Sphinx) -> None:
     app.add_html_math_renderer("mathml", inline_renderers=(_mathml, None), block_renderers=(_mathml, None))
     app.connect("source-read", _results)
+    app.connect("doctree-read", _formulas, priority=100)  # before headings are copied
+    app.connect("doctree-read", _exact_types)
     app.connect("doctree-read", _intervals)
     app.connect("autodoc-process-docstring", _docstring, priority=100)
     app.connect("html-page-context", _short_navigation, priority=400)  # before the theme draws it
