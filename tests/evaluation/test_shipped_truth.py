@@ -219,7 +219,7 @@ def test_standard_comes_with_the_checkout(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tiny", "standard"])
+@pytest.mark.parametrize("name", ["tiny", pytest.param("standard", marks=pytest.mark.long)])
 def test_shipped_truth_agrees_with_mitsuba_here(name: str, request: pytest.FixtureRequest) -> None:
     """One image and one roughness 12 % off, rendered here: the first passes the z-test, the second must not."""
     from unirender_reference.render import Renderer

@@ -20,6 +20,7 @@ from unirender_reference.passes import Estimate
 from unirender_reference.render import Renderer
 from unirender_reference.statistics import ZTest, z_test
 
+pytestmark = pytest.mark.long  # test_augmentation_chain.py has all of them at once
 SIZE = 24
 SPP = 1024
 ROUGHNESS = 0.4

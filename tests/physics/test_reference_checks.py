@@ -25,7 +25,7 @@ def seeds(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return seen
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CHECKS)
 def test_check_passes_and_its_twin_fails(name: str, seeds: list[int]) -> None:
     """No two renders of a check share a seed: their noise would be the same, and counted twice."""

@@ -43,7 +43,10 @@ def painted() -> Renderer:
     return Renderer(lopsided_object(albedo=PAINTED), resolution=SIZE)
 
 
-@pytest.mark.parametrize(("roughness", "metallic"), [(0.2, 1.0), (0.5, 0.0), (0.8, 0.5)])
+@pytest.mark.parametrize(
+    ("roughness", "metallic"),
+    [(0.2, 1.0), pytest.param(0.5, 0.0, marks=pytest.mark.long), pytest.param(0.8, 0.5, marks=pytest.mark.long)],
+)
 def test_repainted_is_the_render_of_the_repainted_object(
     renderer: Renderer, painted: Renderer, roughness: float, metallic: float
 ) -> None:

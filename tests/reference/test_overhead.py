@@ -19,6 +19,7 @@ def test_bare_loop_makes_the_calls_of_a_sample(monkeypatch: pytest.MonkeyPatch) 
         measure_overhead(config, 8)
 
 
+@pytest.mark.long
 def test_table_names_both_sides_of_the_ratio(capsys: pytest.CaptureFixture[str]) -> None:
     assert Overhead(resolutions=(4, 8), spp=8, repeats=1).run() == 0
     printed = capsys.readouterr().out

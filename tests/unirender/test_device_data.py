@@ -66,7 +66,9 @@ def on_device(folder: Path, batch: int, seed: int, augmentation: Augmentation, r
     return DeviceSource(ShardSource(folder, batch, seed, augmentation=augmentation, size=16, rows=rows), CPU)
 
 
-@pytest.mark.parametrize("name", ONE_BY_ONE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] if name == "derived" else []) for name in ONE_BY_ONE]
+)
 def test_batches_are_those_of_the_reader(name: str, folder: Path) -> None:
     made, read = both(folder, ONE_BY_ONE[name])
     assert made.keys() == read.keys()

@@ -213,7 +213,7 @@ def test_larger_pictures_have_the_shadows_of_small_ones() -> None:
         assert np.abs(share[::2, ::2] - small[name]).mean() < 0.02
 
 
-@pytest.mark.parametrize("size", [SIZE, 2 * SHADOW_SIDE])
+@pytest.mark.parametrize("size", [SIZE, pytest.param(2 * SHADOW_SIDE, marks=pytest.mark.long)])
 def test_a_strip_has_the_shadows_that_it_has_in_a_square(size: int) -> None:
     normal, mask, _ = gutter(size)
     rows = slice(3 * size // 8, 5 * size // 8)
@@ -229,7 +229,7 @@ def test_a_strip_has_the_shadows_that_it_has_in_a_square(size: int) -> None:
         assert share.min() < 0.6
 
 
-@pytest.mark.parametrize("size", [SIZE, 2 * SHADOW_SIDE])
+@pytest.mark.parametrize("size", [SIZE, pytest.param(2 * SHADOW_SIDE, marks=pytest.mark.long)])
 def test_what_is_hardly_covered_has_the_shadow_beside_it(size: int) -> None:
     normal, mask, _ = gutter(size)
     soft = mask.copy()

@@ -97,7 +97,7 @@ def test_a_mesh_that_lies_elsewhere_is_refused(views: Views, solution: Solution)
             check_alignment(placed(views, place), solution.obj)
 
 
-@pytest.mark.parametrize("side", [24, 64])
+@pytest.mark.parametrize("side", [24, pytest.param(64, marks=pytest.mark.long)])
 def test_a_mesh_in_other_axes_is_refused(side: int):
     """Turned by quarters about each axis, at any size (an object that is nearly round about an axis is not)."""
     solution = truth(5)
