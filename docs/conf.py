@@ -115,10 +115,10 @@ def _tables(folder: Path) -> str:
 
 
 def _exact_types(app: Sphinx, doctree: nodes.document) -> None:
-    """A signature's types have their whole names, so they are found by them. Sphinx would look through all that is
-    documented for each that is not among it (`object`, `Tensor`), and find a field of the same name."""
+    """Sphinx looks through all that is documented for each type of a signature that is not among it, and finds a field
+    named `object`. A whole name or a built-in needs no search; a bare class is one that is imported for checks alone."""
     for reference in doctree.findall(addnodes.pending_xref):
-        if reference.get("refspecific") is False:
+        if reference.get("refspecific") is False and ("." in reference["reftarget"] or reference["reftarget"].islower()):
             del reference["refspecific"]
 
 
