@@ -70,7 +70,9 @@ def read_conventions(folder: Path) -> Conventions:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise UnirenderError(f"{path}: not a readable TOML file ({error})") from None
+        raise UnirenderError(
+            f"{path}: not a readable TOML file ({error}), expected lines like premultiplied = false"
+        ) from None
     known = [field.name for field in fields(Conventions)]
     problems = [f"{path}: unknown key {key!r}, expected some of {', '.join(known)}" for key in data if key not in known]
     for key, choices in CHOICES.items():

@@ -29,7 +29,7 @@ def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
             else:
                 value = np.asarray(picture.convert("RGB"), np.float32) / 255.0
     except (OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"predictions: {path} is not a readable PNG ({error})") from None
+        raise UnirenderError(f"predictions: {path} is not a readable PNG ({error}); write it again") from None
     value = value if value.ndim == 3 else value[..., None]
     if channels == 3:
         return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value.astype(np.float32)

@@ -84,7 +84,9 @@ class BenchTables:
         specs = {name: ALL_TABLES[name] for name in self.table or ALL_TABLES}
         tables = build_tables(records, run, specs, variants)
         if not tables:
-            raise UnirenderError(f"tables: the files have no values of {', '.join(specs)}")
+            raise UnirenderError(
+                f"tables: the files have no values of {', '.join(specs)}; choose another --table, or none"
+            )
         _print_tables(tables, self.format)
         return 0
 
@@ -149,7 +151,7 @@ def parsed(text: str) -> "Variant":
     try:
         return Variant.parse(text)
     except UnirenderError as error:
-        raise UsageError(f"--variant {text}: {error}") from None
+        raise UsageError(f"--{error}") from None  # which begins with "variant" and the text
 
 
 def asked_variants(texts: tuple[str, ...]) -> "tuple[Variant, ...] | None":
@@ -163,7 +165,7 @@ def asked_variants(texts: tuple[str, ...]) -> "tuple[Variant, ...] | None":
     try:
         return chosen_variants(texts)
     except UnirenderError as error:
-        raise UsageError(f"--variant {' '.join(texts)}: {error}") from None
+        raise UsageError(f"--{error}") from None
 
 
 def _validate(path: Path) -> int:

@@ -105,18 +105,18 @@ def read_document(path: Path) -> Any:
         expected = f"expected JSON, or JSON packed by gzip in a file whose name ends in {PACKED}"
         raise UnirenderError(f"{path}: is no text in UTF-8, {expected}") from None
     except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror})") from None
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
     try:
         return json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_no_name_twice)
     except json.JSONDecodeError as error:
         cut = " (the file ends too early: was it copied whole?)" if error.pos >= len(text.rstrip()) else ""
         raise UnirenderError(f"{path}: is no JSON: {error}{cut}") from None
     except RecursionError:
-        raise UnirenderError(f"{path}: is nested too deeply to be results") from None
+        raise UnirenderError(f"{path}: is nested too deeply to be results, expected the {NAME} of a run") from None
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}") from None
     except ValueError as error:  # a whole number of thousands of digits
-        raise UnirenderError(f"{path}: holds a number that cannot be read ({error})") from None
+        raise UnirenderError(f"{path}: holds a number that cannot be read ({error}); copy the file again") from None
 
 
 def from_document(document: Any, source: str) -> Results:

@@ -189,15 +189,20 @@ def by_object(results: Results, method: str, numbers: Sequence[tuple[str, str]],
 
 
 def by_scale(results: Results, methods: Sequence[str]) -> str:
-    """The albedo's PSNR of rows: as it is, and after a least-squares factor for the picture or for each channel."""
+    """The albedo's PSNR of rows: as it is, and after a least-squares factor for the picture or for each channel.
+
+    Means are over the pictures that all of these rows have, those that have none left aside.
+    """
     records = Selection("inverse", "single-image").of(results.records)
+    keys = [metric_key("albedo", METRICS["psnr"], Variant("masked", "srgb", scale)) for scale in SCALES]
+    rows = {m: {r.sample: r for r in records if r.method == m and keys[0] in r.values} for m in methods}
+    shared = set.intersection(*(set(found) for found in rows.values() if found)) if any(rows.values()) else set()
     lines = []
-    for method in methods:
-        found = [record for record in records if record.method == method]
-        keys = [metric_key("albedo", METRICS["psnr"], Variant("masked", "srgb", scale)) for scale in SCALES]
-        means = [f"{np.mean([r.values[key] for r in found]):.2f}" if found else NOT_RUN for key in keys]
-        lines.append([_label(results, method), *means])
-    return _table(["", "as it is", "one factor", "one a channel"], lines)
+    for method, found in rows.items():
+        values = [[found[sample].values[key] for sample in shared] if found else [] for key in keys]
+        means = [f"{np.mean(own):.2f}" if own else NOT_RUN for own in values]
+        lines.append([_label(results, method), *means, str(len(values[0]))])
+    return _table(["", "as it is", "one factor", "one a channel", "pictures"], lines)
 
 
 def published_against_constant(results: Results) -> str:

@@ -112,7 +112,10 @@ def _picture(value: Any, what: str) -> Picture:
 def _mask(value: Any, truth: Picture) -> Float[np.ndarray, "h w 1"]:
     found = _array(value, "mask", 1, "coverage in [0, 1]")
     if found.shape[:2] != truth.shape[:2]:
-        raise UnirenderError(f"score: got a mask of {found.shape[:2]} and a truth of {truth.shape[:2]} pixels")
+        raise UnirenderError(
+            f"score: got a mask of {found.shape[:2]} and a truth of {truth.shape[:2]} pixels, expected the same; "
+            "resample the mask"
+        )
     if found.min() < 0 or found.max() > 1:
         raise UnirenderError(f"score: mask is in [{found.min():g}, {found.max():g}], expected coverage in [0, 1]")
     return found

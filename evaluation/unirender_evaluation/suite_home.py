@@ -117,9 +117,11 @@ def target(
     asked: tuple[tuple[Literal["objects", "lights"], Path | None], ...] = (("objects", objects), ("lights", lights))
     for kind, given in asked:
         if given is not None and not uses[kind]:
-            raise UnirenderError(f"--{kind} {given}: suite {spec.name!r} takes no files from a folder of {kind}")
+            raise UnirenderError(
+                f"--{kind} {given}: suite {spec.name!r} takes no {kind} from a folder; leave --{kind} out"
+            )
         if given is not None and not given.expanduser().is_dir():
-            raise UnirenderError(f"--{kind} {given}: no such folder")
+            raise UnirenderError(f"--{kind} {given}: no such folder, expected that of the suite's {kind}")
         folder = spec.folder(kind) if given is None else given.expanduser()
         if folder is not None and (given is not None or path != source):
             text = with_folder(text, source, kind, _from(path.parent, folder))

@@ -33,7 +33,10 @@ def check_files(spec: SuiteSpec, sources: Sequence[ObjectSource], lights: Mappin
     """
     if links := list(_links(spec)):
         listed = "\n".join(f"  {line}" for line in links)
-        raise UnirenderError(f"suite {spec.name!r}: a truth takes no files behind links to folders:\n{listed}")
+        raise UnirenderError(
+            f"suite {spec.name!r}: a truth takes no files behind links to folders; put the folders themselves there, "
+            f"or remove the links:\n{listed}"
+        )
     found = {
         "objects": file_hashes(source.provenance() for source in sources),
         "lights": file_hashes(light.provenance for light in lights.values()),

@@ -225,7 +225,7 @@ def input_sha256(path: Path, mask: Path | None) -> str:
         try:
             digest.update(checked_file(file).read_bytes())
         except OSError as error:
-            raise UnirenderError(f"{file}: cannot be read ({error.strerror})") from error
+            raise UnirenderError(f"{file}: cannot be read ({error.strerror}); check its permissions") from error
     return digest.hexdigest()
 
 

@@ -341,6 +341,19 @@ def test_the_keyboard_is_seen_where_it_is(server: Server, tmp_path: Path) -> Non
             assert page.ask(ring) == [kind, "solid"]
 
 
+def test_the_list_of_lights_is_not_opened_by_tabbing_past_it(server: Server, tmp_path: Path) -> None:
+    opened = "return document.querySelectorAll('[role=listbox]').length"
+    with visit(server, tmp_path) as page:
+        open_example(page, 2)
+        page.press("#light input", "tab")
+        time.sleep(0.5)  # gradio opens it a tick later
+        assert page.ask(opened) == 0
+        page.press("#light input", "b")  # any other key does
+        page.wait(opened)
+        page.press("#light input", "tab")
+        page.wait(f"{opened} == 0")
+
+
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_a_phone_does_not_scroll_sideways(server: Server, tmp_path: Path, theme: str) -> None:
     with visit(server, tmp_path, PHONE, 844, theme) as page:

@@ -92,7 +92,7 @@ def test_tables_in_every_format(bench, files: tuple[Path, Path]) -> None:
     ("words", "status", "said"),
     [
         (["--table", "invers"], 2, "--table invers: no such table, did you mean 'inverse'?"),
-        (["--variant", "mask"], 2, "--variant mask: variant 'mask': got 'mask', expected one word per axis of masked"),
+        (["--variant", "mask"], 2, "--variant 'mask': got 'mask', expected one word per axis of masked"),
         (["--table", "physics"], 1, "the files have no values of physics"),
         (["nowhere.json"], 1, "nowhere.json: no such file"),
     ],
@@ -128,7 +128,7 @@ def test_compare_prints_both_means_the_difference_and_the_ranks_in_80_columns(be
         (["--method", "ours-mean=mine"], 1, "compare: B has no row 'mine'; it has ours-mean, input-as-albedo"),
         (["--method", "=ours-mean"], 2, "--method =ours-mean: expected KEY, a row of both files, or KEY=KEY"),
         (["--method", "ours-mean="], 2, "--method ours-mean=: expected KEY"),
-        (["--variant", "best"], 2, "--variant best: "),
+        (["--variant", "best"], 2, "--variant 'best': "),
         (["--method", "noise-ceiling", "--variant", "masked-linear-raw", "x"], 2, "x"),
     ],
 )

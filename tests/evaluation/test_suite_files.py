@@ -505,7 +505,7 @@ def test_a_folder_beside_the_suites_file_moves_with_it(tmp_path: Path, monkeypat
 
 
 def test_folders_are_refused_where_they_are_not_used_or_not_there(tmp_path: Path) -> None:
-    with pytest.raises(UnirenderError, match="suite 'tiny' takes no files from a folder of objects"):
+    with pytest.raises(UnirenderError, match="suite 'tiny' takes no objects from a folder; leave --objects out"):
         target("tiny", objects=tmp_path)
     with pytest.raises(UnirenderError, match=r"--lights .*: no such folder"):
         target("paper", lights=tmp_path / "none")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from tiny_models import SIZE, make_batch, make_model, make_pipeline
 from torch import Tensor
@@ -18,6 +19,7 @@ from unirender.diffusion import sampling
 from unirender.diffusion.inference import extras_by_camera, infer_attributes, infer_image
 from unirender.diffusion.sampling import (
     MOST_STEPS,
+    check_scheduler,
     denoise,
     draw_noise,
     make_sampler,
@@ -130,6 +132,27 @@ def test_the_start_at_zero_signal_costs_unipc_at_most_its_stand_in() -> None:
 def denoise_one_step(name: str, noise: Tensor) -> Tensor:
     states = path(name, 10, noise)
     return states[sorted(states)[-2]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "order"),
+    [
+        (UniPCMultistepScheduler, {"lower_order_final": False}, {"solver_order": 1}),
+        (DPMSolverMultistepScheduler, {"final_sigmas_type": "sigma_min"}, {"solver_order": 1}),
+        (DPMSolverMultistepScheduler, {"final_sigmas_type": "sigma_min"}, {"euler_at_final": True}),
+    ],
+)
+def test_a_last_step_of_first_order_divides_by_nothing_whatever_else_is_set(
+    kind: Any, settings: dict[str, Any], order: dict[str, Any]
+) -> None:
+    noise, config = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8), make_scheduler().config
+    usual, taken = (kind.from_config(config, **order, **own) for own in ({}, settings))
+    check_scheduler(taken)
+    assert torch.equal(*(denoise(exact_denoiser, noise, scheduler, 20) for scheduler in (usual, taken)))
+    higher = kind.from_config(config, **settings)  # the twin: of second order
+    assert not denoise(exact_denoiser, noise, higher, 20).isfinite().all()
+    with pytest.raises(UnirenderError, match=next(iter(settings))):
+        check_scheduler(higher)
 
 
 def test_names() -> None:

@@ -32,6 +32,9 @@ HEADERS = {"content-security-policy": POLICY, "referrer-policy": "no-referrer", 
 ELSEWHERE = re.compile(
     r"<(?:script|link|meta)\b[^>]*\b(?:src|href|content)=[\"']https?://[^>]*>(?:\s*</script>)?", re.S
 )
+# gradio's list opens at any key but Enter and Escape, Tab too, and so stayed open behind whoever tabbed past it.
+TAB_PASSES = """() => document.addEventListener("keydown", event => {
+  if (event.key == "Tab" && event.target.role == "combobox") event.stopPropagation() }, true)"""
 VISITORS = 64  # that are remembered at a time; whoever comes later takes the place of the oldest
 Message = MutableMapping[str, Any]  # of ASGI
 EXAMPLES = {"gear": "test-000020_l1", "knot": "test-000012_l0", "ball": "test-000019_l0", "rock": "test-000004_l0"}
@@ -82,6 +85,7 @@ def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str
                     primary_hue="teal", font=["system-ui", "sans-serif"], font_mono=["ui-monospace", "monospace"]
                 ),
                 css=styles + example_styles(examples),
+                js=TAB_PASSES,
                 app_kwargs={"middleware": [Middleware(NothingElsewhere)]},
             )
         except OSError as error:

@@ -101,7 +101,10 @@ class Maw(Scenes):
         means, counts = segment_means(as_compared(answer.maps.albedo), small, kinds(labels))
         seen = counts > 0
         if not seen.any():
-            raise UnirenderError(f"{sample.files[2]}: no measured surface is left at {SIZE[0]} x {SIZE[1]} pixels")
+            raise UnirenderError(
+                f"{sample.files[2]}: no measured surface is left at {SIZE[0]} x {SIZE[1]} pixels, expected one or "
+                "more; take the photograph out of meta.csv"
+            )
         arguments = means[seen], truth[seen], counts[seen]
         return {
             metric_key("albedo", INTENSITY): intensity(*arguments),
@@ -146,7 +149,7 @@ def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integ
     try:
         adobe = np.load(colours, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise UnirenderError(f"{colours}: not a readable NumPy array ({error})") from error
+        raise UnirenderError(f"{colours}: not a readable NumPy array ({error}); copy it again") from error
     if not isinstance(adobe, np.ndarray):
         raise UnirenderError(f"{colours}: is an archive of arrays, expected one array of (k, 3)")
     if adobe.ndim != 2 or adobe.shape[1] != 3 or adobe.dtype.kind not in "fiu" or not np.isfinite(adobe).all():
@@ -159,7 +162,7 @@ def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integ
         with Image.open(mask) as picture:
             labels = np.asarray(picture)
     except (OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"{mask}: not a readable PNG ({error})") from error
+        raise UnirenderError(f"{mask}: not a readable PNG ({error}); copy it again") from error
     if labels.ndim != 2 or labels.dtype.kind not in "iu":
         raise UnirenderError(f"{mask}: got {labels.dtype} of {labels.shape}, expected one channel of labels")
     count = len(kinds(labels))

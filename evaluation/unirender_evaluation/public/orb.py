@@ -196,7 +196,10 @@ class StanfordOrb:
             raise UnirenderError(f"{path}: is {_size(full)} pixels, expected a square, as all pictures of the set are")
         mask = block_mean(full, self.resolution, str(path))
         if not eroded(mask).any():
-            raise UnirenderError(f"{path}: shows no object that is larger than the edge which is left out")
+            raise UnirenderError(
+                f"{path}: shows no object larger than its edge, which is left out, at {self.resolution} pixels, "
+                "expected white on the object; check the file, or pass a larger --resolution"
+            )
         return mask
 
     def _reduced(self, value: Float[np.ndarray, "h w c"], path: Path, frame: Frame) -> Float[np.ndarray, "h2 w2 c"]:

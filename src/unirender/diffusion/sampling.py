@@ -41,6 +41,7 @@ FINITE: dict[str, dict[str, Any]] = {  # settings without which steps divide by 
     "UniPCMultistepScheduler": {"predict_x0": True, "solver_type": "bh2", "lower_order_final": True},
     "DPMSolverMultistepScheduler": {"algorithm_type": "dpmsolver++", "final_sigmas_type": "zero"},
 }
+LAST_STEP = ("lower_order_final", "final_sigmas_type")  # those of them that make the last step one of first order
 SCHEDULERS = (*DDIM, *FINITE)
 
 Generators = torch.Generator | Sequence[torch.Generator] | None
@@ -126,8 +127,11 @@ def check_scheduler(scheduler: Any) -> None:
             f"scheduler: got a {name} with another noise schedule than the network's: its signal, sqrt(alpha_bar), is "
             f"off by up to {apart:.2f}, expected at most {SAME_SIGNAL}; {advice}"
         )
+    ends_in_first_order = config.get("solver_order") == 1 or (
+        bool(config.get("euler_at_final")) and "DPMSolverMultistepScheduler" in kinds
+    )
     for key, value in [setting for kind in kinds & FINITE.keys() for setting in FINITE[kind].items()]:
-        if config.get(key) != value:
+        if config.get(key) != value and not (ends_in_first_order and key in LAST_STEP):
             raise UnirenderError(
                 f"scheduler: got a {name} with {key}={config.get(key)!r}, expected {value!r}: under a schedule that "
                 f"begins without signal and ends without noise, the other answers NaN; {advice}"

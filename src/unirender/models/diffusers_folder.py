@@ -57,7 +57,8 @@ def load_weights(kind: Any, folder: Path) -> Any:
         )
     except Exception as error:  # diffusers, transformers and safetensors raise half a dozen kinds for a broken file
         raise UnirenderError(
-            f"{folder}: cannot be read as {kind.__name__} with weights as safetensors ({one_line(error)})"
+            f"{folder}: cannot be read as {kind.__name__} with weights as safetensors ({one_line(error)}); copy it "
+            "again"
         ) from error
     if missing := sorted(info["missing_keys"]):  # both libraries only warn of them, and leave them at random
         raise UnirenderError(
@@ -85,7 +86,7 @@ def load_tokenizer(kind: Any, folder: Path) -> Any:
     try:
         return kind.from_pretrained(str(folder), local_files_only=True)
     except Exception as error:  # half a dozen kinds for a broken file
-        raise UnirenderError(f"{folder}: cannot be read as a tokenizer ({one_line(error)})") from error
+        raise UnirenderError(f"{folder}: cannot be read as a tokenizer ({one_line(error)}); copy it again") from error
 
 
 @contextlib.contextmanager

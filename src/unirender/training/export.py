@@ -63,7 +63,9 @@ def read_history(folder: Path) -> list[dict[str, Any]]:
         facts = json.loads(path.read_text())
         return [*facts.pop("continues", []), facts]
     except (ValueError, AttributeError, TypeError) as error:
-        raise UnirenderError(f"{path}: cannot be read as the record of a training ({error})") from error
+        raise UnirenderError(
+            f"{path}: cannot be read as the record of a training ({error}); copy it again, or move it away"
+        ) from error
 
 
 def export_pipeline(

@@ -175,7 +175,9 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                     key, members = name, {}
                     seen.add(name)
                 if rest in members:
-                    raise UnirenderError(f"{path}: member {info.name} occurs twice, expected each member once")
+                    raise UnirenderError(
+                        f"{path}: member {info.name} occurs twice, expected each once; remake the shard"
+                    )
                 stream = tar.extractfile(info)
                 members[rest] = stream.read() if stream else b""
             with path.open("rb") as file:  # a file that was cut off reads like a shorter one
@@ -186,7 +188,7 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                         "cut off or is damaged; copy it again, or remake it"
                     )
     except (tarfile.TarError, OSError) as error:
-        raise UnirenderError(f"{path}: not a readable tar shard ({error})") from error
+        raise UnirenderError(f"{path}: not a readable tar shard ({error}); copy it again, or remake it") from error
     if members:
         yield key, members
 
