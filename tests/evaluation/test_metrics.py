@@ -159,6 +159,19 @@ def test_log_rmse_of_a_factor_is_its_logarithm() -> None:
     assert metrics.log_rmse(t * 2, t, w) == pytest.approx(math.log(2), rel=1e-3)
 
 
+def test_radiance_below_zero_is_none_in_logarithms() -> None:
+    t = np.full((4, 4, 3), 50.0, np.float32)
+    assert metrics.log_rmse(-t, 0 * t, np.ones((4, 4, 1), np.float32)) == 0
+
+
+def test_relative_rmse_by_hand() -> None:
+    p, t = (np.array(values, np.float32).reshape(1, 2, 1) for values in ((2, 4), (1, 3)))
+    w = np.array([1, 0.5], np.float32).reshape(1, 2, 1)
+    assert metrics.rmse_relative(p, t, w) == pytest.approx(1 / ((1 + 0.5 * 3) / 1.5))
+    with pytest.raises(UnirenderError, match="the truth is black"):
+        metrics.rmse_relative(p, 0 * t, w)
+
+
 def test_ciede2000_is_scikit_images() -> None:
     p, t = images(8, 12, 12)
     w = np.ones((12, 12, 1), np.float32)
