@@ -114,6 +114,17 @@ def test_the_balls_are_scored_against_those_of_the_true_light() -> None:
     assert expected.items() <= values.items()
 
 
+def test_a_light_that_is_not_there_has_no_scores_and_ringing_counts_as_black() -> None:
+    true, none = Intrinsics(environment=environment(5)), Intrinsics()
+    assert (
+        score_light(None, true) == score_light(none, true) == score_light(true, none) == score_light(true, None) == {}
+    )
+    found, ringing = lamp(7.5, 8.0), lamp(7.5, 8.0)
+    found[0], ringing[0] = 0, -5e-4
+    scores = [score_light(Intrinsics(environment=light), true) for light in (ringing, found)]
+    assert scores[0] == scores[1]
+
+
 def test_a_uniform_light_has_no_direction() -> None:
     uniform = np.full((*SHAPE, 3), 0.3, np.float32)
     assert brightest_direction(uniform) is None

@@ -57,6 +57,13 @@ def test_ssim_is_scikit_images(size: tuple[int, int]) -> None:
     assert abs(metrics.ssim(p, t) - uniform) > 1e-4  # the twin: another window is another number
 
 
+def test_ssim_needs_a_pixel_inside_the_border() -> None:
+    assert metrics.ssim(*images(1, 11, 11)) < 1
+    for size in ((10, 40), (40, 10)):
+        with pytest.raises(UnirenderError, match="expected more than 10 a side"):
+            metrics.ssim(*images(1, *size))
+
+
 def test_ssim_is_torchmetrics_inside_the_border() -> None:
     """torchmetrics averages the border too (mirrored input); scikit-image and we leave it out."""
     p, t = images(2, 64, 64)
@@ -139,10 +146,30 @@ def test_cosine_in_closed_form() -> None:
     np.testing.assert_allclose(metrics.cosine(p, t)[0, :, 0], [1, math.sqrt(0.5), 0], atol=1e-7)
 
 
+def test_rounding_takes_no_cosine_beyond_one() -> None:
+    """There an angle would be NaN; of 1320 vectors beside themselves, some are beyond without the clip."""
+    p, _ = images(9)
+    assert metrics.cosine(p, p).max() == 1
+    assert metrics.cosine(p, -p).min() == -1
+
+
 def test_log_rmse_of_a_factor_is_its_logarithm() -> None:
     t = np.full((4, 4, 3), 50.0, np.float32)
     w = np.ones((4, 4, 1), np.float32)
     assert metrics.log_rmse(t * 2, t, w) == pytest.approx(math.log(2), rel=1e-3)
+
+
+def test_radiance_below_zero_is_none_in_logarithms() -> None:
+    t = np.full((4, 4, 3), 50.0, np.float32)
+    assert metrics.log_rmse(-t, 0 * t, np.ones((4, 4, 1), np.float32)) == 0
+
+
+def test_relative_rmse_by_hand() -> None:
+    p, t = (np.array(values, np.float32).reshape(1, 2, 1) for values in ((2, 4), (1, 3)))
+    w = np.array([1, 0.5], np.float32).reshape(1, 2, 1)
+    assert metrics.rmse_relative(p, t, w) == pytest.approx(1 / ((1 + 0.5 * 3) / 1.5))
+    with pytest.raises(UnirenderError, match="the truth is black"):
+        metrics.rmse_relative(p, 0 * t, w)
 
 
 def test_ciede2000_is_scikit_images() -> None:

@@ -8,10 +8,12 @@ import pytest
 from unirender.color import image_srgb, srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.lighting import texel_solid_angles
 from unirender_evaluation import metrics
-from unirender_evaluation.metrics import FACING_AWAY, OWN_MASK, SCALES, TURNED, metric_key
+from unirender_evaluation.lpips import load
+from unirender_evaluation.metrics import FACING_AWAY, LOG_EPSILON, OWN_MASK, SCALES, TURNED, metric_key
 from unirender_evaluation.plausible import facing_away, picture_doubt, range_doubt
-from unirender_evaluation.scoring import over_white, score_image, score_maps
+from unirender_evaluation.scoring import MATERIALS, score_colour, score_image, score_maps
 from unirender_evaluation.suites import Scene
 from unirender_evaluation.suspicions import decoding_gain, suspicions, turning_gain
 from unirender_evaluation.task import Asked, Task
@@ -136,15 +138,6 @@ def test_taken_for_display_values_colours_gain_what_is_nearer() -> None:
     assert decoding_gain(true, true, mask) == 0
 
 
-def test_every_variant_of_every_map_is_there() -> None:
-    values = score_maps(intrinsics(1), intrinsics(0))
-    for quantity in ("albedo", "specular", "diffuse"):
-        found = [key for key in values if key.startswith(f"{quantity}.psnr@")]
-        assert len(found) == 2 * 2 * len(SCALES)
-    assert {"normal.cosine", "normal.angle_deg", "roughness.mse@masked", "metallic.mse_object"} <= values.keys()
-    assert "environment.log_rmse@raw" in values
-
-
 def test_absent_maps_have_no_values() -> None:
     prediction = intrinsics(1).replace(albedo=None, environment=None, normal=None)
     values = score_maps(prediction, intrinsics(0))
@@ -152,17 +145,68 @@ def test_absent_maps_have_no_values() -> None:
     assert not [key for key in values if key.startswith(("albedo", "environment", "normal"))]
 
 
-def test_masked_and_whole_by_hand() -> None:
-    prediction, truth = intrinsics(1), intrinsics(0)
-    values = score_maps(prediction, truth)
-    assert prediction.albedo is not None
-    assert truth.albedo is not None
-    p, t, w = prediction.albedo, truth.albedo, truth.mask
-    assert values["albedo.psnr@masked-srgb-raw"] == metrics.psnr(image_srgb(p), image_srgb(t), w)
-    by_hand = metrics.psnr(image_srgb(over_white(p, disc())), image_srgb(over_white(t, disc())))
-    assert values["albedo.psnr@whole-srgb-raw"] == pytest.approx(by_hand)
-    linear = metrics.psnr(np.clip(p, 0, 1), np.clip(t, 0, 1), w)
-    assert values["albedo.psnr@masked-linear-raw"] == linear != values["albedo.psnr@masked-srgb-raw"]
+def white(x: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Over white."""
+    return x * mask + 1 - mask
+
+
+def test_colours_by_hand() -> None:
+    """Every variant: masked, SSIM looks at composites with the true mask, and weights by it."""
+    prediction, truth, w, own = intrinsics(1).maps, intrinsics(0).maps, disc(), disc(6)
+    values = score_maps(intrinsics(1).replace(mask=own), intrinsics(0))
+    for name in ("albedo", "specular", "diffuse"):
+        t = truth[name]
+        for scale in SCALES:
+            p = metrics.align_scale(prediction[name], t, w, scale)
+            for space, shown in (("srgb", image_srgb), ("linear", lambda x: np.clip(x, 0, 1))):
+                expected = {
+                    f"psnr@masked-{space}-{scale}": metrics.psnr(shown(p), shown(t), w),
+                    f"psnr@whole-{space}-{scale}": metrics.psnr(shown(white(p, own)), shown(white(t, w))),
+                    f"ssim@masked-{space}-{scale}": metrics.ssim(shown(white(p, w)), shown(white(t, w)), w),
+                    f"ssim@whole-{space}-{scale}": metrics.ssim(shown(white(p, own)), shown(white(t, w))),
+                }
+                found = {key: values[f"{name}.{key}"] for key in expected}
+                assert found == pytest.approx(expected, rel=1e-6), name
+                assert len(set(found.values())) == 4
+            kind, distance = ("ciede2000", metrics.ciede2000) if name == "albedo" else ("log_rmse", metrics.log_rmse)
+            assert values[f"{name}.{kind}@{scale}"] == pytest.approx(distance(p, t, w), rel=1e-6)
+
+
+@pytest.mark.parametrize("own", [disc(6), None])
+def test_lpips_by_hand(own: np.ndarray | None) -> None:
+    """Of unaligned whole frames: masked, with the true mask; else with the method's own."""
+    network, w = load("alex"), disc()
+    p, t = (intrinsics(seed).maps["albedo"] for seed in (1, 0))
+    values = score_colour("relit", p, t, w, w if own is None else own, SCALES, [network])
+    truth = image_srgb(white(t, w))[None]
+    masked, whole = (
+        float(network.distance(image_srgb(white(p, m))[None], truth)[0]) for m in (w, w if own is None else own)
+    )
+    found = {key: value for key, value in values.items() if "lpips" in key}
+    expected = {"relit.lpips_alex@masked-raw": masked, "relit.lpips_alex@whole-raw": whole}
+    assert found == pytest.approx(expected, abs=1e-6)
+    assert (masked == whole) == (own is None)
+
+
+def test_materials_normals_and_light_by_hand() -> None:
+    prediction, truth, w, own = intrinsics(1).maps, intrinsics(0).maps, disc(), disc(6)
+    values = score_maps(intrinsics(1).replace(mask=own), intrinsics(0))
+    for name in MATERIALS:
+        p, t = prediction[name], truth[name]
+        assert values[f"{name}.mse@masked"] == pytest.approx(np.average((p - t) ** 2, weights=w))
+        assert values[f"{name}.mse@whole"] == pytest.approx(np.mean((p * own - t * w) ** 2))
+        means = (np.average(x, weights=w) for x in (p, t))
+        assert values[f"{name}.mse_object"] == pytest.approx((next(means) - next(means)) ** 2, rel=1e-4)
+    cosine = np.clip((prediction["normal"] * truth["normal"]).sum(axis=-1), -1, 1)
+    assert values["normal.cosine"] == pytest.approx(np.average(cosine, weights=w[..., 0]), rel=1e-5)
+    angle = np.average(np.degrees(np.arccos(cosine)), weights=w[..., 0])
+    assert values["normal.angle_deg"] == pytest.approx(angle, rel=1e-4)
+    p, t = prediction["environment"].astype(float), truth["environment"].astype(float)
+    solid = np.repeat(texel_solid_angles(16, 32)[..., None], 3, axis=-1)
+    factor = {"raw": 1, "aligned": (solid * p * t).sum() / (solid * p * p).sum()}
+    for scale, k in factor.items():
+        error = np.average(np.log((k * p + LOG_EPSILON) / (t + LOG_EPSILON)) ** 2, weights=solid)
+        assert values[f"environment.log_rmse@{scale}"] == pytest.approx(math.sqrt(error), rel=1e-4)
 
 
 def test_a_mask_of_ones_own_changes_the_whole_frame_and_not_the_masked_figures() -> None:
@@ -180,11 +224,11 @@ def test_a_mask_of_ones_own_changes_the_whole_frame_and_not_the_masked_figures()
 
 
 def test_the_given_mask_after_8_bits_is_no_mask_of_ones_own() -> None:
-    truth = intrinsics(0)
+    truth, step = intrinsics(0), np.float32(1 / 255)
     pasted = score_maps(intrinsics(1).replace(mask=None), truth)
-    for stored in (np.round(disc() * 255) / 255, np.floor(disc() * 255) / 255, disc().astype(np.float16)):
+    for stored in (np.round(disc() * 255) / 255, np.maximum(disc() - 0.999 * step, 0), disc().astype(np.float16)):
         assert score_maps(intrinsics(1).replace(mask=stored.astype(np.float32)), truth) == pasted
-    rough = score_maps(intrinsics(1).replace(mask=np.round(disc() * 15) / np.float32(15)), truth)
+    rough = score_maps(intrinsics(1).replace(mask=np.maximum(disc() - 1.01 * step, 0)), truth)
     assert 0.9 < rough[OWN_MASK] < 1
 
 
@@ -245,3 +289,10 @@ def test_nan_is_refused() -> None:
     image = np.full((SIZE, SIZE, 3), np.nan, np.float32)
     with pytest.raises(UnirenderError, match="NaN"):
         score_image(image, np.zeros_like(image), disc())
+
+
+@pytest.mark.parametrize("name", ["albedo", "roughness", "normal"])
+def test_another_size_is_refused(name: str) -> None:
+    small = Intrinsics().replace(**{name: intrinsics(1).maps[name][:16, :16]})
+    with pytest.raises(UnirenderError, match=f"scoring {name}: got shapes .* resample the prediction"):
+        score_maps(small, intrinsics(0))

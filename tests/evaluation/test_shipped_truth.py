@@ -12,6 +12,7 @@ import pytest
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UsageError
+from unirender_evaluation.bounds import ceiling_values
 from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
 from unirender_evaluation.metrics import psnr
 from unirender_evaluation.suite_home import definition, found_spec, shared
@@ -19,6 +20,7 @@ from unirender_evaluation.suite_lights import assign_lights, light_sources
 from unirender_evaluation.suite_objects import suite_sources
 from unirender_evaluation.suite_spec import read_spec
 from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.tasks import tasks
 from unirender_evaluation.truth import quality_summary
 from unirender_evaluation.truth_check import _check_image, check_truth, chosen_scenes, member_test, scenes_here
 from unirender_evaluation.truth_file import (
@@ -82,6 +84,21 @@ def test_stated_ceilings_follow_from_what_is_stored(tiny: Suite) -> None:
             found = stored_ceiling_db(tiny.read(name)[0], mask, member_kind(name))
             assert found == pytest.approx(tiny.provenance["quality"][name]["ceiling_db"], abs=2e-3), name
             assert found >= 45, name
+
+
+def test_the_ceiling_row_is_the_one_stated_for_each_member(tiny: Suite) -> None:
+    """Of the picture under the other light, and of s and d under the own one at the roughness that is asked about."""
+    scene, base = tiny.scenes[0], tiny.spec.base
+    (task,) = tasks(tiny, "relighting", "from-image-sd", [scene])
+    values = ceiling_values(tiny, task)
+    members = {
+        "relit": image_member(tiny.other_light(scene).key, base),
+        "specular": specular_member(scene.key, base[1]),
+        "diffuse": diffuse_member(scene.key),
+    }
+    for quantity, member in members.items():
+        stated = tiny.provenance["quality"][member]["ceiling_db"]
+        assert values[f"{quantity}.psnr@masked-srgb-raw"] == pytest.approx(stated, abs=2e-3), quantity
 
 
 def test_shipped_members_keep_the_exr_contract(tiny: Suite) -> None:

@@ -3,6 +3,7 @@
 import re
 import tomllib
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ from tiny_suites import make_suite
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
 from unirender.whole_files import file_sha256
-from unirender_evaluation.ceiling import similarity_ceiling
-from unirender_evaluation.scoring import score_image
+from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
+from unirender_evaluation.scoring import score_colour, score_image
 from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
@@ -94,6 +95,23 @@ def test_members_come_back_as_they_were_written(kind: Kind) -> None:
     else:
         np.testing.assert_array_equal(getattr(intrinsics_from_channels(read), kind), found)
     assert not {"std.R", "std.G", "std.B"} & set(estimate_channels(kind, mean, None, mask))
+
+
+@pytest.mark.parametrize("premultiplied", [True, False])
+def test_the_ceiling_is_what_a_noise_free_prediction_scores(premultiplied: bool) -> None:
+    """By Monte Carlo, for both masks and colour spaces; half of the frame is covered, a part of it by halves."""
+    rng = np.random.default_rng(0)
+    mask = np.repeat([1.0, 0.5, 0.0, 0.0], 24)[:, None, None].astype(np.float32) * np.ones((1, 96, 1), np.float32)
+    clean = rng.uniform(0.05, 0.9, (96, 96, 3)).astype(np.float32) * (mask > 0)
+    sigma = 0.004 * clean
+    noisy = clean + sigma * rng.standard_normal(clean.shape, np.float32)
+    scored = score_colour("relit", clean, noisy, mask, mask, ("raw",))
+    scale = mask if premultiplied else 1
+    found = noise_ceiling("relit", noisy * scale, np.square(sigma * scale), mask, premultiplied)
+    assert found.keys() == {key for key in scored if ".psnr" in key}
+    assert found == {key: pytest.approx(scored[key], abs=0.2) for key in found}
+    values = sorted(found.values())
+    assert min(b - a for a, b in pairwise(values)) > 0.4, "the twin: none is another one"
 
 
 def test_similarity_ceiling_lies_between_a_noisy_render_and_a_perfect_score(tmp_path: Path) -> None:

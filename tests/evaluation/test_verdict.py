@@ -85,8 +85,10 @@ def test_deliberate_errors_that_were_missed_are_named() -> None:
     text = verdict_text([], run, CHECK | missed)
     assert "deliberate errors NOT found: normal turned by 8 degrees (check more scenes)" in text
     assert "roughness" not in text
-    old = verdict_text([], run, CHECK | {"passed": False, "twin_detected": False})
+    before = {name: value for name, value in CHECK.items() if name != "chosen_from"}
+    old = verdict_text([], run, before | {"passed": False, "twin_detected": False})
     assert "not all deliberate errors of roughness, albedo and normal were found" in old
+    assert "chosen from" not in old
 
 
 def test_a_strangers_row_has_claims_of_its_own() -> None:
@@ -150,6 +152,8 @@ def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
         *((f"{OPTIMISED}-multi-view", "constant-object", what) for what in ("relit", "novel")),
     }
     assert (REFINED, "ours-mean", "albedo") in theirs
+    bars = {"unedited-input", *(c.b for c in claims if c.table == "inverse")}
+    assert {b for a, b, _ in theirs if a == OPTIMISED} == bars, "how it stands to the trivial rows"
 
 
 def test_our_claims_are_made_where_our_rows_ran() -> None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, ttest_ind
 
 from unirender.errors import UnirenderError
 from unirender_reference.statistics import LEVEL, PASS_SHARE, p_values, share_bar, z_test
@@ -26,12 +26,15 @@ def test_equal_expectations_pass(seed: int) -> None:
     assert result.values == TRUTH.size
 
 
-def test_p_values_are_uniform() -> None:
-    """Student's t with Welch's degrees of freedom, not a normal: 5 % lie below 0.05 and 0.1 % below 0.001."""
-    big = np.ones((400, 400, 1))
-    p = p_values(*estimate(big, 0.2, 1), *estimate(big, 0.2, 2))
-    for level in (0.5, 0.05, 0.01, 0.001):
-        assert abs((p < level).mean() / level - 1) < 0.2 + 4 / np.sqrt(level * p.size), level
+def test_p_values_are_those_of_welchs_test() -> None:
+    """Of unequal batches; the twin exchanges their numbers."""
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(1, 0.2, (4, 50)), rng.normal(1.1, 0.4, (12, 50))
+    (mean_a, var_a), (mean_b, var_b) = ((x.mean(axis=0), x.var(axis=0, ddof=1) / len(x)) for x in (a, b))
+    expected = np.asarray(ttest_ind(a, b, equal_var=False))[1]
+    found, twin = (p_values(mean_a, var_a, mean_b, var_b, *batches) for batches in ((4, 12), (12, 4)))
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+    assert np.abs(twin / expected - 1).max() > 0.01
 
 
 def test_one_wrong_pixel_fails() -> None:
@@ -95,9 +98,11 @@ def test_identical_pictures_pass_and_the_mask_restricts() -> None:
 
 
 def test_rounding_is_no_difference() -> None:
+    """It is relative: of a radiance of thousands it is larger."""
     zero = np.zeros(SHAPE)
-    assert z_test(TRUTH, zero, TRUTH * (1 + 1e-5), zero).passed
-    assert not z_test(TRUTH, zero, TRUTH * (1 + 3e-3), zero).passed
+    for truth in (0.1 * TRUTH, TRUTH, 1e4 * TRUTH):
+        assert z_test(truth, zero, truth * (1 + 1e-5), zero).passed
+        assert not z_test(truth, zero, truth * (1 + 3e-3), zero).passed
 
 
 def test_an_empty_mask_is_refused() -> None:

@@ -303,6 +303,14 @@ def test_the_cycle_takes_its_gradient_at_the_scale_of_the_loss(monkeypatch: pyte
     assert scales == [64.0]
 
 
+def test_a_gradient_taken_at_a_scale_is_that_of_the_loss() -> None:
+    x, other = torch.tensor([1.0, -2.0], requires_grad=True), torch.zeros(2, requires_grad=True)
+    found, none = loss_terms.gradients(x.square().sum(), [x, other], 64.0)
+    assert found is not None
+    assert found.tolist() == [2, -4]
+    assert none is None
+
+
 def test_cycle_can_be_off() -> None:
     assert "cycle" not in values(loss_function(cycle=0.0), inverse())
     waiting = loss_function()

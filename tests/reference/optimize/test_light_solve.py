@@ -95,6 +95,20 @@ def test_gradient_is_the_derivative_of_the_cost(problem) -> None:
         assert unprojected != pytest.approx(finite, rel=0.02, abs=0.01 * length)
 
 
+def test_the_priors_are_in_the_normal_equations(problem) -> None:
+    """They are quadratic in the light's logarithm: gradient and Hessian give their change over any step."""
+    _, fit, truth, _ = problem
+    rng = np.random.default_rng(0)
+    tinted = replace(truth, light=truth.light + 0.5 * rng.standard_normal(truth.light.shape))
+    solved, prior = evaluate(fit, tinted, PRIOR), LightPrior(smooth=2, neutral=3)
+    with_priors, without = (light_solve._normal_equations(fit, solved, p) for p in (prior, LightPrior(0, 0)))
+    hessian, gradient = (a - b for a, b in zip(with_priors, without, strict=True))
+    along = rng.standard_normal(truth.light.shape)
+    step = np.concatenate([along.T.ravel(), [0, 0]])
+    change = prior.cost(fit, tinted.light + along) - prior.cost(fit, tinted.light)
+    assert 2 * gradient @ step + step @ hessian @ step == pytest.approx(change, rel=1e-3)
+
+
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.7, 0.8), (0.2, 0.1)])
 def test_light_and_material_are_found_from_a_flat_start(problem, roughness: float, metallic: float) -> None:
     """What descent by gradients stalls on: all of light, base colour, roughness and metallic unknown."""

@@ -128,8 +128,10 @@ def test_psnr_of_two_halves_is_free_of_their_noise() -> None:
     assert loss.psnr(first) < true - 4
 
 
-def test_psnr_is_of_display_values() -> None:
-    display = np.full((1, 2, 2, 3), 0.5, np.float32)
-    loss = ImageLoss(views_of(display))
-    off = (srgb_encode(loss.target * 1.2) - display)[0, 0, 0, 0]
-    assert loss.psnr(loss.target * 1.2) == pytest.approx(-20 * np.log10(off), abs=0.01)
+def test_psnr_is_of_display_values_by_coverage() -> None:
+    mask = np.array([1, 1, 0.25, 0], np.float32).reshape(1, 2, 2, 1)
+    loss = ImageLoss(views_of(np.full((1, 2, 2, 3), 0.5, np.float32), mask))
+    images = loss.target * np.array([1.2, 1, 1.4, 1], np.float32).reshape(mask.shape) + 7 * (mask == 0)
+    off, far = (float(srgb_encode(srgb_decode(np.full(1, 0.5)) * np.float32(k))[0]) - 0.5 for k in (1.2, 1.4))
+    error = (off**2 + 0.25 * far**2) / 2.25
+    assert loss.psnr(images.astype(np.float32)) == pytest.approx(-10 * np.log10(error), abs=0.01)
