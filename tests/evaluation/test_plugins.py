@@ -12,10 +12,11 @@ import pytest
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation import engine
+from unirender_evaluation import engine, kept_defaults
 from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
+from unirender_reference.backend import mitsuba
 
 SOURCE = """
 from helper_of_the_method import SHADE
@@ -243,6 +244,46 @@ def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> 
             assert (made.dtype, made.device.type, divide) == (torch.float64, device, "raise")
             assert (torch.get_default_dtype(), torch.get_default_device()) == before
             assert np.geterr() == errors
+
+
+def test_how_torch_computes_is_a_methods_own(tmp_path: Path) -> None:
+    """A script's `set_grad_enabled(False)` would leave the next method without gradients, and reduced precision would
+    reach the answers of our rows."""
+    settings = (
+        "torch.set_grad_enabled(False)",
+        "torch.backends.cuda.matmul.allow_tf32 = True",
+        "torch.backends.cudnn.benchmark = True",
+        "torch.set_num_threads(torch.get_num_threads() + 1)",
+    )
+    file = tmp_path / "settings.py"
+    file.write_text(
+        "import numpy as np\nimport torch\nclass Sets:\n    name, config = 'sets', {}\n    def __init__(self):\n"
+        + "".join(f"        {setting}\n" for setting in settings)
+        + "    def render(self, intrinsics):\n"
+        "        assert not torch.is_grad_enabled() and torch.backends.cuda.matmul.allow_tf32\n"
+        "        assert torch.backends.cudnn.benchmark\n        return np.zeros((2, 2, 3))\n"
+        "class Learns:\n    name, config = 'learns', {}\n    def render(self, intrinsics):\n"
+        "        torch.ones(2, requires_grad=True).sum().backward()\n        return np.zeros((2, 2, 3))\n"
+    )
+    before = kept_defaults.torch_defaults()
+    rows = plugin_rows([named_plugin(f"{file}:{name}") for name in ("Sets", "Learns")])
+    for row in (*rows, *rows):
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+        assert kept_defaults.torch_defaults() == before
+
+
+def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
+    """Though the truth check, and rows of ours, render with another one between its calls."""
+    file = tmp_path / "renders.py"
+    file.write_text(
+        "import mitsuba as mi\nimport numpy as np\nmi.set_variant('scalar_rgb')\n"
+        "class Renders:\n    name, config = 'renders', {}\n    def render(self, intrinsics):\n"
+        "        assert mi.variant() == 'scalar_rgb'\n        return np.zeros((2, 2, 3))\n"
+    )
+    (row,) = plugin_rows([named_plugin(f"{file}:Renders")])
+    for _ in range(2):
+        mitsuba("scalar_spectral")
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
 
 
 def test_a_compiled_neighbour_is_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
