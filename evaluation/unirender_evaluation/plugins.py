@@ -26,7 +26,7 @@ from urllib.parse import unquote
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
-from unirender_evaluation.plugin_source import shadowed, source_sha256
+from unirender_evaluation.plugin_source import raised_in, shadowed, source_sha256
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -212,7 +212,7 @@ def _attempt(what: str, task: str, run: Callable[[], Any], defaults: OwnDefaults
     except UnirenderError as error:  # written to be read: one of ours
         raise UnirenderError(f"{what}: could not {task}: {error}") from error
     except (Exception, SystemExit) as error:
-        raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
+        raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}{raised_in(error)}") from error
 
 
 def _plugin(

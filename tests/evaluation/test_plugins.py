@@ -246,6 +246,18 @@ def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> 
             assert np.geterr() == errors
 
 
+def test_an_error_names_the_line_of_the_method_that_met_it(tmp_path: Path) -> None:
+    """And not that of the library which raised it, which says nothing to its author."""
+    file = tmp_path / "wide.py"
+    file.write_text(
+        "import json\nclass Wide:\n    name, config = 'wide', {}\n"
+        "    def render(self, intrinsics):\n        return json.loads('{')\n"
+    )
+    (row,) = plugin_rows([named_plugin(f"{file}:Wide")])
+    with pytest.raises(UnirenderError, match=r"JSONDecodeError: .* \(wide.py, line 5\)$"):
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+
+
 def test_how_torch_computes_is_a_methods_own(tmp_path: Path) -> None:
     """A script's `set_grad_enabled(False)` would leave the next method without gradients, and reduced precision would
     reach the answers of our rows."""
@@ -366,7 +378,10 @@ def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
             "{folder}/my_method.py:Loaded",
             "it takes weights, expected a value of each, as in .*Loaded.weights=VALUE",
         ),
-        ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
+        (
+            "{folder}/my_method.py:Broken",
+            r"could not construct it: RuntimeError: no weights \(my_method.py, line \d+\)$",
+        ),
         ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),
         ("{folder}/imports.py:Grey", "could not import it: ModuleNotFoundError: No module named 'no_such_package'"),
         ("no_such_module_here:Grey", "no module 'no_such_module_here' in "),
