@@ -407,6 +407,25 @@ def test_a_config_that_is_not_json(folder: Path, name: str) -> None:
         plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{name}")])
 
 
-def test_an_unknown_entry_point() -> None:
-    with pytest.raises(UnirenderError, match="no method 'nobody'"):
-        installed_plugins(["nobody"])
+def install(folder: Path, name: str, module: str, entries: str) -> None:
+    """A distribution as pip leaves it, in a folder that is to be on Python's path."""
+    information = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(f"[unirender.methods]\n{entries}\n")
+    (folder / f"{module}.py").write_text(
+        f"class Mine:\n    name, config = '{name}', {{}}\n    def render(self, intrinsics): ...\n"
+        "def broken():\n    raise RuntimeError('no weights')\n"
+    )
+
+
+def test_all_installed_methods_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of two distributions that chose one name for theirs; of a broken one it is said how to go on."""
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    for number in ("one", "two"):
+        install(tmp_path, f"installed-{number}", f"my_installed_{number}", f"mine = my_installed_{number}:Mine")
+    assert {"installed-one", "installed-two"} <= {plugin.method.name for plugin in installed_plugins()}
+    install(tmp_path, "installed-three", "my_installed_three", "mine = my_installed_three:broken")
+    said = "no weights .*; mend or uninstall installed-three, or run without it: leave plugins out of --methods"
+    with pytest.raises(UnirenderError, match=said):
+        installed_plugins()
