@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.whole_files import replace_file
-from unirender_evaluation import bounds
+from unirender_evaluation import bounds, subsets
 from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview.pictures import MultiviewPictures
@@ -229,7 +229,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         truth_spp=round(ceiling["mean_spp"]),
         code=here.versions.code[:12],
         date=datetime.now(UTC).date().isoformat(),
-        limit=config.limit,
+        limit=subsets.partial(config.limit, len(suite.scenes)),
         seeds=(config.seed,),
         environment=environment,
     )

@@ -13,7 +13,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.run_folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
+from unirender_evaluation.subsets import partial as partial_limit
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.tables import Table
@@ -104,6 +105,7 @@ def run(what: PublicRun, console: Console) -> PublicResult:
             second run continues from there.
     """
     every = what.public.samples()
+    what = replace(what, limit=partial_limit(what.limit, len(every)))
     check_folders(what)
     with made_folder(what.out), locked(what.out), writing_run(what.out):
         return _run(what, evenly(every, what.limit), console)

@@ -184,6 +184,8 @@ def test_a_limit_is_a_watermark(tmp_path: Path) -> None:
     result = done(iiw, trivial_rows(iiw), tmp_path / "out", limit=1)
     assert {record.sample for record in result.records} == {"100"}
     assert "--limit 1: a partial run" in (tmp_path / "out" / "tables.md").read_text()
+    done(iiw, trivial_rows(iiw), tmp_path / "out", limit=len(iiw.samples()))
+    assert "--limit" not in (tmp_path / "out" / "tables.md").read_text(), "it takes all"
 
 
 def test_a_killed_run_leaves_no_table_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
