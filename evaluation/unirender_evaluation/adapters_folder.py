@@ -207,11 +207,7 @@ def load_parts(
         raise UnirenderError(
             "a text encoder needs the package transformers, which is not installed; pip install 'unirender[sd]'"
         ) from error
-    config = read_json(folder / SCHEDULER, "the scheduler's configuration")
-    kind = config.get("_class_name")
-    if isinstance(schedulers, Mapping) and kind not in schedulers:
-        raise UnirenderError(f"{folder / SCHEDULER}: got the scheduler {kind!r}, expected {' or '.join(schedulers)}")
-    scheduler_class: Any = schedulers[str(kind)] if isinstance(schedulers, Mapping) else schedulers
+    scheduler = load_scheduler(folder, schedulers, **scheduler_changes)
     tokenizer = load_tokenizer(CLIPTokenizer, folder / "tokenizer")
     with silent():
         text_encoder = load_weights(CLIPTextModel, folder / "text_encoder")
@@ -223,5 +219,14 @@ def load_parts(
     if dtype != "float32":  # as they were read
         modules = {name: module.to(getattr(torch, dtype)) for name, module in modules.items()}
     moved = {name: module.to(device) for name, module in modules.items()}
-    scheduler = scheduler_class.from_config(config, **scheduler_changes)
     return moved | {"tokenizer": tokenizer, "scheduler": scheduler}
+
+
+def load_scheduler(folder: Path, schedulers: Mapping[str, Any] | type, **changes: Any) -> Any:
+    """The scheduler of a folder; arguments and errors as in `load_parts`."""
+    config = read_json(folder / SCHEDULER, "the scheduler's configuration")
+    kind = config.get("_class_name")
+    if isinstance(schedulers, Mapping) and kind not in schedulers:
+        raise UnirenderError(f"{folder / SCHEDULER}: got the scheduler {kind!r}, expected {' or '.join(schedulers)}")
+    scheduler_class: Any = schedulers[str(kind)] if isinstance(schedulers, Mapping) else schedulers
+    return scheduler_class.from_config(config, **changes)

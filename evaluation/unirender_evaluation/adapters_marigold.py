@@ -19,7 +19,14 @@ from diffusers.schedulers.scheduling_lcm import LCMScheduler
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.adapters_folder import FolderMethod, load_parts, part_configs, read_json, unit_normal
+from unirender_evaluation.adapters_folder import (
+    FolderMethod,
+    load_parts,
+    load_scheduler,
+    part_configs,
+    read_json,
+    unit_normal,
+)
 from unirender_evaluation.adapters_marigold_maps import check_properties, decoded_targets, target_maps
 from unirender_evaluation.methods import Image, Mask
 
@@ -61,6 +68,7 @@ class _Marigold(FolderMethod):
         factor = 2 ** (len(configs["vae"]["block_out_channels"]) - 1)
         if self.used("resolution") % factor:
             raise UnirenderError(f"resolution: got {self.resolution}, expected a multiple of {factor}, or 0")
+        check_steps(load_scheduler(self.folder, SCHEDULERS), self.used("steps"))
 
     @property
     def targets(self) -> int:
@@ -123,3 +131,23 @@ class MarigoldNormals(_Marigold):
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
         normal = unit_normal(self.predict(image_srgb, mask)[0], mask)
         return Intrinsics(normal=normal, mask=mask, camera=camera)
+
+
+def check_steps(scheduler: Any, steps: int) -> None:
+    """Looks whether diffusers, whose own timesteps the pipelines take, makes as many as there are steps.
+
+    It counts trailing ones down in floating point and ends, for 61 and other numbers, with one too many: that of pure
+    noise.
+
+    Raises:
+        UnirenderError: it does not, or takes no such number.
+    """
+    try:
+        scheduler.set_timesteps(steps)
+    except ValueError as error:
+        raise UnirenderError(f"steps: got {steps}, which {type(scheduler).__name__} does not take: {error}") from error
+    if (made := len(scheduler.timesteps)) != steps:
+        raise UnirenderError(
+            f"steps: got {steps}, of which {type(scheduler).__name__} makes {made} timesteps, the last at pure noise; "
+            "expected another number"
+        )

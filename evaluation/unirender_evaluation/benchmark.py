@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.whole_files import replace_file
-from unirender_evaluation import bounds
+from unirender_evaluation import bounds, subsets
 from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview.pictures import MultiviewPictures
@@ -96,7 +96,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
     missing = missing_answers(suite, here.rows, here.scenes)
     write_missing(config.out, missing)
-    say_missing(config.out, missing, say)
+    say_missing(config.out, missing, say, "has files for")
     before = set(store.known)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
@@ -104,9 +104,9 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)
     records = [record for record in store.close() if record.values]
-    by_plugins = unanswered(suite, here.rows, here.scenes, records)
-    write_missing(config.out, missing | by_plugins)
-    say_missing(config.out, by_plugins, say)
+    without = unanswered(suite, here.rows, here.scenes, records)
+    write_missing(config.out, without)
+    say_missing(config.out, {label: found for label, found in without.items() if found != missing.get(label)}, say)
     say_rows_without_values(here.rows, records, say)
     if others := store.of_other_code():
         say(f"{others} records of other code are not used; {store.unused_path} keeps the last {KEPT} of each")
@@ -229,7 +229,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         truth_spp=round(ceiling["mean_spp"]),
         code=here.versions.code[:12],
         date=datetime.now(UTC).date().isoformat(),
-        limit=config.limit,
+        limit=subsets.partial(config.limit, len(suite.scenes)),
         seeds=(config.seed,),
         environment=environment,
     )

@@ -13,6 +13,7 @@ from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.methods import Image
 from unirender_evaluation.plausible import picture_doubt
+from unirender_evaluation.plugin_source import raised_in
 from unirender_evaluation.predictions import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
@@ -152,7 +153,7 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
         with row.defaults.here():
             result = function(**{argument: _own(value) for argument, value in inputs.items()})
     except (Exception, SystemExit) as error:  # neither ends a run without a word
-        raise UnirenderError(f"{name}: {type(error).__name__}: {error}") from error
+        raise UnirenderError(f"{name}: {type(error).__name__}: {error}{raised_in(error)}") from error
     if result is None:
         raise NoAnswer(f"{name}: got None, expected {'maps' if capability == 'decompose' else 'a picture'}")
     if capability != "decompose":

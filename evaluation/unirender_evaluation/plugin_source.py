@@ -14,6 +14,7 @@ import importlib.util
 import inspect
 import sys
 import sysconfig
+import traceback
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +36,16 @@ def source_sha256(kind: type, *makers: Any) -> str:
     files, _ = _files_and_roots(kind, makers)
     contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
     return hashlib.sha256(b"".join(contents)).hexdigest() if contents else "unknown"
+
+
+def raised_in(error: BaseException) -> str:
+    """Where a method's own code raised an error, or called what did, as the end of a sentence: ` (my_method.py, line
+    12)`; empty where that is in no file of a stranger's, or is installed."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename)
+        if file.is_file() and not (_is_installed(file) or _is_pythons(file.resolve()) or _is_ours(file.resolve())):
+            return f" ({file.name}, line {frame.lineno})"
+    return ""
 
 
 def shadowed(kind: type, *makers: Any) -> Iterator[tuple[Path, Path]]:
@@ -79,6 +90,10 @@ def _file(defined: Any) -> Path | None:
 
 def _is_installed(file: Path) -> bool:
     return any(part in INSTALLED for part in file.parts)
+
+
+def _is_ours(file: Path) -> bool:
+    return any(file.is_relative_to(place.parent) for name in OURS for place in _places(name))
 
 
 def _is_pythons(file: Path) -> bool:

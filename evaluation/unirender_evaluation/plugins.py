@@ -15,7 +15,7 @@ import importlib.util
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -26,7 +26,7 @@ from urllib.parse import unquote
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
-from unirender_evaluation.plugin_source import shadowed, source_sha256
+from unirender_evaluation.plugin_source import raised_in, shadowed, source_sha256
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -52,25 +52,26 @@ class Plugin:
     defaults: OwnDefaults = field(default_factory=OwnDefaults, compare=False, repr=False)
 
 
-def installed_plugins(names: Sequence[str] | None = None) -> list[Plugin]:
-    """Methods of the entry-point group, all or the named ones.
+def installed_plugins() -> list[Plugin]:
+    """All methods of the entry-point group, also those of several distributions under one name.
 
     Raises:
-        UnirenderError: a name is not registered, or cannot be loaded, or what it returns is not a method.
+        UnirenderError: one cannot be loaded, or what it returns is not a method.
     """
-    found = {entry.name: entry for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)}
-    plugins = []
-    for name in found if names is None else names:
-        if name not in found:
-            raise UnirenderError(
-                f"no method {name!r}: installed are {', '.join(sorted(found)) or 'none'}; register a callable in the "
-                f"entry-point group {ENTRY_POINT_GROUP!r}, name it with --method {FORM}, or score a folder with "
-                f"--predictions {name}=FOLDER"
-            )
-        what = f"plug-in {name!r} ({found[name].value})"
-        loaded = _attempt(what, "load it", found[name].load, _set_by(found[name].module))
-        plugins.append(_plugin(loaded, what, name, sys.modules[found[name].module]))
-    return plugins
+    return [_installed(entry) for entry in metadata.entry_points(group=ENTRY_POINT_GROUP)]
+
+
+def _installed(entry: metadata.EntryPoint) -> Plugin:
+    what = f"plug-in {entry.name!r} ({entry.value})"
+    try:
+        loaded = _attempt(what, "load it", entry.load, _set_by(entry.module))
+        return _plugin(loaded, what, entry.name, sys.modules[entry.module])
+    except UnirenderError as error:
+        owner = "its package" if entry.dist is None else entry.dist.name
+        raise UnirenderError(
+            f"{error}; mend or uninstall {owner}, or run without it: leave plugins out of --methods and name the "
+            f"others with --method {FORM}"
+        ) from error
 
 
 def named_plugin(spec: str) -> Plugin:
@@ -212,7 +213,7 @@ def _attempt(what: str, task: str, run: Callable[[], Any], defaults: OwnDefaults
     except UnirenderError as error:  # written to be read: one of ours
         raise UnirenderError(f"{what}: could not {task}: {error}") from error
     except (Exception, SystemExit) as error:
-        raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}") from error
+        raise UnirenderError(f"{what}: could not {task}: {type(error).__name__}: {error}{raised_in(error)}") from error
 
 
 def _plugin(

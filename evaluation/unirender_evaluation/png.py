@@ -8,20 +8,28 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.sixteen_bits import sixteen_bit_values
 
+LINEAR_GAMMA = 0.9  # of the gAMA chunk: 1 is linear, 0.45 like sRGB
 COLOURED = 0.1  # mean difference of the channels; a network's grey pictures have a hundredth
 
 
-def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
+def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarray, "h w c"]:
     """Values in [0, 1] of a PNG; alpha is dropped. Grey is as good as three equal channels, and the reverse: of
     channels that differ a little, one value a pixel is the mean.
 
+    Args:
+        path: the file.
+        channels: 3, or 1.
+        encoded: whether its values are taken as sRGB-encoded.
+
     Raises:
-        UnirenderError: not a readable PNG, or one in colour where `channels` is 1.
+        UnirenderError: not a readable PNG, one in colour where `channels` is 1, or one that states to be linear where
+            it is taken as encoded.
     """
     from PIL import Image as Pil
 
     try:
         with Pil.open(path) as picture:
+            stated = picture.info.get("gamma", 0) if "srgb" not in picture.info else 0
             if (full := sixteen_bit_values(path)) is not None:
                 value = full[..., :3]
             elif picture.mode.startswith("I"):
@@ -30,6 +38,11 @@ def read_png(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
                 value = np.asarray(picture.convert("RGB"), np.float32) / 255.0
     except (OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(f"predictions: {path} is not a readable PNG ({error}); write it again") from None
+    if encoded and stated > LINEAR_GAMMA:
+        raise UnirenderError(
+            f"predictions: {path} states linear values (gAMA {stated:.3g}), expected sRGB-encoded ones; write it "
+            'without that chunk, or, where they are linear, say png_colour = "linear" in conventions.toml'
+        )
     value = value if value.ndim == 3 else value[..., None]
     if channels == 3:
         return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value.astype(np.float32)

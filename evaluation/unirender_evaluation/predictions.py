@@ -141,7 +141,7 @@ class PredictionFolder:
                 `BRIGHTEST`, or is no linear, premultiplied radiance (`plausible.picture_doubt`).
         """
         with _named(path):
-            stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else read_png(path, 3)
+            stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else self._read_png(path, 3, "image")
             _check_size(path, "the picture", stored, mask)
             if not np.isfinite(stored).all():
                 raise UnirenderError(f"predictions: {path} has NaN or infinite values, expected finite radiance")
@@ -211,7 +211,7 @@ class PredictionFolder:
 
     def _read_png_map(self, path: Path, mask: Mask) -> dict[str, np.ndarray]:
         name = path.stem
-        value = read_png(path, MAPS[name])
+        value = self._read_png(path, MAPS[name], name)
         _check_size(path, name, value, mask)
         if name == "normal":
             value = 2 * value - 1
@@ -221,6 +221,10 @@ class PredictionFolder:
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
         return self._converted({name: value})
+
+    def _read_png(self, path: Path, channels: int, what: str) -> Float[np.ndarray, "h w c"]:
+        """Values as stored; a file in colour must not say of itself that it is otherwise encoded than it is read."""
+        return read_png(path, channels, what in (*COLOURS, "image") and self.conventions.png_colour == "srgb")
 
     def _converted(self, maps: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         if "normal" in maps:

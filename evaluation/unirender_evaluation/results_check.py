@@ -230,8 +230,12 @@ def _strangers_to_the_suite(results: Results) -> list[Problem]:
     suite, run = _suite_of(results.run), results.run
     if suite is None:
         return []
+    from unirender_evaluation.task import PROTOCOLS as QUESTIONS
+    from unirender_evaluation.tasks import tasks
+
     scenes = {scene.key: scene.object for scene in suite.scenes}
     names = {*scenes, *scenes.values()}
+    asked = {question: {task.sample for task in tasks(suite, *question, list(suite.scenes))} for question in QUESTIONS}
     wrong = []
     if run.resolution != suite.spec.resolution:
         what = f"got {run.resolution}, expected {suite.spec.resolution}: suite {run.suite!r} has pictures of that size"
@@ -243,5 +247,8 @@ def _strangers_to_the_suite(results: Results) -> list[Problem]:
             yield ".sample", f"suite {results.run.suite!r} has no scene of the sample {record.sample!r}"
         elif record.object not in {scenes.get(name, name) for name in found}:
             yield ".object", f"the sample {record.sample!r} is of another object than {record.object!r}"
+        elif record.sample not in asked.get((record.table, record.protocol), {record.sample}):
+            where = f"{record.table}/{record.protocol}"
+            yield ".sample", f"suite {results.run.suite!r} has no sample {record.sample!r} under {where}"
 
     return [*wrong, *_gathered(results.records, check)]

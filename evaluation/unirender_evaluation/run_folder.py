@@ -44,7 +44,7 @@ def writing_run(folder: Path) -> Iterator[None]:
 
 
 def missing_answers(suite: Suite, rows: Sequence[Row], scenes: list[Scene]) -> dict[str, tuple[list[str], int]]:
-    """Of each row that is a folder, by its label: the questions without an answer, and how many the run has."""
+    """Of each row that is a folder, by its label: the questions without a file, and how many the run has."""
     folders = [(row.info.label, row.predictions) for row in rows if row.predictions is not None]
     every = [task for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if folders else []
     return {
@@ -56,11 +56,14 @@ def missing_answers(suite: Suite, rows: Sequence[Row], scenes: list[Scene]) -> d
 def unanswered(
     suite: Suite, rows: Sequence[Row], scenes: list[Scene], records: Sequence[Record]
 ) -> dict[str, tuple[list[str], int]]:
-    """The same of each row that is a plug-in: which questions have no value among the records."""
-    plugins = [row.info for row in rows if row.info.kind == "external" and row.predictions is None]
-    every = [task.identity for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if plugins else []
+    """Of each stranger's row, by its label: the questions without a value among the records, and how many there are.
+
+    A plug-in returned None there; of a folder there is no file, or one of maps that the question does not ask for.
+    """
+    strangers = [row.info for row in rows if row.info.kind == "external"]
+    every = [task.identity for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if strangers else []
     found = {(r.method, f"{r.table}/{r.protocol}/{r.sample}") for r in records}
-    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in plugins}
+    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in strangers}
 
 
 def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]]) -> None:
@@ -72,11 +75,13 @@ def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]]) ->
     replace_file(folder / MISSING, "".join(lines))
 
 
-def say_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None]) -> None:
-    """Says how many questions have an answer."""
+def say_missing(
+    folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None], what: str = "answers"
+) -> None:
+    """Says how many questions have an answer, or `what` there is of them."""
     for label, (questions, asked) in missing.items():
         listed = f"; the others: {folder / MISSING}" if questions else ""
-        say(f"{label}: answers {asked - len(questions)} of {asked} questions{listed}")
+        say(f"{label}: {what} {asked - len(questions)} of {asked} questions{listed}")
 
 
 def say_rows_without_values(rows: Sequence[Row], records: Sequence[Record], say: Callable[[str], None]) -> None:

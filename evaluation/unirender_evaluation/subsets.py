@@ -28,3 +28,8 @@ class Subsets:
 
 STANDARD = Subsets()
 WHOLE = Subsets(sample=None, shade=None, physics=None, optimise=None, pictures=None, views=None, mitsuba=None)
+
+
+def partial(limit: int | None, whole: int) -> int | None:
+    """A limit of scenes as tables say it: None where the whole has no more than that."""
+    return limit if limit is not None and limit < whole else None

@@ -123,8 +123,9 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     ]
     state = "HOLDS" if check["passed"] else "FAILS"
     agree = "differ from" if check["failed"] else "agree with"
+    objects = f"{check['geometries']} object{'s' * (check['geometries'] != 1)}"
     lines.append(
-        f"  {state}  truth: {check['members']} members, and mask, albedo and normal of {check['geometries']} objects, "
+        f"  {state}  truth: {check['members']} members, and mask, albedo and normal of {objects}, "
         f"rendered again with other seeds {agree} the truth file (check seed {check['seed']}, {check['date']}, "
         f"smallest pass share {check['smallest_pass_share']:.3f}); {_twins_text(check)}"
     )

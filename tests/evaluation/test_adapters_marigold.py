@@ -180,3 +180,14 @@ def test_the_schedulers_of_all_published_folders(tmp_path: Path, seen: dict[str,
     lcm = MarigoldNormals(folder).decompose(**seen).maps["normal"]
     assert np.abs(lcm - ddim).max() > 1e-2
     np.testing.assert_array_equal(MarigoldNormals(folder).decompose(**seen).maps["normal"], lcm)
+
+
+def test_steps_at_which_diffusers_ends_in_noise_are_refused(tmp_path: Path) -> None:
+    """Of 61 steps it makes 62, the last at index -1, where DDIM begins anew; LCM takes up to 50."""
+    folder = write_normals(tmp_path / "n")
+    MarigoldNormals(folder, steps=60)
+    with pytest.raises(UnirenderError, match="steps: got 61, of which DDIMScheduler makes 62 timesteps"):
+        MarigoldNormals(folder, steps=61)
+    LCMScheduler(**SCHEDULE).save_pretrained(folder / "scheduler")
+    with pytest.raises(UnirenderError, match="steps: got 51, which LCMScheduler does not take: "):
+        MarigoldNormals(folder, steps=51)

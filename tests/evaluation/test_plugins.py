@@ -12,10 +12,11 @@ import pytest
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation import engine
+from unirender_evaluation import engine, kept_defaults
 from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
+from unirender_reference.backend import mitsuba
 
 SOURCE = """
 from helper_of_the_method import SHADE
@@ -245,6 +246,58 @@ def test_what_a_method_sets_for_the_whole_process_is_its_own(tmp_path: Path) -> 
             assert np.geterr() == errors
 
 
+def test_an_error_names_the_line_of_the_method_that_met_it(tmp_path: Path) -> None:
+    """And not that of the library which raised it, which says nothing to its author."""
+    file = tmp_path / "wide.py"
+    file.write_text(
+        "import json\nclass Wide:\n    name, config = 'wide', {}\n"
+        "    def render(self, intrinsics):\n        return json.loads('{')\n"
+    )
+    (row,) = plugin_rows([named_plugin(f"{file}:Wide")])
+    with pytest.raises(UnirenderError, match=r"JSONDecodeError: .* \(wide.py, line 5\)$"):
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+
+
+def test_how_torch_computes_is_a_methods_own(tmp_path: Path) -> None:
+    """A script's `set_grad_enabled(False)` would leave the next method without gradients, and reduced precision would
+    reach the answers of our rows."""
+    settings = (
+        "torch.set_grad_enabled(False)",
+        "torch.backends.cuda.matmul.allow_tf32 = True",
+        "torch.backends.cudnn.benchmark = True",
+        "torch.set_num_threads(torch.get_num_threads() + 1)",
+    )
+    file = tmp_path / "settings.py"
+    file.write_text(
+        "import numpy as np\nimport torch\nclass Sets:\n    name, config = 'sets', {}\n    def __init__(self):\n"
+        + "".join(f"        {setting}\n" for setting in settings)
+        + "    def render(self, intrinsics):\n"
+        "        assert not torch.is_grad_enabled() and torch.backends.cuda.matmul.allow_tf32\n"
+        "        assert torch.backends.cudnn.benchmark\n        return np.zeros((2, 2, 3))\n"
+        "class Learns:\n    name, config = 'learns', {}\n    def render(self, intrinsics):\n"
+        "        torch.ones(2, requires_grad=True).sum().backward()\n        return np.zeros((2, 2, 3))\n"
+    )
+    before = kept_defaults.torch_defaults()
+    rows = plugin_rows([named_plugin(f"{file}:{name}") for name in ("Sets", "Learns")])
+    for row in (*rows, *rows):
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+        assert kept_defaults.torch_defaults() == before
+
+
+def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
+    """Though the truth check, and rows of ours, render with another one between its calls."""
+    file = tmp_path / "renders.py"
+    file.write_text(
+        "import mitsuba as mi\nimport numpy as np\nmi.set_variant('scalar_rgb')\n"
+        "class Renders:\n    name, config = 'renders', {}\n    def render(self, intrinsics):\n"
+        "        assert mi.variant() == 'scalar_rgb'\n        return np.zeros((2, 2, 3))\n"
+    )
+    (row,) = plugin_rows([named_plugin(f"{file}:Renders")])
+    for _ in range(2):
+        mitsuba("scalar_spectral")
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+
+
 def test_a_compiled_neighbour_is_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Python prefers the one that Cython or mypyc has left beside it."""
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -325,7 +378,10 @@ def test_a_folder_shadows_no_module_of_python(folder: Path) -> None:
             "{folder}/my_method.py:Loaded",
             "it takes weights, expected a value of each, as in .*Loaded.weights=VALUE",
         ),
-        ("{folder}/my_method.py:Broken", "could not construct it: RuntimeError: no weights"),
+        (
+            "{folder}/my_method.py:Broken",
+            r"could not construct it: RuntimeError: no weights \(my_method.py, line \d+\)$",
+        ),
         ("{folder}/syntax.py:Grey", "could not import it: SyntaxError"),
         ("{folder}/imports.py:Grey", "could not import it: ModuleNotFoundError: No module named 'no_such_package'"),
         ("no_such_module_here:Grey", "no module 'no_such_module_here' in "),
@@ -351,6 +407,25 @@ def test_a_config_that_is_not_json(folder: Path, name: str) -> None:
         plugin_rows([named_plugin(f"{folder / 'my_method.py'}:{name}")])
 
 
-def test_an_unknown_entry_point() -> None:
-    with pytest.raises(UnirenderError, match="no method 'nobody'"):
-        installed_plugins(["nobody"])
+def install(folder: Path, name: str, module: str, entries: str) -> None:
+    """A distribution as pip leaves it, in a folder that is to be on Python's path."""
+    information = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text(f"[unirender.methods]\n{entries}\n")
+    (folder / f"{module}.py").write_text(
+        f"class Mine:\n    name, config = '{name}', {{}}\n    def render(self, intrinsics): ...\n"
+        "def broken():\n    raise RuntimeError('no weights')\n"
+    )
+
+
+def test_all_installed_methods_are_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also those of two distributions that chose one name for theirs; of a broken one it is said how to go on."""
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    for number in ("one", "two"):
+        install(tmp_path, f"installed-{number}", f"my_installed_{number}", f"mine = my_installed_{number}:Mine")
+    assert {"installed-one", "installed-two"} <= {plugin.method.name for plugin in installed_plugins()}
+    install(tmp_path, "installed-three", "my_installed_three", "mine = my_installed_three:broken")
+    said = "no weights .*; mend or uninstall installed-three, or run without it: leave plugins out of --methods"
+    with pytest.raises(UnirenderError, match=said):
+        installed_plugins()

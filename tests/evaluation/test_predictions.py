@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from sixteen_bit_files import write_png16
 from tiny_suites import make_suite
 
@@ -58,6 +59,28 @@ def test_png_predictions_and_broken_files(suite: Suite, tmp_path: Path) -> None:
     (folder / "albedo.png").write_text("no picture")
     with pytest.raises(UnirenderError, match="not a readable PNG"):
         row.predictions.answer(task)
+
+
+@pytest.mark.parametrize(
+    ("gamma", "srgb", "refused"), [(1.0, False, True), (1.0, True, False), (0.45455, False, False)]
+)
+def test_a_png_that_states_linear_values_is_not_decoded(
+    tmp_path: Path, gamma: float, srgb: bool, refused: bool
+) -> None:
+    """Decoded all the same its colours would be far too dark, and nothing but the score would say so. An sRGB chunk
+    goes before gAMA; of maps that are linear anyway both say nothing."""
+    chunks = PngInfo()
+    if srgb:
+        chunks.add(b"sRGB", b"\0")
+    chunks.add(b"gAMA", round(gamma * 1e5).to_bytes(4, "big"))
+    path = tmp_path / "albedo.png"
+    Image.fromarray(np.full((4, 4, 3), 128, np.uint8)).save(path, pnginfo=chunks)
+    read_png(path, 3)
+    if refused:
+        with pytest.raises(UnirenderError, match=r"states linear values \(gAMA 1\), .* png_colour = .linear."):
+            read_png(path, 3, encoded=True)
+    else:
+        read_png(path, 3, encoded=True)
 
 
 @pytest.mark.parametrize("filter_type", [0, 1])

@@ -15,7 +15,7 @@ from unirender_evaluation.records import write_records, write_run
 from unirender_evaluation.results_check import content_problems, remarks
 from unirender_evaluation.results_data import Results, definitions
 from unirender_evaluation.results_file import from_document, read_results, write_results
-from unirender_evaluation.suites import Scene, load_suite
+from unirender_evaluation.suites import Scene, load_suite, material_key
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 
 PSNR = "albedo.psnr@masked-srgb-raw"
@@ -196,6 +196,10 @@ def test_a_metrics_name_means_one_thing_in_all_tables() -> None:
             assert column.metric == ALL_METRICS[column.metric.name], column
 
 
+def inverse_sample(scene: Scene) -> str:
+    return f"{scene.key}_{material_key(scene.materials[0])}"
+
+
 def test_samples_are_looked_up_in_the_suite_that_is_installed() -> None:
     suite = load_suite("tiny")
     scene, other = suite.scenes[0], suite.scenes[-1]
@@ -205,10 +209,12 @@ def test_samples_are_looked_up_in_the_suite_that_is_installed() -> None:
         records = (replace(base.records[0], sample=sample, object=owner),)
         return [str(problem) for problem in content_problems(replace(base, records=records))]
 
-    assert at(f"{scene.key}_m010_r030", scene.object) == []
-    assert at(scene.object, scene.object) == []
+    assert at(inverse_sample(scene), scene.object) == []
+    several = replace(base.records[0], table="multi-view", protocol="8-views", sample=scene.object, object=scene.object)
+    assert not any("sample" in str(problem) for problem in content_problems(replace(base, records=(several,))))
+    assert "suite 'tiny' has no sample" in at(f"{scene.key}_m010_r031", scene.object)[0], "not asked of that scene"
     assert "suite 'tiny' has no scene of the sample 'ball-0_l0'" in at("ball-0_l0", "ball-0")[0]
-    assert "is of another object than" in at(f"{scene.key}_m010_r030", other.object)[0]
+    assert "is of another object than" in at(inverse_sample(scene), other.object)[0]
     elsewhere = remarks(small_results(suite="tiny"))
     assert "is not the one installed here" in elsewhere[0]
 
@@ -219,7 +225,7 @@ def of_tiny(scenes: Mapping[str, Sequence[Scene]], **changes: Any) -> Results:
     facts = {"suite": "tiny", "suite_hash": suite.sha256, "resolution": suite.spec.resolution} | changes
     base = small_results(methods=tuple(scenes), **facts)
     records = tuple(
-        replace(base.records[0], method=method, sample=f"{scene.key}_m010_r030", object=scene.object)
+        replace(base.records[0], method=method, sample=inverse_sample(scene), object=scene.object)
         for method, shown in scenes.items()
         for scene in shown
     )

@@ -36,8 +36,8 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     assert len(questions) == asked - 2
     said: list[str] = []
     write_missing(tmp_path, missing)
-    say_missing(tmp_path, missing, said.append)
-    assert said == [f"mine: answers 2 of {asked} questions; the others: {tmp_path / 'missing.txt'}"]
+    say_missing(tmp_path, missing, said.append, "has files for")
+    assert said == [f"mine: has files for 2 of {asked} questions; the others: {tmp_path / 'missing.txt'}"]
     lines = (tmp_path / "missing.txt").read_text().splitlines()
     assert lines == [f"mine: {question}" for question in questions]
     assert not any("m100_r050" in line for line in lines if line.startswith("mine: rendering/from-image/"))
@@ -45,12 +45,16 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     assert not (tmp_path / "missing.txt").exists(), "that of an earlier run says nothing of this one"
 
 
-def test_what_a_plugin_does_not_answer_is_counted_too(tmp_path: Path) -> None:
-    """It returned None, or nothing that is scored."""
+@pytest.mark.parametrize("as_folder", [False, True])
+def test_a_question_without_a_value_is_not_answered(tmp_path: Path, as_folder: bool) -> None:
+    """A plug-in returned None, or nothing that is scored; a folder has a file of maps that are not asked for there."""
     suite = make_suite(tmp_path / "suite", objects=1)
     scenes = [suite.scenes[0]]
     edit, other = list(tasks(suite, "rendering", "from-image", scenes))[:2]
-    rows = [make_row(UneditedInput(), "trivial"), make_row(UneditedInput(), "external", "mine")]
+    (tmp_path / "mine" / edit.folder).mkdir(parents=True)
+    (tmp_path / "mine" / edit.folder / "albedo.png").write_bytes(b"")
+    plugin, (folder,) = make_row(UneditedInput(), "external", "mine"), prediction_rows({"mine": tmp_path / "mine"})
+    rows = [make_row(UneditedInput(), "trivial"), folder if as_folder else plugin]
     record = Record(edit.table, edit.protocol, rows[1].info.key, edit.sample, "o", {"x": 1.0})
     missing = unanswered(suite, rows, scenes, [record])
     questions, asked = missing["mine"]

@@ -11,7 +11,7 @@ from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.physics.rows import physics_scenes
 from unirender_evaluation.rows import Row
 from unirender_evaluation.run_command import BenchRun
-from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
+from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets, partial
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
@@ -35,6 +35,10 @@ def physics_labels(suite: Suite, subsets: Subsets, folder: Path) -> int:
     """Scenes of a run that have physics records."""
     run = Run(suite, (), list(suite.scenes), VERSIONS, (), folder, subsets)
     return sum(any(job.label.startswith("physics") for job in run.jobs(scene)) for scene in suite.scenes)
+
+
+def test_a_limit_that_takes_all_scenes_makes_no_partial_run() -> None:
+    assert [partial(limit, 48) for limit in (None, 1, 47, 48, 100)] == [None, 1, 47, None, None]
 
 
 def test_a_default_run_keeps_to_the_stated_subsets(suite: Suite, tmp_path: Path) -> None:

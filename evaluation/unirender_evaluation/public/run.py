@@ -13,7 +13,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.run_folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
+from unirender_evaluation.subsets import partial as partial_limit
 from unirender_evaluation.table_formats import print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
 from unirender_evaluation.tables import Table
@@ -104,6 +105,7 @@ def run(what: PublicRun, console: Console) -> PublicResult:
             second run continues from there.
     """
     every = what.public.samples()
+    what = replace(what, limit=partial_limit(what.limit, len(every)))
     check_folders(what)
     with made_folder(what.out), locked(what.out), writing_run(what.out):
         return _run(what, evenly(every, what.limit), console)
@@ -118,7 +120,7 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
     counted = {label: (names, len(samples)) for label, names in missing.items()}
     write_missing(what.out, counted)
-    say_missing(what.out, counted, say)
+    say_missing(what.out, counted, say, "has files for")
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     before, contents = set(store.known), []
@@ -130,10 +132,10 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
             progress.update(bar, advance=1, description=f"{what.public.name}: {sample.key}")
     records = [record for record in store.close() if record.values]
     computed = len({record.key for record in records} - before)
-    by_plugins = _unanswered(what.rows, samples, records)
-    write_missing(what.out, counted | by_plugins)
-    say_missing(what.out, by_plugins, say)
-    missing |= {label: names for label, (names, _) in by_plugins.items()}
+    without = _unanswered(what.rows, samples, records)
+    write_missing(what.out, without)
+    say_missing(what.out, {label: found for label, found in without.items() if found != counted.get(label)}, say)
+    missing = {label: names for label, (names, _) in without.items()}
     info = _info(what, records, contents)
     write_run(what.out / "run.json", info)
     write_csv(what.out / "records.csv", records)
@@ -154,11 +156,16 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
 def _unanswered(
     rows: Sequence[Row], samples: Sequence[Sample], records: Sequence[Record]
 ) -> dict[str, tuple[list[str], int]]:
-    """Of each row that is a plug-in, by its label: the questions without a value, and how many one picture answers."""
-    plugins = [row.info for row in rows if row.info.kind == "external" and row.predictions is None]
-    every = [f"{sample.table}/{sample.key}" for sample in samples if sample.one_picture]
+    """Of each stranger's row, by its label: the questions without a value, and how many there are; to a plug-in those
+    that one picture answers."""
     found = {(record.method, f"{record.table}/{record.sample}") for record in records}
-    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in plugins}
+    without = {}
+    for row in rows:
+        if row.info.kind == "external":
+            asked_of = [s for s in samples if row.predictions is not None or s.one_picture]
+            names = [f"{sample.table}/{sample.key}" for sample in asked_of]
+            without[row.info.label] = [name for name in names if (row.info.key, name) not in found], len(names)
+    return without
 
 
 def check_folders(what: PublicRun) -> None:

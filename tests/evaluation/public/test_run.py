@@ -179,11 +179,24 @@ def test_a_table_that_nothing_can_be_asked_for_is_explained(tmp_path: Path) -> N
     assert StanfordOrb(folder, 32).why_absent("stanford-orb-relighting") is None  # nothing is asked of anybody
 
 
+def test_maps_of_a_folder_that_are_not_asked_for_are_no_answer(tmp_path: Path) -> None:
+    """As those of a plug-in: IIW asks for albedo alone."""
+    iiw = Iiw(make_iiw(tmp_path / "iiw"))
+    sample = iiw.samples()[0]
+    folder = tmp_path / "mine" / sample.key
+    folder.mkdir(parents=True)
+    write_png(folder / "roughness.png", np.zeros((*iiw.frame(sample)[0], 1), np.float32))
+    result = done(iiw, prediction_rows({"mine": tmp_path / "mine"}), tmp_path / "out")
+    assert result.missing == {"mine": [f"{sample.table}/{sample.key}" for sample in iiw.samples()]}
+
+
 def test_a_limit_is_a_watermark(tmp_path: Path) -> None:
     iiw = Iiw(make_iiw(tmp_path / "iiw"))
     result = done(iiw, trivial_rows(iiw), tmp_path / "out", limit=1)
     assert {record.sample for record in result.records} == {"100"}
     assert "--limit 1: a partial run" in (tmp_path / "out" / "tables.md").read_text()
+    done(iiw, trivial_rows(iiw), tmp_path / "out", limit=len(iiw.samples()))
+    assert "--limit" not in (tmp_path / "out" / "tables.md").read_text(), "it takes all"
 
 
 def test_a_killed_run_leaves_no_table_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
