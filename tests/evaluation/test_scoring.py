@@ -115,6 +115,7 @@ def test_only_what_is_probably_in_other_conventions_is_suspicious() -> None:
     picture = truth.require("albedo")["albedo"] * mask
     task = asked(truth, picture)
     assert suspicions(task, picture, truth) == suspicions(task, None, None) == {}
+    assert suspicions(task, None, truth.replace(normal=None)) == {}
     rng = np.random.default_rng(1)
     worse = np.clip(truth.require("albedo")["albedo"] + rng.normal(0, 0.2, mask.shape), 0, 1)
     assert suspicions(task, worse * mask, truth.replace(albedo=worse)) == {}, "errors are none"

@@ -101,8 +101,8 @@ def test_members_come_back_as_they_were_written(kind: Kind) -> None:
 def test_the_ceiling_is_what_a_noise_free_prediction_scores(premultiplied: bool) -> None:
     """By Monte Carlo, for both masks and colour spaces; half of the frame is covered, a part of it by halves."""
     rng = np.random.default_rng(0)
-    mask = np.repeat([1.0, 0.5, 0.0, 0.0], 24)[:, None, None].astype(np.float32) * np.ones((1, 96, 1), np.float32)
-    clean = rng.uniform(0.05, 0.9, (96, 96, 3)).astype(np.float32) * (mask > 0)
+    mask = np.repeat([1.0, 0.5, 0.0, 0.0], 16)[:, None, None].astype(np.float32) * np.ones((1, 64, 1), np.float32)
+    clean = rng.uniform(0.05, 0.9, (64, 64, 3)).astype(np.float32) * (mask > 0)
     sigma = 0.004 * clean
     noisy = clean + sigma * rng.standard_normal(clean.shape, np.float32)
     scored = score_colour("relit", clean, noisy, mask, mask, ("raw",))

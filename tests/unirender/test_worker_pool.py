@@ -74,7 +74,7 @@ def test_a_guarded_worker_ends_with_its_parent(pool: str, tmp_path: Path) -> Non
 def test_an_unguarded_worker_lives_on(tmp_path: Path) -> None:
     worker = orphan(tmp_path, "executor", "unguarded")
     try:
-        assert not ends(worker, 2)
+        assert not ends(worker, 0.5)
     finally:
         os.kill(worker, signal.SIGKILL)
 
