@@ -7,6 +7,7 @@ import os
 import select
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from types import FrameType
 
@@ -14,6 +15,7 @@ from unirender.command_line import Ended
 from unirender.models.lean_imports import lean_imports
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
+PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
 
@@ -32,17 +34,23 @@ def quick_start() -> Iterator[None]:
         gc.freeze()
 
 
-def end(number: int, frame: FrameType | None) -> None:
-    """Asked to stop by a batch system or a terminal that closes, a command of the model ends as when it is interrupted.
+def hear_ends() -> None:
+    """From now on SIGTERM and SIGHUP end this process as Ctrl-C does: what is temporary is deleted, workers end.
 
-    Others resume by what they have written, and end at once.
-
-    Raises:
-        Ended: always.
+    They are those of a batch system or `timeout`, and of a terminal that closes. What the process ignores from its
+    beginning, as nohup has it ignore SIGHUP, stays ignored.
     """
-    for each in (signal.SIGTERM, signal.SIGHUP):  # `timeout` sends it to the process and to its group
-        signal.signal(each, signal.SIG_IGN)
-    raise Ended(number)
+    last = float("-inf")
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal last
+        before, last = last, time.monotonic()
+        if last - before > PASSED_ON_S:  # native code may have swallowed the first, or its end takes too long
+            raise Ended(number)
+
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, end)
 
 
 def open_streams() -> None:
