@@ -1,5 +1,6 @@
 """How the process of a command starts, and how it ends early: a signal, or a reader who left. Light to import."""
 
+import _thread
 import contextlib
 import gc
 import io
@@ -7,6 +8,7 @@ import os
 import select
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
@@ -15,6 +17,7 @@ from unirender.command_line import Ended
 from unirender.models.lean_imports import lean_imports
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
+WAIT_S, MOST_WAITS = 0.05, 1200  # of a signal, for the end of an import: a minute in all
 PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
@@ -35,22 +38,57 @@ def quick_start() -> Iterator[None]:
 
 
 def hear_ends() -> None:
-    """From now on SIGTERM and SIGHUP end this process as Ctrl-C does: what is temporary is deleted, workers end.
+    """From now on SIGINT, SIGTERM and SIGHUP end this process in order: what is temporary is deleted, workers end.
 
-    They are those of a batch system or `timeout`, and of a terminal that closes. What the process ignores from its
-    beginning, as nohup has it ignore SIGHUP, stays ignored.
+    They are those of Ctrl-C, of a batch system or `timeout`, and of a terminal that closes. What the process ignores
+    from its beginning, as nohup has it ignore SIGHUP, stays ignored.
     """
-    last = float("-inf")
+    ends = _Ends()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, ends.hear)
 
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal last
-        before, last = last, time.monotonic()
-        if last - before > PASSED_ON_S:  # native code may have swallowed the first, or its end takes too long
+
+class _Ends:
+    """Raises `Ended` on a signal, once a module that is being imported is there.
+
+    In the middle of an import, torch aborts the process on any exception, and trimesh takes it for a library that is
+    missing and goes on without.
+    """
+
+    def __init__(self) -> None:
+        self.last = float("-inf")  # time of the last that was raised
+        self.waiting = False  # whether one waits for the end of an import
+        self.waits = 0  # since the last that was raised
+
+    def hear(self, number: int, frame: FrameType | None) -> None:
+        """The handler.
+
+        Raises:
+            Ended: no module is being imported, and the signal is none that comes again by another way.
+        """
+        if importing(frame) and self.waits < MOST_WAITS:
+            if not self.waiting:
+                self.waiting, self.waits = True, self.waits + 1
+                _thread.start_new_thread(self.again, (number,))  # takes none of the locks that `threading` may hold
+        elif number == signal.SIGINT or time.monotonic() - self.last > PASSED_ON_S:
+            self.last, self.waits = time.monotonic(), 0
             raise Ended(number)
 
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) == signal.SIG_DFL:
-            signal.signal(number, end)
+    def again(self, number: int) -> None:
+        """Sends the signal to the main thread a little later."""
+        time.sleep(WAIT_S)
+        self.waiting = False
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+def importing(frame: FrameType | None) -> bool:
+    """Whether a frame, or one that called it, imports a module."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def open_streams() -> None:

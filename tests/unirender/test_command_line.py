@@ -1,6 +1,7 @@
 """What the command line says of a line that is wrong, and of Ctrl-C."""
 
 import errno
+import importlib
 import io
 import os
 import signal
@@ -274,7 +275,8 @@ def test_every_command_hears_who_tells_it_to_end() -> None:
 @pytest.fixture
 def as_before() -> Iterator[None]:
     """What the process does on a signal is afterwards as before."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -292,6 +294,30 @@ def test_who_is_told_to_end_again_ends_if_it_has_not(monkeypatch: pytest.MonkeyP
     with pytest.raises(Ended):
         os.kill(os.getpid(), signal.SIGTERM)
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN, "as nohup has it"
+
+
+@pytest.mark.usefixtures("as_before")
+def test_an_import_is_not_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch would abort the process, and trimesh would do without the library."""
+    (tmp_path / "takes_the_interrupt.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    swallowed = False\nexcept BaseException:\n    swallowed = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    process_ends.hear_ends()
+    with pytest.raises(Ended) as ended:
+        import_and_wait("takes_the_interrupt")
+    assert ended.value.args == (signal.SIGINT,)
+    assert not sys.modules.pop("takes_the_interrupt").swallowed
+    monkeypatch.setattr(process_ends, "MOST_WAITS", 0)
+    importlib.import_module("takes_the_interrupt")
+    assert sys.modules.pop("takes_the_interrupt").swallowed, "the twin: nobody waits for ever"
+
+
+def import_and_wait(name: str) -> None:
+    importlib.import_module(name)
+    time.sleep(30)
 
 
 @pytest.mark.slow
