@@ -17,7 +17,7 @@ from unirender.command_line import Ended
 from unirender.models.lean_imports import lean_imports
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
-WAIT_S, MOST_WAITS = 0.05, 1200  # of a signal, for the end of an import: a minute in all
+WAIT_S, MOST_WAITS = 0.05, 200  # of a signal, for the end of an import: ten seconds in all
 PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
