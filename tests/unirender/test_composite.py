@@ -155,7 +155,8 @@ def test_split_sum_of_a_large_picture_is_that_of_its_pixels_in_little_memory(mon
     maps: dict[str, Any] = {name: rng.random((300, 400, 3), np.float32) for name in ("albedo", "diffuse", "specular")}
     maps |= {name: rng.random((300, 400, 1), np.float32) for name in ("roughness", "metallic", "mask")}
     normal = np.broadcast_to(np.array([0.6, 0, 0.8], np.float32), (300, 400, 3))
-    large = Intrinsics(normal=normal, **maps | {"mask": np.where(maps["mask"] < 0.3, 0, maps["mask"])})
+    maps["mask"] = np.where(maps["mask"] < 0.3, 0, maps["mask"])
+    large = Intrinsics(normal=normal, **maps)
     whole, needed = split_sum_image(large), peak_memory(large)
     monkeypatch.setattr("unirender.composite.BLOCK", 2**12)
     np.testing.assert_array_equal(split_sum_image(large), whole)
