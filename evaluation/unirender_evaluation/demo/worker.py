@@ -4,12 +4,14 @@
         answer = worker.run(job, 1, 2)              # job(context, 1, 2), in the process
 
 A job that is not done in time is stopped with its process, and the next one finds a new process. Files of strangers are
-decoded in there, too: what a decoder does to its process it does not do to the page.
+decoded in there, too: what a decoder does to its process it does not do to the page. The process has a folder for its
+temporary files, which goes with it, however it ends: a job that was stopped leaves no picture behind.
 """
 
 import logging
 import multiprocessing
 import signal
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -40,6 +42,7 @@ class Worker:
         self._lock = threading.Lock()
         self._process: BaseProcess | None = None
         self._pipe: Connection | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> "Worker":
         """Waits until the process can work.
@@ -69,13 +72,15 @@ class Worker:
         with self._lock:
             if self._process is None or not self._process.is_alive():
                 self._begin()
-            return self._ask((job, arguments), self.seconds)
+            return self._answer(self.seconds, (job, arguments))
 
     def _begin(self) -> None:
         self._end()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(self.start, theirs, self.idle_seconds), daemon=True)
+        self._folder = tempfile.TemporaryDirectory(prefix="unirender-demo-")
+        arguments = (self.start, theirs, self.idle_seconds, self._folder.name)
+        process = context.Process(target=_work, args=arguments, daemon=True)
         process.start()
         self._process = process
         theirs.close()
@@ -89,16 +94,17 @@ class Worker:
         if self._pipe is not None:
             self._pipe.close()
             self._pipe = None
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
 
-    def _ask(self, question: tuple[Callable[..., Any], tuple], seconds: float) -> Any:
-        assert self._pipe is not None, "there is a process"
-        self._pipe.send(question)
-        return self._answer(seconds)
-
-    def _answer(self, seconds: float) -> Any:
+    def _answer(self, seconds: float, question: tuple[Callable[..., Any], tuple] | None = None) -> Any:
+        """To a question, or without one to the first, which is whether `start` succeeded."""
         assert self._pipe is not None, "there is a process"
         begun = time.monotonic()
         try:
+            if question is not None:
+                self._pipe.send(question)
             if not self._pipe.poll(seconds):
                 self._end()
                 raise UnirenderError(
@@ -114,10 +120,11 @@ class Worker:
         return answer
 
 
-def _work(start: Callable[[], Any], pipe: Connection, idle_seconds: float) -> None:
+def _work(start: Callable[[], Any], pipe: Connection, idle_seconds: float, folder: str) -> None:
     """The process: answers (whether it succeeded, the result or the error) until nobody asks any more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends this
     exit_with_parent()
+    tempfile.tempdir = folder
     context: Any = None
 
     def prepare(_: Any) -> None:

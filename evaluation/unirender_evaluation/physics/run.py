@@ -32,7 +32,6 @@ from unirender_evaluation.statistics import Estimate, mean_estimate, unprinted_n
 from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.table_formats import estimate_text
-from unirender_evaluation.table_text import markdown_row
 from unirender_evaluation.truth_render import item_seed
 
 MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
@@ -165,8 +164,8 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
     lines = [
         HEADING,
         "",
-        markdown_row(("Test", "expected", *ROWS, "twin refused")),
-        markdown_row((":--", *["--:"] * (1 + len(ROWS)), ":--")),
+        "| Test | expected | " + " | ".join(ROWS) + " | twin refused |",
+        "| :-- | --: | " + "--: | " * len(ROWS) + ":-- |",
     ]
     for finding in found:
         test = finding.test
@@ -174,7 +173,7 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
         cells = [estimate_text(finding.rows.get(row), test.metric.decimals) for row in ROWS]
         verdict = "PASS" if finding.refused else "FAIL"
         heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
-        lines.append(markdown_row((heading, expected, *cells, f"{verdict}: {test.twin_is}")))
+        lines.append(f"| {heading} | {expected} | {' | '.join(cells)} | {verdict}: {test.twin_is} |")
     protocol = " · ".join(f"{name}: {value}" for name, value in settings.items())
     notes = unprinted_note(estimate for finding in found for estimate in finding.rows.values())
     lines += [line for note in notes for line in ("", note)]
