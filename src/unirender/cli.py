@@ -26,7 +26,7 @@ from unirender.command_line import Ended, causes, interrupted, parse
 from unirender.commands import Decompose, Edit, Relight, Render
 from unirender.errors import UnirenderError, UsageError
 from unirender.notices import NoticeHandler, notice
-from unirender.process_ends import READER_LEFT, drop_output, end, open_streams, quick_start, reader_left
+from unirender.process_ends import READER_LEFT, drop_output, hear_ends, open_streams, quick_start, reader_left
 from unirender.system_errors import out_of_memory, refused_by_system
 from unirender.training.average import Average
 from unirender.training.calibrate import Calibrate
@@ -206,12 +206,13 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point of the `unirender` script.
 
     Exits with 0, 1 (failure), 2 (usage), 130 (interrupted), 141 (who read its output left: `unirender ... | head`), 143
-    (SIGTERM) or 129 (SIGHUP) where that is heard (`end`, `unirender.training.stopping`).
+    (SIGTERM) or 129 (SIGHUP).
     `--version` prints the version. `UNIRENDER_DEBUG=1` shows the traceback of an error.
     """
     arguments = sys.argv[1:] if argv is None else argv
     if argv is None:
         open_streams()
+        hear_ends()
     command = None
     logger, handler = logging.getLogger("unirender"), NoticeHandler()
     logger.addHandler(handler)
@@ -220,10 +221,6 @@ def main(argv: list[str] | None = None) -> None:
             print(f"unirender {importlib.metadata.version('unirender')}", flush=True)
             sys.exit(0)
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
-        if argv is None and isinstance(command, MODEL):
-            for number in (signal.SIGTERM, signal.SIGHUP):
-                if signal.getsignal(number) == signal.SIG_DFL:  # nohup has the second ignored
-                    signal.signal(number, end)
         with quick_start() if argv is None and isinstance(command, MODEL) else contextlib.nullcontext():
             status = run(command)
         sys.stdout.flush()

@@ -32,6 +32,7 @@ COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced o
 LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
 LOBES = 4  # at a time: their samples stay in the processor's cache
 GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
+BLOCK = 2**18  # pixels whose split sum is made at a time: some 200 bytes each
 TABLES = Path(__file__).with_name("environment_brdf.npy")  # what `integrate_environment_brdf` gives, [2 n r], float64
 
 
@@ -70,13 +71,27 @@ def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
     maps = _maps(intrinsics, "albedo", "normal", "roughness", "metallic", "diffuse", "specular", "mask")
     view = intrinsics.camera.view_directions(intrinsics.height, intrinsics.width)
     covered = np.flatnonzero(maps["mask"])
-    seen = {name: _pixels(value, covered) for name, value in maps.items()}
-    n_v = dots(unit_normals(seen["normal"]), _pixels(view, covered))
-    reflectance = mean_fresnel(fresnel(seen["albedo"], seen["metallic"]), n_v, seen["roughness"])
-    radiance = lobes(seen["albedo"], seen["metallic"], seen["diffuse"], seen["specular"], reflectance)
     image = np.zeros((maps["mask"].size, 3), np.float32)
-    image[covered] = radiance * seen["mask"]
+    for start in range(0, len(covered), BLOCK):
+        which = covered[start : start + BLOCK]
+        seen = {name: _pixels(value, which) for name, value in maps.items()}
+        image[which] = _split_sum(**seen, view=_pixels(view, which))
     return image.reshape(view.shape)
+
+
+def _split_sum(
+    albedo: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    roughness: Float[np.ndarray, "n 1"],
+    metallic: Float[np.ndarray, "n 1"],
+    diffuse: Float[np.ndarray, "n 3"],
+    specular: Float[np.ndarray, "n 3"],
+    mask: Float[np.ndarray, "n 1"],
+    view: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """The split-sum composite of some pixels; `view`: directions towards the viewer."""
+    reflectance = mean_fresnel(fresnel(albedo, metallic), dots(unit_normals(normal), view), roughness)
+    return lobes(albedo, metallic, diffuse, specular, reflectance) * mask
 
 
 def _pixels(picture: Float[np.ndarray, "h w c"], which: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n c"]:

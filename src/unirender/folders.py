@@ -146,12 +146,12 @@ def decompose_folder(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
-    done, damaged = FolderResult(), set[Path]()
+    done, damaged, mask_of = FolderResult(), set[Path](), mask_finder(masks)
 
     def wanted() -> Iterator[tuple[Path, Picture, dict[str, Any]]]:
         for path in pictures:
             try:
-                mask = mask_of(path, masks)
+                mask = mask_of(path)
                 meta = {**settings, "input": path, "mask": mask, INPUT_SHA256: input_sha256(path, mask)}
                 if not overwrite and (figures := figures_of(output / path.name, meta)) is not None:
                     if not missing_files(output / path.name, figures):
@@ -200,18 +200,24 @@ def batches(
         yield batch
 
 
-def mask_of(path: Path, masks: Path | None) -> Path | None:
-    """The mask file of a picture: `masks` itself, or the picture in that folder with the same stem.
+def mask_finder(masks: Path | None) -> Callable[[Path], Path | None]:
+    """What says which file is the mask of a picture: `masks` itself, or the picture in that folder with the same stem.
 
-    Raises:
-        UnirenderError: there is none in that folder, or more than one.
+    The folder is listed once. What is returned raises `UnirenderError` where it has no such picture, or more than one.
     """
     if masks is None or not masks.is_dir():
-        return masks
-    found = [mask for mask in masks.iterdir() if mask.stem == path.stem and _is_picture(mask)]
-    if len(found) != 1:
-        raise UnirenderError(f"{masks}: has {len(found)} masks for {path.name}, expected one picture {path.stem}.*")
-    return found[0]
+        return lambda _: masks
+    by_stem: dict[str, list[Path]] = {}
+    for mask in filter(_is_picture, masks.iterdir()):
+        by_stem.setdefault(mask.stem, []).append(mask)
+
+    def mask_of(path: Path) -> Path:
+        found = by_stem.get(path.stem, [])
+        if len(found) != 1:
+            raise UnirenderError(f"{masks}: has {len(found)} masks for {path.name}, expected one picture {path.stem}.*")
+        return found[0]
+
+    return mask_of
 
 
 def input_sha256(path: Path, mask: Path | None) -> str:

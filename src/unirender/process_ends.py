@@ -1,5 +1,6 @@
 """How the process of a command starts, and how it ends early: a signal, or a reader who left. Light to import."""
 
+import _thread
 import contextlib
 import gc
 import io
@@ -7,6 +8,8 @@ import os
 import select
 import signal
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from types import FrameType
 
@@ -14,6 +17,8 @@ from unirender.command_line import Ended
 from unirender.models.lean_imports import lean_imports
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
+WAIT_S, MOST_WAITS = 0.05, 200  # of a signal, for the end of an import: ten seconds in all
+PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
 
@@ -32,17 +37,58 @@ def quick_start() -> Iterator[None]:
         gc.freeze()
 
 
-def end(number: int, frame: FrameType | None) -> None:
-    """Asked to stop by a batch system or a terminal that closes, a command of the model ends as when it is interrupted.
+def hear_ends() -> None:
+    """From now on SIGINT, SIGTERM and SIGHUP end this process in order: what is temporary is deleted, workers end.
 
-    Others resume by what they have written, and end at once.
-
-    Raises:
-        Ended: always.
+    They are those of Ctrl-C, of a batch system or `timeout`, and of a terminal that closes. What the process ignores
+    from its beginning, as nohup has it ignore SIGHUP, stays ignored.
     """
-    for each in (signal.SIGTERM, signal.SIGHUP):  # `timeout` sends it to the process and to its group
-        signal.signal(each, signal.SIG_IGN)
-    raise Ended(number)
+    ends = _Ends()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, ends.hear)
+
+
+class _Ends:
+    """Raises `Ended` on a signal, once a module that is being imported is there.
+
+    In the middle of an import, torch aborts the process on any exception, and trimesh takes it for a library that is
+    missing and goes on without.
+    """
+
+    def __init__(self) -> None:
+        self.last = float("-inf")  # time of the last that was raised
+        self.waiting = False  # whether one waits for the end of an import
+        self.waits = 0  # since the last that was raised
+
+    def hear(self, number: int, frame: FrameType | None) -> None:
+        """The handler.
+
+        Raises:
+            Ended: no module is being imported, and the signal is none that comes again by another way.
+        """
+        if importing(frame) and self.waits < MOST_WAITS:
+            if not self.waiting:
+                self.waiting, self.waits = True, self.waits + 1
+                _thread.start_new_thread(self.again, (number,))  # takes none of the locks that `threading` may hold
+        elif number == signal.SIGINT or time.monotonic() - self.last > PASSED_ON_S:
+            self.last, self.waits = time.monotonic(), 0
+            raise Ended(number)
+
+    def again(self, number: int) -> None:
+        """Sends the signal to the main thread a little later."""
+        time.sleep(WAIT_S)
+        self.waiting = False
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+def importing(frame: FrameType | None) -> bool:
+    """Whether a frame, or one that called it, imports a module."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def open_streams() -> None:

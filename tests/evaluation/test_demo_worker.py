@@ -3,12 +3,29 @@
 import os
 import threading
 import time
+from dataclasses import dataclass
+from pathlib import Path
 
 import demo_jobs
 import pytest
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.demo.worker import Worker
+
+
+@dataclass
+class Dying:
+    """An argument on whose way the process dies."""
+
+    worker: Worker
+
+    def __reduce__(self) -> tuple[type[int], tuple[int]]:
+        process = self.worker._process
+        assert process is not None
+        process.kill()
+        process.join()
+        return int, (2,)
+
 
 pytestmark = pytest.mark.slow
 
@@ -24,16 +41,17 @@ def test_jobs_run_in_another_process_and_errors_come_back() -> None:
         assert worker.run(demo_jobs.add, 1) == 41, "a refusal costs nothing"
 
 
-def test_a_job_that_takes_too_long_is_stopped_and_the_next_one_runs() -> None:
+def test_a_job_that_takes_too_long_is_stopped_and_the_next_one_runs(tmp_path: Path) -> None:
     with Worker(demo_jobs.start, seconds=1.5) as worker:
         before = worker.run(demo_jobs.process)
         assert worker.run(demo_jobs.sleep, 0.1) == 40, "the twin: in time"
         begun = time.monotonic()
         with pytest.raises(UnirenderError, match=r"expected at most 1\.5 s"):
-            worker.run(demo_jobs.sleep, 600)
+            worker.run(demo_jobs.sleep_over_a_file, str(tmp_path / "where"))
         assert time.monotonic() - begun < 60
         with pytest.raises(ProcessLookupError):
             os.kill(before, 0)
+        assert not Path((tmp_path / "where").read_text()).exists(), "what a visitor handed in goes with the process"
         assert worker.run(demo_jobs.process) != before
 
 
@@ -48,6 +66,9 @@ def test_a_process_that_dies_costs_its_job_alone() -> None:
     with Worker(demo_jobs.start, seconds=60) as worker:
         with pytest.raises(UnirenderError, match="died"):
             worker.run(demo_jobs.die)
+        worker.run(demo_jobs.add, 2)
+        with pytest.raises(UnirenderError, match="died"):
+            worker.run(demo_jobs.add, Dying(worker))
         assert worker.run(demo_jobs.add, 2) == 42
 
 

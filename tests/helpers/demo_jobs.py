@@ -1,7 +1,9 @@
 """Jobs for a worker process of the demo, which imports them by name."""
 
 import os
+import tempfile
 import time
+from pathlib import Path
 
 from unirender.errors import UnirenderError
 from unirender.pipelines.remembered import remembered
@@ -33,6 +35,14 @@ def fail(context: int) -> float:
 def sleep(context: int, seconds: float) -> int:
     time.sleep(seconds)
     return context
+
+
+def sleep_over_a_file(context: int, path: str) -> None:
+    """Says where its temporary folder is, and takes its time."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "picture.png").touch()
+        Path(path).write_text(folder)
+        time.sleep(600)
 
 
 def die(context: int) -> None:

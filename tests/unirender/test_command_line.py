@@ -1,12 +1,14 @@
 """What the command line says of a line that is wrong, and of Ctrl-C."""
 
 import errno
+import importlib
 import io
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import diffusers
@@ -14,8 +16,8 @@ import numpy as np
 import pytest
 from optimizer_runs import rendered_views, truth
 
-from unirender import cli
-from unirender.command_line import causes, interrupted
+from unirender import cli, process_ends
+from unirender.command_line import Ended, causes, interrupted
 from unirender.files import write_png
 from unirender.process_ends import open_streams
 from unirender.system_errors import refused_by_system
@@ -224,21 +226,98 @@ main()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_command_that_is_told_to_end_takes_back_what_it_began(number: signal.Signals, tmp_path: Path) -> None:
+def test_a_command_that_is_told_to_end_takes_back_what_it_began(tmp_path: Path) -> None:
     write_png(tmp_path / "mug.png", np.full((16, 16, 3), 0.5, np.float32))
     command = [sys.executable, "-c", SLOW_TO_WRITE, "decompose", "mug.png", "--output", "out"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path, preexec_fn=heed_hang_up)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     try:
         while process.poll() is None and not list(tmp_path.glob(".out.*")):
             time.sleep(0.005)
-        process.send_signal(number)
+        process.send_signal(signal.SIGTERM)
         _, text = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == 128 + number
+    assert process.returncode == 128 + signal.SIGTERM
     assert text.endswith("unirender: interrupted\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mug.png"]
+
+
+# as `python -m unirender`, but that any command works for a minute, with a temporary folder
+AT_WORK = """
+import tempfile, time
+from unirender import cli
+
+def run(command):
+    with tempfile.TemporaryDirectory() as folder:
+        print(folder, flush=True)
+        time.sleep(60)
+
+cli.run = run
+cli.main()
+"""
+
+
+def test_every_command_hears_who_tells_it_to_end() -> None:
+    """A terminal that closes tells it; batch systems do it by SIGTERM."""
+    command = [sys.executable, "-c", AT_WORK, "lights"]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_hang_up
+    )
+    assert process.stdout is not None
+    folder = Path(process.stdout.readline().strip())
+    assert folder.is_dir(), "it is at work"
+    process.send_signal(signal.SIGHUP)
+    _, text = process.communicate(timeout=60)
+    assert (process.returncode, text) == (128 + signal.SIGHUP, "unirender: interrupted\n")
+    assert not folder.exists()
+
+
+@pytest.fixture
+def as_before() -> Iterator[None]:
+    """What the process does on a signal is afterwards as before."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in numbers}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("as_before")
+def test_who_is_told_to_end_again_ends_if_it_has_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    process_ends.hear_ends()
+    with pytest.raises(Ended) as ended:
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert ended.value.args == (signal.SIGTERM,)
+    os.kill(os.getpid(), signal.SIGTERM)  # to the group: `timeout` does both
+    monkeypatch.setattr(process_ends, "PASSED_ON_S", 0.0)
+    with pytest.raises(Ended):
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN, "as nohup has it"
+
+
+@pytest.mark.usefixtures("as_before")
+def test_an_import_is_not_interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch would abort the process, and trimesh would do without the library."""
+    (tmp_path / "takes_the_interrupt.py").write_text(
+        "import os, signal\n"
+        "try:\n    os.kill(os.getpid(), signal.SIGINT)\n    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    swallowed = False\nexcept BaseException:\n    swallowed = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    process_ends.hear_ends()
+    with pytest.raises(Ended) as ended:
+        import_and_wait("takes_the_interrupt")
+    assert ended.value.args == (signal.SIGINT,)
+    assert not sys.modules.pop("takes_the_interrupt").swallowed
+    monkeypatch.setattr(process_ends, "MOST_WAITS", 0)
+    importlib.import_module("takes_the_interrupt")
+    assert sys.modules.pop("takes_the_interrupt").swallowed, "the twin: nobody waits for ever"
+
+
+def import_and_wait(name: str) -> None:
+    importlib.import_module(name)
+    time.sleep(30)
 
 
 @pytest.mark.slow

@@ -3,6 +3,9 @@
 Mitsuba judges both in tests/physics.
 """
 
+import tracemalloc
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -145,6 +148,28 @@ def test_split_sum_uses_the_true_view_rays() -> None:
     assert image[0] < image[-1] - 0.005  # the plane turns to the right: the left column's view ray is closer to n
     narrow = split_sum_image(wide.replace(camera=Camera(fov_deg=0.01)))[2, :, 0]
     np.testing.assert_allclose(narrow, narrow[0], rtol=0, atol=1e-5)
+
+
+def test_split_sum_of_a_large_picture_is_that_of_its_pixels_in_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    maps: dict[str, Any] = {name: rng.random((300, 400, 3), np.float32) for name in ("albedo", "diffuse", "specular")}
+    maps |= {name: rng.random((300, 400, 1), np.float32) for name in ("roughness", "metallic", "mask")}
+    normal = np.broadcast_to(np.array([0.6, 0, 0.8], np.float32), (300, 400, 3))
+    maps["mask"] = np.where(maps["mask"] < 0.3, 0, maps["mask"])
+    large = Intrinsics(normal=normal, **maps)
+    whole, needed = split_sum_image(large), peak_memory(large)
+    monkeypatch.setattr("unirender.composite.BLOCK", 2**12)
+    np.testing.assert_array_equal(split_sum_image(large), whole)
+    assert peak_memory(large) < 0.5 * needed
+
+
+def peak_memory(intrinsics: Intrinsics) -> int:
+    """Bytes that the split sum takes."""
+    tracemalloc.start()
+    split_sum_image(intrinsics)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak
 
 
 def test_split_sum_says_what_is_missing() -> None:

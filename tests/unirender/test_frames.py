@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from unirender.folders import (
     decompose_folder,
     figures_of,
     list_pictures,
-    mask_of,
+    mask_finder,
     write_summary,
 )
 from unirender.frames import Frame, temporal_difference
@@ -83,7 +84,7 @@ def test_a_cameras_files_are_listed_as_failed(tmp_path: Path) -> None:
     for name in ("a.DNG", "b.cr2", "c.heic", "thumbnail.NEF"):
         (tmp_path / name).write_bytes((tmp_path / "thumbnail.tiff").read_bytes() if name != "c.heic" else b"ftypheic")
     found = list_pictures(tmp_path)  # but those of which there is a picture: cameras write both
-    assert mask_of(Path("elsewhere/thumbnail.png"), tmp_path) == tmp_path / "thumbnail.tiff"
+    assert mask_finder(tmp_path)(Path("elsewhere/thumbnail.png")) == tmp_path / "thumbnail.tiff"
     failed = run(found, tmp_path / "out").failed
     assert set(failed) == {"a.DNG", "b.cr2", "c.heic"}
     assert all("a camera's raw file, expected PNG" in failed[name] for name in ("a.DNG", "b.cr2"))
@@ -206,15 +207,30 @@ def test_masks_of_a_folder(tmp_path: Path) -> None:
     values[:, :5] = 255
     mask = tmp_path / "masks" / "a.bmp"
     Image.fromarray(values).save(mask)
-    assert mask_of(pictures[0], tmp_path / "masks") == mask
-    assert mask_of(pictures[0], mask) == mask
+    assert mask_finder(tmp_path / "masks")(pictures[0]) == mask
+    assert mask_finder(mask)(pictures[0]) == mask
     found = run(pictures, tmp_path / "out", masks=tmp_path / "masks")
     assert list(found.figures) == ["a.png"]
     assert "has 0 masks for b.png" in found.failed["b.png"]
     assert np.asarray(Image.open(tmp_path / "out" / "a.png" / "mask.png")).mean() == pytest.approx(255 * 5 / 12)
     Image.fromarray(255 - values).save(tmp_path / "masks" / "a.png")
     with pytest.raises(UnirenderError, match=r"has 2 masks for a\.png"):
-        mask_of(pictures[0], tmp_path / "masks")
+        mask_finder(tmp_path / "masks")(pictures[0])
+
+
+def test_a_folder_of_masks_is_listed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else 10,000 pictures with 10,000 masks take minutes to look up."""
+    (tmp_path / "masks").mkdir()
+    pictures = [save(tmp_path / name) for name in ("a.png", "b.png")]
+    listed, real = [], Path.iterdir
+
+    def counted(folder: Path) -> Iterator[Path]:
+        listed.append(folder)
+        return real(folder)
+
+    monkeypatch.setattr(Path, "iterdir", counted)
+    assert len(run(pictures, tmp_path / "out", masks=tmp_path / "masks").failed) == 2
+    assert listed.count(tmp_path / "masks") == 1
 
 
 def test_batches_are_bounded() -> None:

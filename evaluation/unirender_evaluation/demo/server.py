@@ -6,7 +6,6 @@ by a Content-Security-Policy not to fetch anything from elsewhere, whatever else
 
 import os
 import re
-import signal
 import tempfile
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping, MutableMapping
@@ -46,7 +45,6 @@ def serve(worker: Worker, limits: Limits, host: str, port: int) -> None:
     Raises:
         UnirenderError: the address is not to be had.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # an end like Ctrl-C's: what is temporary is deleted
     with served(worker, limits, host, port) as address:
         print(f"unirender demo: {address} (Ctrl-C ends it)", flush=True)
         threading.Event().wait()

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from types import FrameType
 
 from unirender.command_line import Ended
+from unirender.process_ends import PASSED_ON_S
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-PASSED_ON_S = 2.0  # seconds in which a SIGTERM may come again by another way
 
 
 @dataclass
