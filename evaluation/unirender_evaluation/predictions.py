@@ -31,7 +31,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, on_pole_grid, read_exr
+from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, read_exr
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.conventions import FILE, Conventions, read_conventions
 from unirender_evaluation.methods import Image, Mask
@@ -159,20 +159,14 @@ class PredictionFolder:
     def read_light(self, path: Path) -> Float[np.ndarray, "eh ew 3"]:
         """A light on the contract's grid: a map that unirender wrote as it is, another one's pixels taken as areas.
 
-        Coarse ones are brought to the 64 x 128 texels of the suites' lights: on a grid of their own rows, which lie
-        elsewhere, a lamp would be smeared over the texels beside it.
-
         Raises:
             UnirenderError: the file is broken, black, more negative than ringing is, not finite, beyond `BRIGHTEST` or
                 not twice as wide as high.
         """
         from unirender_reference.lights import load_light
-        from unirender_reference.lights.light import SHAPE
 
         with _named(path):
             light = load_light(path, photograph=False, normalise=False).environment
-            if len(light) < SHAPE[0] and (path.suffix != ".exr" or not on_pole_grid(read_exr(path)[1])):
-                light = load_light(path, photograph=False, normalise=False, shape=SHAPE).environment
             _check_brightness("the light", light)
         return light
 

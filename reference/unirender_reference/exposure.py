@@ -70,8 +70,8 @@ def scene_exposure(
         except LightFault as error:
             raise ObjectFault("stays black even under a light from everywhere; are its normals broken?") from error
         raise LightFault(
-            f"{name} does not reach {renderer.obj.name}, which stays black from the camera, expected light on its "
-            "visible side; turn the light, or give another"
+            f"{name} does not reach {renderer.obj.name}, of which it lights no more than {100 - gauge.PERCENTILE:g}% "
+            "before the camera, expected light on its visible side; turn the light, or give another"
         ) from fault
 
 

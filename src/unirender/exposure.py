@@ -36,16 +36,19 @@ def exposure_factor(
         target: radiance that a white surface has afterwards at the percentile, as drawn by `draw_target`.
 
     Raises:
-        UnirenderError: the mask is empty, or the object receives no light.
+        UnirenderError: the mask is empty, or no more of the object than above the percentile receives light.
     """
     inside = mask.reshape(diffuse.shape[:2]) > MASK_THRESHOLD
     if not inside.any():
         raise UnirenderError(
             f"exposure: no pixel has coverage above {MASK_THRESHOLD}, expected an object in view; check camera and mask"
         )
-    level = float(np.percentile(luminance(diffuse[inside]), PERCENTILE))
+    received = luminance(diffuse[inside])
+    level = float(np.percentile(received, PERCENTILE))
     if not np.isfinite(level) or level <= 0:
         raise UnirenderError(
-            f"exposure: the white-diffuse level is {level}, expected light on the object; check the light"
+            f"exposure: the white-diffuse level is {level}, expected light on more than {100 - PERCENTILE:g}% of the "
+            f"object, got it on {100 * (received > 0).mean():.2g}%; turn the light, or choose the exposure yourself "
+            "(relight: --exposure 0, in Python exposure='keep')"
         )
     return target / level

@@ -151,7 +151,7 @@ def test_a_picture_is_refused_with_a_sentence_that_names_no_folder(case: str) ->
 
 
 def test_a_light_is_read_and_brought_to_a_size_and_a_bad_one_refused() -> None:
-    assert read_light(Upload("a.exr", radiance(2.0)), LIMITS).shape == (8, 16, 3)
+    assert read_light(Upload("a.exr", radiance(2.0, (65, 130))), LIMITS).shape == (65, 130, 3)
     large = Upload("a.exr", radiance(2.0, (300, 600)))
     assert read_light(large, LIMITS).shape == (*LIGHT_SHAPE, 3)
     for bad, expected in ((NAN, "NaN"), (radiance(0.0), "a.exr")):

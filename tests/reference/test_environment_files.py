@@ -63,8 +63,7 @@ def test_any_other_map_is_taken_as_areas(tmp_path: Path) -> None:
     environment = peaked_environment()
     write_exr(tmp_path / "map.exr", image_channels(environment), half=False, attributes={"author": "someone"})
     read = read_light(tmp_path / "map.exr")
-    np.testing.assert_array_equal(read, area_resampled(environment, (16, 32)))
-    assert read.max() < 0.6 * environment.max()
+    np.testing.assert_array_equal(read, area_resampled(environment, (64, 128)))
     normal = np.zeros((4, 4, 3), np.float32)
     normal[..., 2] = 1
     for buffer in (

@@ -69,3 +69,12 @@ def test_an_empty_mask_and_a_black_light_are_refused(diffuse: np.ndarray, mask: 
         exposure_factor(diffuse, np.zeros_like(mask), 0.7)
     with pytest.raises(UnirenderError, match="light"):
         exposure_factor(np.zeros_like(diffuse), mask, 0.7)
+
+
+def test_a_light_on_the_rim_alone_is_said_to_be_there() -> None:
+    """It was said that there is none."""
+    diffuse = np.zeros((10, 10, 3), np.float32)
+    diffuse[:, 0] = 0.5
+    diffuse[:5, 0] = 0
+    with pytest.raises(UnirenderError, match=r"on more than 10% of the object, got it on 5%; .*--exposure 0"):
+        exposure_factor(diffuse, np.ones((10, 10, 1), np.float32), 0.7)

@@ -29,11 +29,11 @@ from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, read_exr
-from unirender.lighting import LEAST_ROWS, check_shape, resample_environment
+from unirender.lighting import check_shape, resample_environment
 from unirender.pictures import check_finite, negative_share
 from unirender.primaries import REC709, in_rec709
 from unirender_reference.backend import mitsuba
-from unirender_reference.lights.light import Light, area_resampled, mean_luminance
+from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 KNEE, PEAK, FLOOR = 0.8, 16.0, 0.5
@@ -104,7 +104,7 @@ def load_light(
             provenance["rule"] = "lat-long on the contract's grid"
             environment = pixels if shape in (None, (h, w)) else resample_environment(pixels, shape)
         else:
-            environment = area_resampled(pixels, shape or (max(h, LEAST_ROWS), w))
+            environment = area_resampled(pixels, shape or (SHAPE if h < SHAPE[0] else (h, w)))
     if negative := negative_share(environment, f"light {path}"):
         provenance["negative_share"] = f"{negative:.2e}"
     environment = np.maximum(environment, 0)
