@@ -4,10 +4,14 @@ import contextlib
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from unirender.errors import UnirenderError
+
+HALF_MADE = ".*.????????"  # folders of `tempfile`
+FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one: it takes minutes
 
 
 def cache_dir() -> Path:
@@ -18,7 +22,7 @@ def cache_dir() -> Path:
 @contextlib.contextmanager
 def cached_folder(folder: Path) -> Iterator[Path]:
     """A new folder of the cache, to be filled; it appears when it is complete. Where another process that makes the
-    same was faster, its own stays.
+    same was faster, its own stays. What killed processes left beside it half made goes after a day.
 
     Raises:
         UnirenderError: the cache cannot be written.
@@ -26,6 +30,7 @@ def cached_folder(folder: Path) -> Iterator[Path]:
     temporary = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+        _forget_half_made(folder.parent)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:16]}.", dir=folder.parent))
         yield temporary
         try:
@@ -40,3 +45,10 @@ def cached_folder(folder: Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _forget_half_made(parent: Path) -> None:
+    for path in parent.glob(HALF_MADE):
+        with contextlib.suppress(OSError):  # another process takes it away
+            if time.time() - path.stat().st_mtime > FORGOTTEN_S:
+                shutil.rmtree(path, ignore_errors=True)

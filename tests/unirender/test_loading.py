@@ -1,5 +1,6 @@
 """A pipeline folder is read whole, or refused in one sentence: damage of each kind that a copy or an edit can do."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -9,10 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from safetensors.numpy import load_file, save_file
-from tiny_models import make_pipeline
+from tiny_models import MODEL, make_pipeline
+from tiny_stable_diffusion import tiny_vae
 
+from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
+from unirender.models.build import build_model
 from unirender.pipelines.loading import reading
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
@@ -84,6 +89,21 @@ def test_a_pipeline_keeps_its_weights_when_the_files_are_written_anew(folder: Pa
         written.write(bytes(file.stat().st_size))
     for name, value in pipeline.dual_stream.state_dict().items():
         assert torch.equal(value, before[name]), name
+
+
+def test_what_is_saved_again_is_the_same_wherever_it_lay(folder: Path, tmp_path: Path) -> None:
+    tiny_vae().save_pretrained(tmp_path / "vae")
+    vae = AutoencoderKL.from_pretrained(tmp_path / "vae")  # as that of a Stable Diffusion folder
+    model, _ = build_model(dataclasses.replace(MODEL, codec="kl", patch=4, physics_prior="none"), vae)
+    UniRenderPipeline(model, make_scheduler(), vae).save_pretrained(tmp_path / "kl")
+    for first in (folder, tmp_path / "kl"):
+        again = tmp_path / "again" / first.name
+        UniRenderPipeline.from_pretrained(first).save_pretrained(again)
+        files = {path.relative_to(first) for path in first.rglob("*") if path.is_file()}
+        assert files == {path.relative_to(again) for path in again.rglob("*") if path.is_file()}
+        for name in files:
+            assert (again / name).read_bytes() == (first / name).read_bytes(), name
+            assert b"_name_or_path" not in (first / name).read_bytes(), name
 
 
 def test_weights_in_another_format_are_not_missing(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """Folders of the cache."""
 
+import os
+import time
 from pathlib import Path
 
 import pytest
@@ -27,3 +29,16 @@ def test_a_folder_of_the_cache_is_whole_or_not_there(tmp_path: Path) -> None:
     message = r"cannot be written \(.*\); free some space or set UNIRENDER_CACHE"
     with pytest.raises(UnirenderError, match=message), cached_folder(tmp_path / "file" / "key"):
         pass
+
+
+def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
+    with cached_folder(tmp_path / "key") as made:
+        old, new = (made.with_name(f".key.abcdefg{number}") for number in (1, 2))
+        for folder, days in ((old, 2), (new, 0), (tmp_path / "other", 2)):
+            folder.mkdir()
+            (folder / "pixels.npy").touch()
+            made_at = time.time() - days * 86400
+            os.utime(folder, (made_at, made_at))
+    with cached_folder(tmp_path / "next"):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {"key", "next", "other", new.name}

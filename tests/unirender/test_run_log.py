@@ -24,6 +24,14 @@ def test_a_broken_line_is_dropped_and_no_other(tmp_path: Path, broken: str | byt
     assert log.path.read_text() == "".join(LINES[:2])
 
 
+def test_what_holds_from_the_state_on_is_told_anew(tmp_path: Path) -> None:
+    """Other data or parts than the state's come again, with their line."""
+    log, before = RunLog(tmp_path, ALONE), LINES[0] + '{"step": 1, "data": "1 -> 2"}\n' + LINES[1]
+    log.path.write_text(before + '{"step": 2, "data": "2 -> 3"}\n{"step": 2, "parts": "1 -> 2"}\n')
+    log.forget_after(2)
+    assert log.path.read_text() == before
+
+
 def test_a_run_without_a_log_has_no_lines(tmp_path: Path) -> None:
     RunLog(tmp_path, ALONE).forget_after(-1)
     assert read_lines(tmp_path / "log.jsonl") == []

@@ -47,6 +47,7 @@ from unirender.training.live import live_report, standing
 from unirender.training.presets import PRESETS, get_preset
 from unirender.training.reader import BatchReader
 from unirender.training.run import train
+from unirender.training.run_log import read_lines
 from unirender.training.source import ShardSource
 from unirender.training.start import begin_with_network, read_start
 from unirender.training.trainer import Trainer, learning_rate
@@ -300,11 +301,11 @@ def fit(
 
 
 def test_validation_sees_the_averaged_weights(tmp_path: Path) -> None:
-    validate, shown = scores_in_turn([3.0, 1.0, 2.0], higher_is_better=False)
+    validate, shown = scores_in_turn([3.0, 1.0], higher_is_better=False)
     trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=1, picture_minutes=0.0), CPU, torch.float32)
     lines: list[dict[str, Any]] = []
     trainer.fit(SyntheticSource(), lines.append, validate)
-    assert [line["validation"]["error"] for line in lines if "validation" in line] == [3.0, 1.0, 2.0]
+    assert [line["validation"]["error"] for line in lines if "validation" in line] == [3.0, 1.0]
     weight = shown[-1].dual_stream.image_unet.conv_in.weight
     assert torch.equal(weight, trainer.ema.average["image_unet.conv_in.weight"])
     assert not torch.equal(weight, trainer.model.image_unet.conv_in.weight)  # the twin: not the trained ones
@@ -317,13 +318,13 @@ def test_validation_sees_the_averaged_weights(tmp_path: Path) -> None:
 def test_the_best_pipeline_is_kept_by_the_scores_own_direction(
     tmp_path: Path, higher_is_better: bool, step: int
 ) -> None:
-    validate, _ = scores_in_turn([2.0, 1.0, 3.0, 2.5], higher_is_better)  # at steps 0, 1, 2, and at the end
+    validate, _ = scores_in_turn([2.0, 1.0, 3.0], higher_is_better)  # at steps 0, 1, 2
     fit(tmp_path, 2, validate, keep_best="error")
     best = json.loads((tmp_path / "best" / "validation.json").read_text())
     assert best["step"] == step
     assert json.loads((tmp_path / "best" / "training.json").read_text())["steps"] == step
-    resumed, _ = scores_in_turn([2.9, float("nan"), 1.5], higher_is_better)  # neither better, whichever way
-    fit(tmp_path, 3, resumed, keep_best="error")
+    resumed, _ = scores_in_turn([2.9, float("nan")], higher_is_better)  # neither better, whichever way
+    fit(tmp_path, 4, resumed, keep_best="error")
     assert json.loads((tmp_path / "best" / "validation.json").read_text()) == best
     assert UniRenderPipeline.from_pretrained(tmp_path / "best").size == 32
     assert not (tmp_path / "best.partial").exists()
@@ -364,6 +365,37 @@ def test_the_best_on_other_scenes_is_not_compared(tmp_path: Path) -> None:
         Validation(validate, "error").begin(trainer(same))
     with pytest.raises(UnirenderError, match=r"best on 4 .* expected 8 .*: scores on other scenes cannot be compared"):
         trainer("8 scenes of the suite tiny").fit(SyntheticSource(), validate=validate)
+
+
+def test_a_kill_at_the_end_costs_no_picture_and_no_score(tmp_path: Path) -> None:
+    """After the last save come the last picture, its scores, `best/` and a line about them."""
+    scores = {"error": Score(1.0, True)}
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    fit(whole, 2, lambda pipeline: scores, keep_best="error")
+    shutil.copytree(whole, killed)
+    *kept, last = (killed / "log.jsonl").read_text().splitlines(keepends=True)
+    assert '"validation"' in last
+    (killed / "log.jsonl").write_text("".join(kept))
+    (killed / "pictures" / "step_000002.png").unlink()
+    (killed / "pictures" / ".step_000002.png.part").touch()
+    (killed / "best").rename(killed / "best.old")
+    (killed / "best.partial").mkdir()
+    for _ in range(2):  # again, when all is there
+        fit(killed, 2, lambda pipeline: scores, keep_best="error")
+        files = [{path.relative_to(run) for path in run.rglob("*")} for run in (killed, whole)]
+        assert files[0] == files[1]
+        assert scored(killed) == scored(whole) == [(0, True), (1, False), (2, False)]
+        picture = Path("pictures", "step_000002.png")
+        assert (killed / picture).read_bytes() == (whole / picture).read_bytes()
+    (killed / "log.jsonl").unlink()
+    (killed / STATE_FILE).unlink()
+    fit(killed, 1, lambda pipeline: scores, keep_best="error")
+    assert scored(killed)[0] == (0, True)  # killed between `best/` and its line, it is the best all the same
+
+
+def scored(folder: Path) -> list[tuple[int, bool]]:
+    """The steps that a log has scores of, and whether these were the best."""
+    return [(line["step"], line["best"]) for line in read_lines(folder / "log.jsonl") if "validation" in line]
 
 
 def test_a_run_that_is_over_is_scored_once(tmp_path: Path) -> None:
@@ -556,6 +588,8 @@ def test_growing_folder(tmp_path: Path) -> None:
     old = resumed.next()
     assert resumed.state_dict()["shards"] == state["shards"]
     assert not torch.equal(grown["image"], old["image"])
+    with pytest.raises(UnirenderError, match=r"2 of the 3 shards .* \(first: shard-000001\.tar\), .*; pass the run's"):
+        ShardSource(write_dataset(tmp_path / "other", shards=1), 2, 0).load_state_dict(source.state_dict())
     source.close()
     resumed.close()
 

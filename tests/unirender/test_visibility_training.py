@@ -7,6 +7,7 @@ import logging
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.training import checkpoint
 from unirender.training.checkpoint import load_state
 from unirender.training.stopping import SIGNALS
 from unirender.training.visibility import TrainVisibility, rate, split, train_visibility
@@ -163,7 +165,13 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     whole = train_visibility(TrainVisibility(folder, tmp_path / "whole", **options))
     from unirender.training import visibility
 
-    calls = []
+    calls, write = [], checkpoint.save_state
+
+    def killed_at_the_end(folder: Path, state: dict[str, Any]) -> Path:
+        path = write(folder, state)
+        if state["step"] == options["steps"]:
+            raise KeyboardInterrupt
+        return path
 
     def asked_after_two(*arguments: object) -> float:
         calls.append(1)
@@ -176,13 +184,17 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
     with pytest.raises(KeyboardInterrupt):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
     monkeypatch.setattr(visibility, "rate", rate)
+    monkeypatch.setattr(checkpoint, "save_state", killed_at_the_end)
+    with pytest.raises(KeyboardInterrupt):
+        train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
     stopped = train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options))
     assert stopped.read_bytes() == whole.read_bytes()
+    assert {path.name for path in stopped.parent.iterdir()} == {path.name for path in whole.parent.iterdir()}
     steps = [json.loads(line)["step"] for line in (tmp_path / "stopped" / "log.jsonl").read_text().splitlines()]
     assert steps == [0, 1, 2, 3, 4]
     stopped.unlink()  # as if the disk had been full after the last state
     assert train_visibility(TrainVisibility(folder, tmp_path / "stopped", **options)).read_bytes() == whole.read_bytes()
-    with pytest.raises(UnirenderError, match="other batch_size; repeat the options"):
+    with pytest.raises(UnirenderError, match="a run with batch_size 2 instead of 3; repeat the options"):
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
 

@@ -1,6 +1,7 @@
 """A dual-stream model as a diffusers pipeline: its components, how they are read, and the network that a call asks for.
 
-`from_pretrained`, `save_pretrained`, `to`, `torch_dtype` and progress bars are those that users of diffusers know.
+`from_pretrained`, `save_pretrained`, `to`, `torch_dtype` and progress bars are those that users of diffusers know. What
+is saved does not say where the parts were read, so that it is the same wherever they lay.
 """
 
 import copy
@@ -22,7 +23,7 @@ from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
-from unirender.pipelines.loading import check_complete, copy_weights, find_pipeline, reading
+from unirender.pipelines.loading import check_complete, copy_weights, find_pipeline, forget_place, reading
 from unirender.pipelines.network import Network, Overflow
 
 P = TypeVar("P", bound="DualStreamPipeline")
@@ -53,6 +54,8 @@ class DualStreamPipeline(DiffusionPipeline):
         calibration: Lines | None = None,
     ) -> None:
         super().__init__()
+        for part in (dual_stream, vae):
+            forget_place(part)
         self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
         self.register_to_config(material=material, calibration=check_lines(calibration))
         self.dual_stream: DualStreamModel
@@ -79,6 +82,7 @@ class DualStreamPipeline(DiffusionPipeline):
             pipeline = super().from_pretrained(str(path), **kwargs)
             if "dual_stream" not in kwargs:
                 check_complete(pipeline.dual_stream, path / "dual_stream")
+        forget_place(pipeline)
         for name, part in pipeline.components.items():
             if isinstance(part, torch.nn.Module) and name not in kwargs:
                 copy_weights(part)

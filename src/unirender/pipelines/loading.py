@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import torch
+from diffusers.configuration_utils import ConfigMixin, FrozenDict
 from safetensors import SafetensorError, safe_open
 
 from unirender.errors import UnirenderError
@@ -14,6 +15,7 @@ from unirender.shipped import checkpoint_folder, shipped_names
 from unirender.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
+PLACE = "_name_or_path"  # in the configuration of what diffusers has read
 OF_FILES = (OSError, SafetensorError)
 
 
@@ -89,6 +91,13 @@ def copy_weights(model: torch.nn.Module) -> None:
     """
     for tensor in (*model.parameters(), *model.buffers()):
         tensor.data = tensor.data.clone()
+
+
+def forget_place(part: ConfigMixin | None) -> None:
+    """Takes from a part's configuration the folder that it was read from, which diffusers would save with it."""
+    if part is not None:
+        kept = {name: value for name, value in part.config.items() if name != PLACE}
+        part._internal_dict = FrozenDict(kept)  # pyright: ignore[reportAttributeAccessIssue] - diffusers has no other way
 
 
 def _check_index(file: Path) -> None:

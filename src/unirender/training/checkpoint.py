@@ -10,11 +10,13 @@ from typing import Any
 import torch
 
 from unirender.errors import UnirenderError
+from unirender.training.card import OF_A_RUN
 from unirender.training.config import TrainConfig
 from unirender.whole_files import whole_file
 from unirender.writing import writing
 
 STATE_FILE = "state.pt"
+PICTURES = "pictures"
 PROLONGABLE = "steps"  # a resumed run may be given another length
 
 
@@ -131,6 +133,20 @@ def restore_folder(folder: Path) -> None:
         shutil.rmtree(old)
     else:
         old.rename(folder)
+
+
+def tidy(folder: Path) -> None:
+    """Takes from a run folder, which no other process writes to, what a killed run left there half written."""
+    for name in OF_A_RUN:
+        restore_folder(folder / name)
+        shutil.rmtree(partial_folder(folder / name), ignore_errors=True)
+    for file in folder.glob(f"{PICTURES}/.*.part"):
+        file.unlink()
+
+
+def partial_folder(folder: Path) -> Path:
+    """Where a folder is written before it is moved into place."""
+    return folder.with_name(f"{folder.name}.partial")
 
 
 def _aside(folder: Path) -> Path:

@@ -80,8 +80,8 @@ class GroupDataset:
             missing = sorted(set(shards) - set(names.values()))
             if missing:
                 raise UnirenderError(
-                    f"{folder}: shards {', '.join(missing)} are missing, expected all of {', '.join(shards)}; put "
-                    "them back"
+                    f"{folder}: {len(missing)} of the {len(shards)} shards that a run was trained on are missing "
+                    f"(first: {missing[0]}), expected all; pass the run's folder, or another --out to start anew"
                 )
             available = {path: sha256 for path, sha256 in available.items() if names[path] in shards}
         self._paths = tuple(available)

@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.card import CARD_FILE, card_text
-from unirender.training.checkpoint import replace_folder
+from unirender.training.checkpoint import partial_folder, replace_folder
 from unirender.training.device_data import DeviceSource
 from unirender.training.facts import training_facts
 from unirender.training.source import BatchSource, ShardSource
@@ -84,7 +84,7 @@ def export_pipeline(
     Raises:
         UnirenderError: it cannot be written; what was there stays.
     """
-    partial = folder.with_name(f"{folder.name}.partial")
+    partial = partial_folder(folder)
     shutil.rmtree(partial, ignore_errors=True)
     pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
     facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}

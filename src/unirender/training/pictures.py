@@ -13,6 +13,7 @@ from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.training.losses import LossFunction
+from unirender.whole_files import whole_file
 from unirender.writing import writing
 
 SHEET_ROWS = 4  # samples of a sheet
@@ -36,11 +37,10 @@ def training_sheet(loss: LossFunction, batch: Maps) -> UInt8[np.ndarray, "h w 3"
 
 def save_sheet(path: Path, sheet: UInt8[np.ndarray, "h w 3"]) -> None:
     """Writes a PNG; it appears complete."""
-    partial = path.with_suffix(".partial.png")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(sheet).save(partial)  # which takes back what it cannot end
-        partial.replace(path)
+        with whole_file(path) as file:
+            Image.fromarray(sheet).save(file, format="PNG")
 
 
 def _line(maps: Maps, row: int, mask: Float[Tensor, "1 H W"]) -> UInt8[np.ndarray, "H 7*W 3"]:

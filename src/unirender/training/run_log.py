@@ -12,10 +12,11 @@ from typing import Any
 
 from unirender.training.live import Report
 from unirender.training.processes import Processes
-from unirender.whole_files import replace_file
+from unirender.whole_files import whole_file
 from unirender.writing import writing
 
 LOG_FILE = "log.jsonl"
+NEWS = {"data", "parts"}  # entries of lines on what holds from their step on
 OVERFLOW = "above_x_max_"  # prefix of entries that are left out where they are zero
 
 
@@ -56,11 +57,12 @@ class RunLog:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Keeps the readable lines of a log up to a step, if there is one."""
-    if path.is_file():
-        kept = [line for line, values in _read(path) if values["step"] <= step]
-        with writing(path):
-            replace_file(path, "".join(kept))
+    """Keeps the readable lines of a log up to a step, if there is one; at it, without what holds only from there on."""
+    if not path.is_file():
+        return
+    kept = [line for line, values in _read(path) if values["step"] <= step - bool(NEWS & values.keys())]
+    with writing(path), whole_file(path) as file:
+        file.write("".join(kept).encode())
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:

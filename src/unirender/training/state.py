@@ -12,7 +12,7 @@ from unirender.training.checkpoint import differences, load_state, plain
 from unirender.training.live import Report
 from unirender.training.passes import laid_out_like
 from unirender.training.source import BatchSource
-from unirender.whole_files import replace_file
+from unirender.whole_files import whole_file
 from unirender.writing import writing
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def state_of(trainer: "Trainer", source: BatchSource) -> dict[str, Any]:
         "continues": trainer.continues,
         "begun_with": trainer.begun_with,
         "source": source.state_dict(),
+        "shown": trainer.shown,
     }
 
 
@@ -75,6 +76,7 @@ def resume(trainer: "Trainer", source: BatchSource, report: Report = lambda line
     trainer.generator.set_state(state["generator"])
     trainer.log.waiting.update(state.get("unlogged", {}))
     source.load_state_dict(state["source"])
+    trainer.shown = state.get("shown", {})
     trainer.log.forget_after(trainer.step)
     parts = state.get("parts", state.get("parallel", trainer.split.all_parts))  # older states: parallel, or nothing
     if parts != trainer.split.all_parts:
@@ -93,4 +95,6 @@ def write_config(trainer: "Trainer") -> None:
     text = json.dumps({"train": dataclasses.asdict(trainer.config), "run": run, "hardware": hardware}, indent=2)
     path = trainer.run.out / "config.json"
     with writing(path):
-        replace_file(path, text + "\n")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as file:
+            file.write((text + "\n").encode())

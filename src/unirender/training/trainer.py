@@ -26,7 +26,7 @@ from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
 from unirender.training.beginning import Beginning
-from unirender.training.checkpoint import STATE_FILE, save_state
+from unirender.training.checkpoint import PICTURES, STATE_FILE, save_state, tidy
 from unirender.training.config import OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.config_check import check_config
 from unirender.training.due import Due
@@ -97,6 +97,7 @@ class Trainer:
         self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
         self.begun_with: Beginning | None = {}  # None: a state of an earlier version, which does not say
         self.source: BatchSource | None = None  # of the batches, once it trains
+        self.shown: Maps = {}  # samples of the first batch: the same in every picture
 
     @property
     def progress(self) -> float:
@@ -164,6 +165,8 @@ class Trainer:
         """
         self.source, main = source, self.processes.is_main
         validation = Validation(validate, self.run.keep_best) if validate else None
+        if main:
+            tidy(self.run.out)
         if main and validation is not None:
             validation.begin(self)
         resumed = self.resume(source, report)
@@ -173,13 +176,12 @@ class Trainer:
         write_config(self)
         self._look(None, validation, report)
         due = Due(save=self.run.save_minutes, picture=self.run.picture_minutes, refresh=self.run.refresh_minutes)
-        shown: Maps = {}  # of the first batch: the same in every picture
         begun, logged = self.step, (self.step, self.seconds)
         with stopping_gently() as request:
             while self.progress < 1:
                 start = time.monotonic()  # pictures, validation and saves are no training
                 batch = source.next()
-                shown = shown or {name: value[:SHEET_ROWS].cpu() for name, value in batch.items()}
+                self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 seconds = self.seconds + time.monotonic() - start
                 self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
@@ -194,13 +196,13 @@ class Trainer:
                     raise Ended(stopping)
                 with request.unheard():
                     if main and due("picture"):
-                        self._look(shown, validation, report)
+                        self._look(self.shown, validation, report)
                     if refreshing:
                         self._refresh(source, report)
         if main:
             self.save(source)
-        if self.step > begun:  # else it has been looked at
-            self._look(shown, validation, report)
+        if self.step > begun or not self._picture_file.exists():  # which a kill after the last save has prevented
+            self._look(self.shown, validation, report)
 
     def _tell_losses(self, step: int, seconds: float, report: Report) -> None:
         """Logs the means of the losses, and the speed since a step and its seconds of training."""
@@ -209,12 +211,12 @@ class Trainer:
         self.log.tell(rates | self.log.means(), report)
 
     def _look(self, shown: Maps | None, validation: Validation | None, report: Report) -> None:
-        """Draws these samples, if there are any, and validates, if that is asked for; process 0 alone."""
+        """Draws these samples, if there are any, and validates, if that is asked for and not done; process 0 alone."""
         if not self.processes.is_main:
             return
         if shown:
             self.picture(shown)
-        if validation is not None:
+        if validation is not None and not validation.is_done(self):
             self.log.tell(validation.run(self), report)
 
     def _start_alike(self, source: BatchSource) -> None:
@@ -259,7 +261,12 @@ class Trainer:
         """Writes the picture of the averaged weights."""
         with self.averaged():
             sheet = training_sheet(self.loss, {name: value.to(self.device) for name, value in batch.items()})
-        save_sheet(self.run.out / "pictures" / f"step_{self.step:06d}.png", sheet)
+        save_sheet(self._picture_file, sheet)
+
+    @property
+    def _picture_file(self) -> Path:
+        """Of the picture at the present step."""
+        return self.run.out / PICTURES / f"step_{self.step:06d}.png"
 
     @contextlib.contextmanager
     def averaged(self) -> Iterator[None]:

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.training.checkpoint import differences, restore_folder
+from unirender.training.checkpoint import differences
 from unirender.training.export import SCORES_FILE, TRAINING_FILE, averaged_pipeline, export_pipeline
+from unirender.training.run_log import LOG_FILE, read_lines
 
 if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
@@ -68,6 +69,14 @@ class Validation:
                 "move the folder away"
             )
 
+    def is_done(self, trainer: "Trainer") -> bool:
+        """Whether the log has the scores of the weights as they are now, on the same scenes, and `best/` knows them."""
+        lines = read_lines(trainer.run.out / LOG_FILE)
+        line = next((line for line in reversed(lines) if "validation" in line), {})
+        here = line.get("step") == trainer.step and line.get("scored_on") == trainer.run.scored_on
+        best = trainer.run.out / BEST_FOLDER
+        return here and (self.keep_best is None or best_score(best, self.keep_best) is not None)
+
     def run(self, trainer: "Trainer") -> dict[str, Any]:
         """Scores the averaged weights, and keeps them if they are the best so far; returns a line for the log.
 
@@ -86,24 +95,19 @@ class Validation:
                 f"the best of {self.keep_best!r}: there is no such score, expected one of: {', '.join(scores)}"
             )
         folder = trainer.run.out / BEST_FOLDER
+        plain = {name: dataclasses.asdict(score) for name, score in scores.items()}
+        record = {"step": trainer.step, "chosen_by": self.keep_best, "scores": plain}
+        text = json.dumps(record, indent=2) + "\n"
         before = best_score(folder, self.keep_best)
-        better = before is None or scores[self.keep_best].better_than(before)
-        if better:
-            _replace_best(trainer, folder, scores, self.keep_best)
-        return line | {"best": better}
+        if before is None or scores[self.keep_best].better_than(before):
+            export_pipeline(trainer, folder, beside={SCORES_FILE: text})
+        return line | {"best": (folder / SCORES_FILE).read_text() == text}  # also if it was kept before a kill
 
 
 def best_score(folder: Path, name: str) -> Score | None:
     """The named score of the pipeline in `best/`; None where there is none."""
-    restore_folder(folder)
     path = folder / SCORES_FILE
     if not path.is_file():
         return None
     stored = json.loads(path.read_text())["scores"].get(name)
     return None if stored is None else Score(**stored)
-
-
-def _replace_best(trainer: "Trainer", folder: Path, scores: Mapping[str, Score], chosen_by: str) -> None:
-    values = {name: dataclasses.asdict(score) for name, score in scores.items()}
-    record = {"step": trainer.step, "chosen_by": chosen_by, "scores": values}
-    export_pipeline(trainer, folder, beside={SCORES_FILE: json.dumps(record, indent=2) + "\n"})

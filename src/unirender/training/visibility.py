@@ -102,7 +102,7 @@ def train_visibility(options: TrainVisibility) -> Path:
     items, shards = read_items(options.data, lambda done, total: print(f"looked at {done} of {total} shards"))
     run = _Run(options, *split(items), shards)
     if run.step == options.steps:
-        run.write_weights()  # it may have ended between its state and them
+        run.write_weights(run.averaged())  # it may have ended between its state and them
     saved = time.monotonic()
     with stopping_gently() as stop:
         while run.step < options.steps and not stop.asked:
@@ -156,16 +156,20 @@ class _Run:
         elif self.log.is_file():
             self.log.unlink()  # of a run that was killed before its first state
         if not self.step:
-            self._tell(validate(self.net, held_out, options.seed))  # before anything was learned
+            print(self._log(validate(self.net, held_out, options.seed)), flush=True)  # before anything was learned
 
     def _resume(self, state: Mapping[str, Any]) -> None:
         from unirender.training.run_log import forget_after
 
         before = state["options"]
         if differing := [name for name in self.asked if before.get(name) != self.asked[name]]:
+            held = (
+                "other data" if name == "data" else f"{name} {before.get(name)} instead of {self.asked[name]}"
+                for name in differing
+            )
             raise UnirenderError(
-                f"{self.options.out}: holds a run with other {', '.join(differing)}; repeat the options of that run, "
-                "or choose another --out"
+                f"{self.options.out}: holds a run with {', '.join(held)}; repeat the options of that run, or choose "
+                "another --out"
             )
         self.net.load_state_dict(state["net"])
         self.optimizer.load_state_dict(state["optimizer"])
@@ -199,39 +203,49 @@ class _Run:
         self.step += 1
 
     def keep(self) -> None:
-        """Saves the state and the averaged weights, and what they score."""
+        """Saves the state and the averaged weights, and what they score.
+
+        The line of the log comes first: of a run that is killed before the state it is dropped, and comes again.
+        """
         from unirender.training.checkpoint import save_state
         from unirender.training.visibility_loss import mean, validate
 
+        shown = self.averaged()
+        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
+        told = self._log(means | validate(shown, self.held_out, self.options.seed))
         parts = {"net": self.net, "optimizer": self.optimizer, "ema": self.ema}
         state = {name: part.state_dict() for name, part in parts.items()}
         save_state(self.options.out, {**state, "step": self.step, "options": self.asked})
-        shown = self.write_weights()
-        means = dict(zip(("bce", "log_error"), map(mean, zip(*self.losses, strict=True)), strict=True))
+        self.write_weights(shown)
         self.losses.clear()
-        self._tell(means | validate(shown, self.held_out, self.options.seed))
+        print(told, flush=True)
 
-    def write_weights(self) -> "VisibilityNet":
-        """Writes the averaged weights; a network that has them."""
-        from safetensors.torch import save
-
+    def averaged(self) -> "VisibilityNet":
+        """A network that has the averaged weights."""
         from unirender.models.visibility import VisibilityNet
-        from unirender.whole_files import replace_file
 
         shown = channels_last(VisibilityNet())
         self.ema.copy_to(shown)
-        halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
-        with writing(path := self.options.out / WEIGHTS_FILE):
-            replace_file(path, save(halves))
         return shown
 
-    def _tell(self, values: Mapping[str, float]) -> None:
+    def write_weights(self, shown: "VisibilityNet") -> None:
+        """Writes the weights of a network."""
+        from safetensors.torch import save
+
+        from unirender.whole_files import whole_file
+
+        halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
+        with writing(path := self.options.out / WEIGHTS_FILE), whole_file(path) as file:
+            file.write(save(halves))
+
+    def _log(self, values: Mapping[str, float]) -> str:
+        """Adds a line to the log; the same for people."""
         line = {"step": self.step, "objects": self.step * self.options.batch_size, **values}
         with writing(self.log):
             self.options.out.mkdir(parents=True, exist_ok=True)
             with self.log.open("a") as file:
                 file.write(json.dumps(line) + "\n")
-        print(" ".join(f"{key} {value:.4g}" for key, value in line.items()), flush=True)
+        return " ".join(f"{key} {value:.4g}" for key, value in line.items())
 
 
 def channels_last(net: "VisibilityNet") -> "VisibilityNet":
