@@ -211,9 +211,11 @@ def site_settings() -> ModuleType:
 
 
 def test_a_bar_over_a_formula_is_left_to_the_style_sheet() -> None:
-    writer = SimpleNamespace(body=[])
+    page, writer = nodes.section(), SimpleNamespace(body=[])
+    page += nodes.math("", r"\overline{w^2} + \overline{w}")
+    site_settings()._formulas(None, page)
     with pytest.raises(nodes.SkipNode):
-        site_settings()._mathml(writer, nodes.math("", r"\overline{w^2} + \overline{w}"))
+        site_settings()._mathml(writer, page[0])
     (markup,) = writer.body
     assert markup.count('<mrow class="overline">') == markup.count("</mrow>") == 2
     assert "mover" not in markup

@@ -278,7 +278,7 @@ def test_jobs_say_what_the_page_shows(pipeline: UniRenderPipeline, subject: Subj
     assert f"Roughness {opened.subject.decomposition.roughness:.2f}" in opened.maps
     assert jobs.show(context, subject, Controls()) != jobs.show(context, subject, Controls(metallic=1.0))
     assert jobs.pack(context, subject, Controls()).count("<a download") == 3
-    assert jobs.open_light(context, Upload("a.exr", radiance(2.0))).shape == (8, 16, 3)
+    assert jobs.open_light(context, Upload("a.exr", radiance(2.0))).shape == (64, 128, 3)
 
 
 def test_names_are_text_in_html() -> None:
