@@ -22,25 +22,26 @@ class OwnDefaults:
     def __init__(self) -> None:
         self._torch: Mapping[str, Any] = {}
         self._numpy: dict[str, Any] = {}
-        self._variant: str | None = None  # None: it has set none
+        self._variant: str | None = None  # None: Mitsuba had none
         self._folder: str | None = None  # None: that of all others
 
     @contextmanager
     def here(self) -> Iterator[None]:
         """For a block of the method's code: the defaults are its own, and afterwards as before.
 
-        But for Mitsuba's variant, which takes a third of a second to set: who renders next sets it.
+        But for Mitsuba's variant, which takes a third of a second to set: who renders next sets it. Whether a method
+        has set the one that was there already cannot be told, so it finds that again, too.
         """
         before, folder = torch_defaults(), _folder()
         with np.errstate(**self._numpy):
             _set_torch(self._torch)
             _enter(self._folder)
-            variant = _set_variant(self._variant)
+            _set_variant(self._variant)
             try:
                 yield
             finally:
                 self._torch, self._numpy = torch_defaults(), dict(np.geterr())
-                self._variant = now if (now := _variant()) != variant else self._variant
+                self._variant = _variant()
                 self._folder = own if (own := _folder()) != folder else None
                 _set_torch(before or _initial())
                 _enter(folder)
@@ -124,11 +125,10 @@ def _variant() -> str | None:
     return None if mitsuba is None else mitsuba.variant()
 
 
-def _set_variant(variant: str | None) -> str | None:
-    """Sets it, where it is another one now, and returns what it is."""
+def _set_variant(variant: str | None) -> None:
+    """Sets it, where it is another one now."""
     if variant is not None and variant != _variant():
         sys.modules["mitsuba"].set_variant(variant)
-    return _variant()
 
 
 def _folder() -> str | None:

@@ -285,15 +285,19 @@ def test_how_torch_computes_is_a_methods_own(tmp_path: Path) -> None:
 
 
 def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
-    """Though the truth check, and rows of ours, render with another one between its calls."""
-    file = tmp_path / "renders.py"
-    file.write_text(
-        "import mitsuba as mi\nimport numpy as np\nmi.set_variant('scalar_rgb')\n"
-        "class Renders:\n    name, config = 'renders', {}\n    def render(self, intrinsics):\n"
-        "        assert mi.variant() == 'scalar_rgb'\n        return np.zeros((2, 2, 3))\n"
-    )
-    (row,) = plugin_rows([named_plugin(f"{file}:Renders")])
-    for _ in range(2):
+    """Though the truth check, rows of ours, and other methods render with another one between its calls; also that
+    which was there when it set it.
+    """
+    rows = []
+    for name, variant in (("first", "scalar_rgb"), ("second", "scalar_rgb"), ("other", "scalar_spectral_polarized")):
+        file = tmp_path / f"{name}.py"
+        file.write_text(
+            f"import mitsuba as mi\nimport numpy as np\nmi.set_variant('{variant}')\n"
+            f"class Renders:\n    name, config = '{name}', {{}}\n    def render(self, intrinsics):\n"
+            f"        assert mi.variant() == '{variant}'\n        return np.zeros((2, 2, 3))\n"
+        )
+        rows += plugin_rows([named_plugin(f"{file}:Renders")])
+    for row in (*rows, *rows):
         mitsuba("scalar_spectral")
         engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
 
