@@ -272,6 +272,24 @@ def test_every_command_hears_who_tells_it_to_end() -> None:
     assert not folder.exists()
 
 
+# as on Windows
+FEWER_SIGNALS = """
+import signal
+del signal.SIGHUP, signal.pthread_kill
+import unirender.training.stopping
+from unirender import cli, process_ends
+
+cli.run = lambda command: process_ends._Ends().again(signal.SIGINT)
+cli.main()
+"""
+
+
+def test_commands_run_where_the_system_has_fewer_signals() -> None:
+    """They ended before they began, with an AttributeError."""
+    done = subprocess.run([sys.executable, "-c", FEWER_SIGNALS, "lights"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "unirender: interrupted\n")
+
+
 @pytest.fixture
 def as_before() -> Iterator[None]:
     """What the process does on a signal is afterwards as before."""
