@@ -43,12 +43,22 @@ def hear_ends() -> None:
     """From now on SIGINT, SIGTERM and SIGHUP end this process in order: what is temporary is deleted, workers end.
 
     They are those of Ctrl-C, of a batch system or `timeout`, and of a terminal that closes. What the process ignores
-    from its beginning, as nohup has it ignore SIGHUP, stays ignored.
+    from its beginning, as nohup has it ignore SIGHUP, stays ignored. A process that is forked, as a plug-in's pool does
+    it, ends as any other: it would print an error, and an import below it would have it wait.
     """
     ends = _Ends()
-    for number in SIGNALS:
-        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-            signal.signal(number, ends.hear)
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    heard = [number for number in SIGNALS if before[number] in (signal.SIG_DFL, signal.default_int_handler)]
+    for number in heard:
+        signal.signal(number, ends.hear)
+
+    def as_before() -> None:
+        for number in heard:
+            if signal.getsignal(number) == ends.hear:
+                signal.signal(number, before[number])
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=as_before)
 
 
 class _Ends:

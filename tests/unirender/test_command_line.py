@@ -272,6 +272,36 @@ def test_every_command_hears_who_tells_it_to_end() -> None:
     assert not folder.exists()
 
 
+FORKED = """
+import multiprocessing, time
+from unirender import cli
+
+def run(command):
+    context = multiprocessing.get_context("fork")
+    at_work = context.Event()
+
+    def work():
+        at_work.set()
+        time.sleep(60)
+
+    child = context.Process(target=work)
+    child.start()
+    at_work.wait()
+    child.terminate()
+    child.join()
+    return -child.exitcode
+
+cli.run = run
+cli.main()
+"""
+
+
+def test_a_forked_process_ends_as_any_other() -> None:
+    """A plug-in's pool printed an error of each of its processes when it ended them."""
+    done = subprocess.run([sys.executable, "-c", FORKED, "lights"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (signal.SIGTERM, "")
+
+
 # as on Windows
 FEWER_SIGNALS = """
 import signal
