@@ -116,9 +116,11 @@ def _tables(folder: Path) -> str:
 
 def _exact_types(app: Sphinx, doctree: nodes.document) -> None:
     """Sphinx looks through all that is documented for each type of a signature that is not among it, and finds a field
-    named `object`. A whole name or a built-in needs no search; a bare class is one that is imported for checks alone."""
+    named `object`. A whole name or a built-in needs no search; a bare class is one that is imported for checks.
+    """
     for reference in doctree.findall(addnodes.pending_xref):
-        if reference.get("refspecific") is False and ("." in reference["reftarget"] or reference["reftarget"].islower()):
+        name = reference["reftarget"]
+        if reference.get("refspecific") is False and ("." in name or name.islower()):
             del reference["refspecific"]
 
 

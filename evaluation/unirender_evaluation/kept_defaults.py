@@ -1,6 +1,6 @@
 """Defaults of the process that a stranger's method may set, and that the answers of all other rows depend on.
 
-They are torch's (dtype, device, gradients, precision of products, determinism, threads), Mitsuba's variant, how numpy
+They are torch's (dtype, device, gradients, precision, determinism, threads), Mitsuba's variant, how numpy
 treats floating-point errors, and the current folder, from which files are named.
 """
 
@@ -22,25 +22,26 @@ class OwnDefaults:
     def __init__(self) -> None:
         self._torch: Mapping[str, Any] = {}
         self._numpy: dict[str, Any] = {}
-        self._variant: str | None = None  # None: it has set none
+        self._variant: str | None = None  # None: Mitsuba had none
         self._folder: str | None = None  # None: that of all others
 
     @contextmanager
     def here(self) -> Iterator[None]:
         """For a block of the method's code: the defaults are its own, and afterwards as before.
 
-        But for Mitsuba's variant, which takes a third of a second to set: who renders next sets it.
+        But for Mitsuba's variant, which takes a third of a second to set: who renders next sets it. Whether a method
+        has set the one that was there already cannot be told, so it finds that again, too.
         """
         before, folder = torch_defaults(), _folder()
         with np.errstate(**self._numpy):
             _set_torch(self._torch)
             _enter(self._folder)
-            variant = _set_variant(self._variant)
+            _set_variant(self._variant)
             try:
                 yield
             finally:
                 self._torch, self._numpy = torch_defaults(), dict(np.geterr())
-                self._variant = now if (now := _variant()) != variant else self._variant
+                self._variant = _variant()
                 self._folder = own if (own := _folder()) != folder else None
                 _set_torch(before or _initial())
                 _enter(folder)
@@ -61,16 +62,33 @@ def _initial() -> dict[str, Any]:
     torch = sys.modules.get("torch")
     if torch is None:
         return {}
-    known = {"dtype": torch.float32, "device": torch.device("cpu"), "gradients": True, "products": "highest"}
+    known = {"dtype": torch.float32, "device": torch.device("cpu"), "gradients": True}
+    known |= {"precision": (*["none"] * 4, "tf32", "tf32"), "products": "highest"}
     return known | {"determinism": (False, False), "cudnn": (True, False, False)}
 
 
 def _set_torch(defaults: Mapping[str, Any]) -> None:
-    """Sets those that are others now."""
-    now = torch_defaults()
+    """Sets those that are others now; in their order, since a general precision changes what follows."""
     for name, value in defaults.items():
-        if value != now[name]:
-            TORCH[name][1](sys.modules["torch"], value)
+        read, write = TORCH[name]
+        if value != read(torch := sys.modules["torch"]):
+            write(torch, value)
+
+
+def _precise(torch: Any) -> tuple[Any, ...]:
+    """What has a precision of float32 that torch's newer interface sets, the general ones first."""
+    cpu, gpu = torch.backends.mkldnn, torch.backends.cudnn
+    return torch.backends, cpu, cpu.conv, cpu.rnn, gpu.conv, gpu.rnn
+
+
+def _read_precision(torch: Any) -> tuple[str, ...]:
+    return tuple(place.fp32_precision for place in _precise(torch))
+
+
+def _write_precision(torch: Any, precision: tuple[str, ...]) -> None:
+    for place, value in zip(_precise(torch), precision, strict=True):
+        if place.fp32_precision != value:
+            place.fp32_precision = value
 
 
 def _read_products(torch: Any) -> str:
@@ -108,6 +126,7 @@ TORCH: Mapping[str, tuple[Callable[[Any], Any], Callable[[Any, Any], None]]] = {
     "dtype": (lambda torch: torch.get_default_dtype(), lambda torch, value: torch.set_default_dtype(value)),
     "device": (lambda torch: torch.get_default_device(), _write_device),
     "gradients": (lambda torch: torch.is_grad_enabled(), lambda torch, value: torch.set_grad_enabled(value)),
+    "precision": (_read_precision, _write_precision),
     "products": (_read_products, lambda torch, value: torch.set_float32_matmul_precision(value)),
     "determinism": (
         _read_determinism,
@@ -124,11 +143,10 @@ def _variant() -> str | None:
     return None if mitsuba is None else mitsuba.variant()
 
 
-def _set_variant(variant: str | None) -> str | None:
-    """Sets it, where it is another one now, and returns what it is."""
+def _set_variant(variant: str | None) -> None:
+    """Sets it, where it is another one now."""
     if variant is not None and variant != _variant():
         sys.modules["mitsuba"].set_variant(variant)
-    return _variant()
 
 
 def _folder() -> str | None:

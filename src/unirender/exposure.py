@@ -36,7 +36,8 @@ def exposure_factor(
         target: radiance that a white surface has afterwards at the percentile, as drawn by `draw_target`.
 
     Raises:
-        UnirenderError: the mask is empty, or no more of the object than above the percentile receives light.
+        UnirenderError: the mask is empty, or no more of the object than above the percentile receives light,
+            or more than is finite.
     """
     inside = mask.reshape(diffuse.shape[:2]) > MASK_THRESHOLD
     if not inside.any():
@@ -45,7 +46,9 @@ def exposure_factor(
         )
     received = luminance(diffuse[inside])
     level = float(np.percentile(received, PERCENTILE))
-    if not np.isfinite(level) or level <= 0:
+    if not np.isfinite(level):
+        raise UnirenderError(f"exposure: the white-diffuse level is {level}, expected finite radiance; check the light")
+    if level <= 0:
         raise UnirenderError(
             f"exposure: the white-diffuse level is {level}, expected light on more than {100 - PERCENTILE:g}% of the "
             f"object, got it on {100 * (received > 0).mean():.2g}%; turn the light, or choose the exposure yourself "

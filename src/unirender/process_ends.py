@@ -19,6 +19,8 @@ from unirender.models.lean_imports import lean_imports
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
 WAIT_S, MOST_WAITS = 0.05, 200  # of a signal, for the end of an import: ten seconds in all
 PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
+HANG_UP: int = getattr(signal, "SIGHUP", 0)  # 0, which is no signal: Windows has none
+SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, *filter(None, [HANG_UP]))
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
 
@@ -41,12 +43,22 @@ def hear_ends() -> None:
     """From now on SIGINT, SIGTERM and SIGHUP end this process in order: what is temporary is deleted, workers end.
 
     They are those of Ctrl-C, of a batch system or `timeout`, and of a terminal that closes. What the process ignores
-    from its beginning, as nohup has it ignore SIGHUP, stays ignored.
+    from its beginning, as nohup has it ignore SIGHUP, stays ignored. A process that is forked, as a plug-in's pool does
+    it, ends as any other: it would print an error, and an import below it would have it wait.
     """
     ends = _Ends()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
-            signal.signal(number, ends.hear)
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    heard = [number for number in SIGNALS if before[number] in (signal.SIG_DFL, signal.default_int_handler)]
+    for number in heard:
+        signal.signal(number, ends.hear)
+
+    def as_before() -> None:
+        for number in heard:
+            if signal.getsignal(number) == ends.hear:
+                signal.signal(number, before[number])
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=as_before)
 
 
 class _Ends:
@@ -79,7 +91,10 @@ class _Ends:
         """Sends the signal to the main thread a little later."""
         time.sleep(WAIT_S)
         self.waiting = False
-        signal.pthread_kill(threading.main_thread().ident or 0, number)
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
+        else:  # Windows
+            _thread.interrupt_main(signal.Signals(number))
 
 
 def importing(frame: FrameType | None) -> bool:

@@ -284,16 +284,45 @@ def test_how_torch_computes_is_a_methods_own(tmp_path: Path) -> None:
         assert kept_defaults.torch_defaults() == before
 
 
-def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
-    """Though the truth check, and rows of ours, render with another one between its calls."""
-    file = tmp_path / "renders.py"
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "torch.backends.fp32_precision = 'bf16'",
+        "torch.backends.fp32_precision = 'tf32'",
+        "torch.backends.mkldnn.conv.fp32_precision = 'bf16'",
+        "torch.backends.cudnn.conv.fp32_precision = 'ieee'",
+    ],
+)
+def test_a_precision_that_torchs_newer_interface_sets_is_a_methods_own(tmp_path: Path, setting: str) -> None:
+    """The networks of other rows convolve on the same processor."""
+    file = tmp_path / "precise.py"
     file.write_text(
-        "import mitsuba as mi\nimport numpy as np\nmi.set_variant('scalar_rgb')\n"
-        "class Renders:\n    name, config = 'renders', {}\n    def render(self, intrinsics):\n"
-        "        assert mi.variant() == 'scalar_rgb'\n        return np.zeros((2, 2, 3))\n"
+        f"import numpy as np\nimport torch\n{setting}\nclass Precise:\n    name, config = 'precise', {{}}\n"
+        f"    def render(self, intrinsics):\n        assert {setting.replace(' = ', ' == ')}\n"
+        "        return np.zeros((2, 2, 3))\n"
     )
-    (row,) = plugin_rows([named_plugin(f"{file}:Renders")])
+    before = kept_defaults.torch_defaults()
+    (row,) = plugin_rows([named_plugin(f"{file}:Precise")])
     for _ in range(2):
+        assert kept_defaults.torch_defaults() == before
+        engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+    assert kept_defaults.torch_defaults() == before
+
+
+def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
+    """Though the truth check, rows of ours, and other methods render with another one between its calls; also that
+    which was there when it set it.
+    """
+    rows = []
+    for name, variant in (("first", "scalar_rgb"), ("second", "scalar_rgb"), ("other", "scalar_spectral_polarized")):
+        file = tmp_path / f"{name}.py"
+        file.write_text(
+            f"import mitsuba as mi\nimport numpy as np\nmi.set_variant('{variant}')\n"
+            f"class Renders:\n    name, config = '{name}', {{}}\n    def render(self, intrinsics):\n"
+            f"        assert mi.variant() == '{variant}'\n        return np.zeros((2, 2, 3))\n"
+        )
+        rows += plugin_rows([named_plugin(f"{file}:Renders")])
+    for row in (*rows, *rows):
         mitsuba("scalar_spectral")
         engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
 

@@ -272,6 +272,54 @@ def test_every_command_hears_who_tells_it_to_end() -> None:
     assert not folder.exists()
 
 
+FORKED = """
+import multiprocessing, time
+from unirender import cli
+
+def run(command):
+    context = multiprocessing.get_context("fork")
+    at_work = context.Event()
+
+    def work():
+        at_work.set()
+        time.sleep(60)
+
+    child = context.Process(target=work)
+    child.start()
+    at_work.wait()
+    child.terminate()
+    child.join()
+    return -child.exitcode
+
+cli.run = run
+cli.main()
+"""
+
+
+def test_a_forked_process_ends_as_any_other() -> None:
+    """A plug-in's pool printed an error of each of its processes when it ended them."""
+    done = subprocess.run([sys.executable, "-c", FORKED, "lights"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (signal.SIGTERM, "")
+
+
+# as on Windows
+FEWER_SIGNALS = """
+import signal
+del signal.SIGHUP, signal.pthread_kill
+import unirender.training.stopping
+from unirender import cli, process_ends
+
+cli.run = lambda command: process_ends._Ends().again(signal.SIGINT)
+cli.main()
+"""
+
+
+def test_commands_run_where_the_system_has_fewer_signals() -> None:
+    """They ended before they began, with an AttributeError."""
+    done = subprocess.run([sys.executable, "-c", FEWER_SIGNALS, "lights"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "unirender: interrupted\n")
+
+
 @pytest.fixture
 def as_before() -> Iterator[None]:
     """What the process does on a signal is afterwards as before."""

@@ -78,3 +78,11 @@ def test_a_light_on_the_rim_alone_is_said_to_be_there() -> None:
     diffuse[:5, 0] = 0
     with pytest.raises(UnirenderError, match=r"on more than 10% of the object, got it on 5%; .*--exposure 0"):
         exposure_factor(diffuse, np.ones((10, 10, 1), np.float32), 0.7)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_a_level_that_is_not_finite_is_said_to_be_that(diffuse: np.ndarray, mask: np.ndarray) -> None:
+    """It was said that light is missing, on up to 1e+02% of the object."""
+    for value in (np.nan, np.inf):
+        with pytest.raises(UnirenderError, match="expected finite radiance"):
+            exposure_factor(np.full_like(diffuse, value), mask, 0.7)

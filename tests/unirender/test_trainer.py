@@ -588,7 +588,7 @@ def test_growing_folder(tmp_path: Path) -> None:
     old = resumed.next()
     assert resumed.state_dict()["shards"] == state["shards"]
     assert not torch.equal(grown["image"], old["image"])
-    with pytest.raises(UnirenderError, match=r"2 of the 3 shards .* \(first: shard-000001\.tar\), .*; pass the run's"):
+    with pytest.raises(UnirenderError, match=r"2 of the 3 shards .* \(first: shard-000001\.tar\), .*; put them back"):
         ShardSource(write_dataset(tmp_path / "other", shards=1), 2, 0).load_state_dict(source.state_dict())
     source.close()
     resumed.close()

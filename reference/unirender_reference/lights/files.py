@@ -64,7 +64,8 @@ def load_light(
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
             None: by suffix (HDR formats are lat-long, others are photographs).
         shape: rows and columns of the result; None: the file's own for lat-long maps (bit for bit where it is on the
-            contract's grid; of a map of 2 x 4 pixels 3 rows, which rendering needs), 128 x 256 for photographs.
+            contract's grid; other maps of fewer than 64 rows 64 x 128: on fewer rows lamps would smear), 128 x 256 for
+            photographs.
         normalise: scale to mean luminance 1; False keeps the radiance of the file (of a photograph: white is `PEAK`).
 
     Returns:

@@ -81,7 +81,8 @@ class GroupDataset:
             if missing:
                 raise UnirenderError(
                     f"{folder}: {len(missing)} of the {len(shards)} shards that a run was trained on are missing "
-                    f"(first: {missing[0]}), expected all; pass the run's folder, or another --out to start anew"
+                    f"(first: {missing[0]}), expected all; put them back, pass --data with all of them, or "
+                    "another --out to start anew"
                 )
             available = {path: sha256 for path, sha256 in available.items() if names[path] in shards}
         self._paths = tuple(available)

@@ -14,9 +14,7 @@ from dataclasses import dataclass
 from types import FrameType
 
 from unirender.command_line import Ended
-from unirender.process_ends import PASSED_ON_S
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+from unirender.process_ends import HANG_UP, PASSED_ON_S, SIGNALS
 
 
 @dataclass
@@ -37,7 +35,7 @@ class StopRequest:
         try:
             yield
         except OSError:
-            if self.signal != signal.SIGHUP:  # which may have come inside the block
+            if self.signal != HANG_UP:  # which may have come inside the block
                 raise
 
 
@@ -59,8 +57,7 @@ def stopping_gently() -> Iterator[StopRequest]:
             raise Ended(number)
         request.signal, request.last = number, now
 
-    hung_up_for_nobody = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    heard = [number for number in SIGNALS if not (number == signal.SIGHUP and hung_up_for_nobody)]
+    heard = [number for number in SIGNALS if not (number == HANG_UP and signal.getsignal(number) == signal.SIG_IGN)]
     before = {number: signal.signal(number, hear) for number in heard}
     try:
         yield request
