@@ -1,7 +1,7 @@
 # make bench       install what runs, then score everything on the tiny suite: tables, report (results/)
 # make bench-full  the same with what is slow (sampling rows, Mitsuba's shading, physics) on the whole suite
 # make test        install the development tools, then lint, type-check, docs and tests
-# make test-long   what make test leaves out because it takes long: notebooks, and some 100 tests; CI runs it too
+# make test-long   what make test leaves out because it takes long: notebooks, and some 170 tests; CI runs it too
 # make test-large  what make test leaves out: the network at Stable Diffusion size (20 GiB of memory, minutes)
 # make test-report likewise: the HTML report in Chromium (with chromedriver; an error where one is missing)
 # make test-demo   likewise: the page of `unirender demo` in Chromium
