@@ -22,9 +22,9 @@ from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.process_ends import SIGNALS
 from unirender.training import checkpoint
 from unirender.training.checkpoint import load_state
-from unirender.training.stopping import SIGNALS
 from unirender.training.visibility import TrainVisibility, rate, split, train_visibility
 from unirender.training.visibility_data import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
 from unirender.training.visibility_loss import terms
