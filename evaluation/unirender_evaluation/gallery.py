@@ -8,13 +8,11 @@ degree) compares the pictures over white with the true mask pasted on both.
 import base64
 import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from PIL import Image
 
@@ -24,6 +22,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.records import RunInfo
 from unirender_evaluation.report_plots import LEADING, heading
 from unirender_evaluation.scoring import over_white
+from unirender_reference.principled import one_thread
 
 GALLERY_BYTES = 12_000_000  # of all its pictures, about: where they would take more, they are shown smaller
 BYTES_PER_PIXEL = 1.2  # of a PNG data URI; measured: 1.16, 499 pictures of the tiny suite; noise takes up to 5
@@ -114,7 +113,8 @@ def flip_map(prediction: Picture, truth: Picture, mask: Float[np.ndarray, "h w 1
     import flip_evaluator
 
     frames = [image_srgb(over_white(srgb_decode(np.clip(picture, 0, 1)), mask)) for picture in (truth, prediction)]
-    with _one_thread():
+    # FLIP's OpenMP threads, which it shares with torch, spin for one another: 170 ms a small picture, 14 ms with one.
+    with one_thread():
         error, _, _ = flip_evaluator.evaluate(frames[0], frames[1], "LDR", applyMagma=False)
     error = np.asarray(error, dtype=np.float32).reshape(*mask.shape[:2], 1)
     mean = float((error * mask).sum() / mask.sum())
@@ -164,20 +164,6 @@ def shown_width(gallery: Sequence[GalleryItem], limit: int = GALLERY_BYTES) -> i
         len(item.given) + len(item.truth) + 2 * sum(map(len, item.predictions.values())) for item in gallery
     )  # each prediction has its FLIP map
     return min(width, max(SMALLEST, int(math.sqrt(limit / (BYTES_PER_PIXEL * count)))))
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """FLIP's OpenMP threads spin for one another on a busy machine: 170 ms a small picture, 14 ms with one thread.
-
-    torch and flip-evaluator share the OpenMP runtime that was loaded first (torch's, through `scoring`).
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _magma(error: Float[np.ndarray, "h w"]) -> Picture:

@@ -169,23 +169,19 @@ def append_record(path: Path, record: Record) -> None:
         file.write(record.to_json() + "\n")
 
 
-def read_records(path: Path, *, torn_tail: Literal["raise", "drop"] = "raise") -> list[Record]:
+def read_records(path: Path) -> list[Record]:
     """Reads a JSONL file of records.
 
-    Args:
-        path: the file.
-        torn_tail: what to do with a last line that a killed run left without its newline. "drop" is for resuming.
-
     Raises:
-        UnirenderError: on an unreadable file or line (with its number), or if two lines are the same measurement.
+        UnirenderError: on an unreadable file or line (with its number), on a last line that a killed run left without
+            its newline, or if two lines are the same measurement.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UnirenderError(f"cannot read records from {path}: {error}") from error
     lines = text.split("\n")
-    torn = lines.pop()
-    if torn and torn_tail == "raise":
+    if lines.pop():
         raise UnirenderError(f"{path}: the last line has no newline (a run was killed while writing); run it again")
     records, seen = [], set()
     for number, line in enumerate(lines, start=1):

@@ -85,7 +85,7 @@ class CeilingBreach:
         return f"{self.method} exceeds the noise ceiling on {where} by at least {self.low_db:.2f} dB"
 
 
-def ceiling_breaches(records: Sequence[Record], exempt: Sequence[str] = ()) -> list[CeilingBreach]:
+def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
     """Rows whose paired PSNR interval against the noise ceiling lies above 0; empty in a sound benchmark.
 
     (The ceilings of SSIM and LPIPS are scores of a picture with a little noise of its own: a good row may pass them.)
@@ -100,7 +100,7 @@ def ceiling_breaches(records: Sequence[Record], exempt: Sequence[str] = ()) -> l
         bound = [r for r in chosen if r.method == CEILING]
         for key in sorted({key for r in bound for key in r.values if ".psnr" in key}):
             limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
-            for method in sorted({r.method for r in chosen} - {CEILING, *exempt}):
+            for method in sorted({r.method for r in chosen} - {CEILING}):
                 rows = (r for r in chosen if r.method == method and key in r.values and r.sample in limit)
                 values = {r.sample: r.values[key] for r in rows}
                 if not values:
@@ -129,7 +129,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
         f"rendered again with other seeds {agree} the truth file (check seed {check['seed']}, {check['date']}, "
         f"smallest pass share {check['smallest_pass_share']:.3f}); {_twins_text(check)}"
     )
-    here, scenes = check.get("chosen_from", (0, 0))  # a check that an earlier version stored has none
+    here, scenes = check["chosen_from"]
     if here < scenes:
         lines.append(f"         (chosen from {here} of {scenes} scenes: the meshes of the others are not here)")
     lines += [f"         {line}" for line in check["failed"]]
@@ -147,7 +147,4 @@ def _twins_text(check: dict) -> str:
     """Whether the check found its deliberate errors; which it did not, with what may help."""
     if check["twin_detected"]:
         return "deliberate errors of roughness, albedo and normal were found"
-    missed = check.get("missed")  # a check that an earlier version stored does not say which
-    if not missed:
-        return "not all deliberate errors of roughness, albedo and normal were found: check again with --recheck"
-    return "deliberate errors NOT found: " + "; ".join(f"{name} ({advice})" for name, advice in missed.items())
+    return "deliberate errors NOT found: " + "; ".join(f"{name} ({advice})" for name, advice in check["missed"].items())

@@ -85,7 +85,6 @@ COMMANDS = (
 FROM_RECORDS = (
     "claims",
     "comparisons",
-    "docs_tables",
     "light_tables",
     "merge",
     "protocol",

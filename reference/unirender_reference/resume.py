@@ -51,7 +51,7 @@ def finished_shards(
     try:
         content = json.loads(path.read_text())
         listed = {record.name: record for record in map(parse_record, content["shards"])}
-        found, made_with = content["config"], content.get("versions")
+        found, made_with = content["config"], content.get("versions") or {}
     except (ValueError, KeyError, TypeError) as error:
         raise UnirenderError(f"{path}: not a manifest of unirender ({error}); choose another --out") from error
     check_versions(folder, made_with, header["versions"])

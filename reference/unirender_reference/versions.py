@@ -26,17 +26,12 @@ def versions(denoise: bool) -> dict[str, str]:
     return found
 
 
-def check_versions(folder: Path, found: Mapping[str, str] | None, wanted: Mapping[str, str]) -> None:
+def check_versions(folder: Path, found: Mapping[str, str], wanted: Mapping[str, str]) -> None:
     """Compares the versions that a data set was made with to those that would continue it.
 
     Raises:
         UnirenderError: they differ; the message says in what.
     """
-    if found is None:
-        raise UnirenderError(
-            f"{folder}: was begun by an earlier version of unirender, whose manifest names no versions, and cannot be "
-            "continued (it can be read); choose another --out or delete it"
-        )
     differs = [
         f"{name} {found.get(name, 'none')} (now {wanted.get(name, 'none')})"
         for name in sorted({*found, *wanted})

@@ -539,17 +539,3 @@ def test_the_command_refuses_in_a_line(
         assert said in error
         assert "Traceback" not in error
     assert not list(tmp_path.iterdir())
-
-
-def test_every_file_that_cannot_be_used_has_its_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_meshes(tmp_path / "models", ["a.obj", "b.obj"])
-    for name in ("a.obj", "b.obj"):
-        (tmp_path / "models" / name).write_text("v 0 0 0\n")
-    path = spec_with(tmp_path, MESHES).path
-    path.write_text(suite_path("tiny").read_text() + MESHES)
-    with pytest.raises(SystemExit) as stopped:
-        main(["bench", "truth", str(path), "--work", str(tmp_path / "work")])
-    assert stopped.value.code == 1
-    error = capsys.readouterr().err.splitlines()
-    assert error[0].startswith("unirender: error: suite 'tiny': 2 of its meshes cannot be used")
-    assert [line.split(":")[0] for line in error[1:]] == ["  a.obj", "  b.obj"]

@@ -16,7 +16,6 @@ from unirender_reference import backend
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.scene import load_scene, sensor_dict
 from unirender_reference.shapes import make_object
-from unirender_reference.statistics import z_test
 
 SIZE = 24
 SPP = 256  # 16 passes of 16: every test runs the same compiled kernels
@@ -47,51 +46,6 @@ def test_white_furnace(ball: Renderer) -> None:
     for estimate in (diffuse, specular):
         np.testing.assert_allclose(estimate.mean[inside].mean(axis=0), light[0, 0], rtol=5e-3)
     np.testing.assert_allclose(diffuse.mean[inside], np.broadcast_to(light[0, 0], (inside.sum(), 3)), rtol=0.03)
-
-
-@pytest.mark.parametrize("roughness", [0.3, 0.6, 1.0])
-def test_rough_reflectors_lose_light_and_never_make_it(ball: Renderer, roughness: float) -> None:
-    specular = ball.specular(np.full((8, 16, 3), 0.5, np.float32), roughness, SPP, batches=BATCHES)
-    mean = specular.mean[full(ball)].mean()
-    assert 0.1 < mean < 0.5
-    assert specular.variance is not None
-    assert (specular.mean[full(ball)] < 0.5 + 5 * np.sqrt(specular.variance[full(ball)]) + 1e-3).all()
-
-
-@pytest.mark.parametrize("buffer", ["image", "diffuse", "specular"])
-def test_light_is_additive(concave: Renderer, buffer: str) -> None:
-    """Render under A plus render under B = render under A + B; a tenth more of B is noticed."""
-    a, b = scenes.environment(1, peaks=0), scenes.environment(2, peaks=0)
-
-    def render(light: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        estimate = {
-            "image": lambda: concave.image(light, 0.4, 0.5, SPP, seed, batches=BATCHES),
-            "diffuse": lambda: concave.diffuse(light, SPP, seed, batches=BATCHES),
-            "specular": lambda: concave.specular(light, 0.4, SPP, seed, batches=BATCHES),
-        }[buffer]()
-        assert estimate.variance is not None
-        return estimate.mean[..., :3], estimate.variance[..., :3]
-
-    (mean_a, var_a), (mean_b, var_b) = render(a, 1), render(b, 2)
-    mask = concave.geometry(64).mask
-    options = {"batches_a": 2 * BATCHES - 1, "batches_b": BATCHES, "alpha": 1e-3}
-    together = z_test(mean_a + mean_b, var_a + var_b, *render(a + b, 3), mask, **options)
-    assert together.passed, str(together)
-    twin = z_test(mean_a + mean_b, var_a + var_b, *render(a + 1.25 * b, 3), mask, **options)
-    assert not twin.passed, str(twin)
-
-
-def test_twelve_percent_of_roughness_are_noticed(ball: Renderer) -> None:
-    """What a golden image with 'PSNR > 40' misses."""
-    light = scenes.environment(4)
-    renders = [ball.image(light, r, 1.0, 512, seed, batches=32) for r, seed in ((0.3, 1), (0.3, 2), (0.336, 3))]
-    first, same, rougher = (
-        (image.mean[..., :3], image.variance[..., :3]) for image in renders if image.variance is not None
-    )
-    options = {"batches_a": 32, "batches_b": 32, "alpha": 1e-3}
-    mask = ball.geometry(64).mask
-    assert z_test(*first, *same, mask, **options).passed
-    assert not z_test(*first, *rougher, mask, **options).passed
 
 
 def emitted(environment: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -176,19 +130,6 @@ def test_twice_the_light_and_half_the_exposure_give_the_same_sample(concave: Ren
     assert np.array_equal(sample.image_linear, brighter.image_linear)
     for name in sample.intrinsics.present:
         assert np.array_equal(getattr(sample.intrinsics, name), getattr(brighter.intrinsics, name)), name
-
-
-def test_radiance_is_linear_in_metallic_under_direct_light(concave: Renderer) -> None:
-    light = scenes.environment(3, peaks=0)
-    renders = [concave.image(light, 0.4, m, SPP, seed, 2, BATCHES) for seed, m in enumerate((0.0, 1.0, 0.25, 0.5))]
-    means = [image.mean[..., :3] for image in renders]
-    variances = [image.variance[..., :3] for image in renders if image.variance is not None]
-    between = 0.75 * means[0] + 0.25 * means[1], 0.75**2 * variances[0] + 0.25**2 * variances[1]
-    options = {"batches_a": BATCHES, "batches_b": BATCHES, "alpha": 1e-3}
-    mask = concave.geometry(64).mask
-    result = z_test(*between, means[2], variances[2], mask, **options)
-    assert result.passed, str(result)
-    assert not z_test(*between, means[3], variances[3], mask, **options).passed
 
 
 def test_background_is_hidden_and_object_is_not() -> None:

@@ -356,7 +356,7 @@ def checkerboard(side: int) -> np.ndarray:
     return np.repeat((np.indices((side, side)).sum(0) % 2 * 255).astype(np.uint8)[..., None], 3, axis=-1)
 
 
-@pytest.mark.parametrize("side", [1536, 2048, 4096])
+@pytest.mark.parametrize("side", [1536, 4096])
 def test_large_picture_is_reduced_in_linear_light(tmp_path, side):
     def fill(w: GltfWriter) -> None:
         w.mesh(w.quad(w.material(pbrMetallicRoughness={"baseColorTexture": {"index": w.texture(checkerboard(side))}})))

@@ -67,7 +67,8 @@ def on_device(folder: Path, batch: int, seed: int, augmentation: Augmentation, r
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.long] if name == "derived" else []) for name in ONE_BY_ONE]
+    "name",
+    [pytest.param(name, marks=[] if name in ("nothing", "everything") else [pytest.mark.long]) for name in ONE_BY_ONE],
 )
 def test_batches_are_those_of_the_reader(name: str, folder: Path) -> None:
     made, read = both(folder, ONE_BY_ONE[name])

@@ -24,7 +24,6 @@ from unirender.models.conditioning import LIGHT, Conditioning
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.light_encoder import LightEncoder, pad_sphere
 from unirender.models.packing import TRIPLETS
-from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.config import LossConfig, RunConfig
@@ -279,18 +278,16 @@ def test_after_a_few_steps_the_render_depends_on_the_light(unified: bool, tmp_pa
     assert torch.equal(withheld, render(parts, other_light(batch), "environment"))
 
 
-@BOTH
-def test_trained_saved_loaded_and_used(unified: bool, tmp_path: Path) -> None:
-    config = dataclasses.replace(ENCODED, model=dataclasses.replace(ENCODED.model, unified=unified))
+def test_trained_saved_loaded_and_used(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data", size=SIZE)
     trainer = Trainer(
-        config, RunConfig(tmp_path / "run", steps=1, picture_minutes=0.0), torch.device("cpu"), torch.float32
+        ENCODED, RunConfig(tmp_path / "run", steps=1, picture_minutes=0.0), torch.device("cpu"), torch.float32
     )
-    source = ShardSource(data, config.batch_size, config.seed)
+    source = ShardSource(data, ENCODED.batch_size, ENCODED.seed)
     trainer.fit(source)
     source.close()
     pipeline = UniRenderPipeline.from_pretrained(export_pipeline(trainer, tmp_path / "pipeline", torch.float32))
-    assert type(pipeline.dual_stream) is (DualStreamModel if unified else SplitDualStreamModel)
+    assert type(pipeline.dual_stream) is DualStreamModel
     assert pipeline.dual_stream.config["light"] == "encoder"
     assert pipeline.conditioning.light_encoder
     for name, average in trainer.ema.average.items():

@@ -58,11 +58,10 @@ def fit(folder: Path, source: Source) -> list[dict[str, Any]]:
     return [{k: v for k, v in line.items() if k not in ("minutes", "samples_per_s")} for line in lines if "lr" in line]
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-def test_the_step_is_ended_and_saved_and_nothing_is_lost(number: int, tmp_path: Path) -> None:
+def test_the_step_is_ended_and_saved_and_nothing_is_lost(tmp_path: Path) -> None:
     before = [signal.getsignal(n) for n in SIGNALS]
     with pytest.raises(KeyboardInterrupt):
-        fit(tmp_path / "stopped", Source(2, (number,)))
+        fit(tmp_path / "stopped", Source(2, SIGNALS[:1]))
     assert [signal.getsignal(n) for n in SIGNALS] == before
     state = load_state(tmp_path / "stopped")
     assert state is not None

@@ -11,6 +11,6 @@
 | `warm_start` | `bench warm-start` | what the model's prediction is worth as the start of an optimisation |
 
 Each has the modules `command` (light to import), `run` (measures, prints, writes) and, but for `speed`, `tables`; the
-two commands of `optimiser` are in `commands`, which run it as well. They share `cells`, `folder`, `progress` and
-`rows`. No result of `bench run` depends on a study.
+two commands of `optimiser` are in `commands`, which run it as well. They share `about`, `cells`, `folder`,
+`progress` and `rows`. No result of `bench run` depends on a study.
 """

@@ -8,19 +8,18 @@ differentiates them by path replay (`prb`). Image and gradient are separate call
 
 A loss that is not linear in the image has a biased gradient if both use the same samples.
 
-What is exact and what is not: `prb` differentiates everything that does not move visibility (albedo, roughness,
-metallic, light). Vertices also move silhouettes and shadows; their gradient comes from `prb_projective`, which samples
-the silhouettes that a camera sees; of the shadows' edges it is blind (`sppi=0`: 27 times as fast).
+`prb` differentiates everything that does not move visibility: albedo, roughness, metallic, light.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
+from unirender_reference.optimize.parameters import NAMES, Name
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_scene
 from unirender_reference.optimize.views import View
@@ -28,9 +27,7 @@ from unirender_reference.passes import NAN_ATTEMPTS, Counters, derive_seed, fini
 from unirender_reference.scene import LIGHT, parameter_name, sensor_at
 from unirender_reference.shader import MOST_METALLIC, gradient, tensors, wrapped
 
-Parameter = Literal["albedo", "roughness", "metallic", "environment", "vertices"]
 Maps = Mapping[str, Float[np.ndarray, "..."]]
-APPEARANCE: tuple[Parameter, ...] = ("albedo", "roughness", "metallic", "environment")
 PLUGIN_MAPS = {"albedo": "base_color", "roughness": "roughness", "metallic": "metallic"}
 
 
@@ -50,9 +47,8 @@ def maps_of(solution: Solution) -> dict[str, Float[np.ndarray, "..."]]:
 class TexturedScene:
     """Renders an object with textures from all views at once, and differentiates what it rendered.
 
-    Images are stacks (n, h, w, 4) of premultiplied linear RGBA, one picture for each view. Maps are those of `maps_of`,
-    and `vertices`; their sizes stay as they were, one that is left out keeps its last value. A metallic of 1 counts as
-    `MOST_METALLIC`. Vertices, once given, have Mitsuba's vertex normals instead of the mesh's own.
+    Images are stacks (n, h, w, 4) of premultiplied linear RGBA, one picture for each view. Maps are those of `maps_of`;
+    their sizes stay as they were, one that is left out keeps its last value. A metallic of 1 counts as `MOST_METALLIC`.
 
     Args:
         solution: mesh, first maps and light.
@@ -64,18 +60,14 @@ class TexturedScene:
         mi = mitsuba()
         self.count, (self.height, self.width) = len(views), views[0].image.shape[:2]
         self._scene = solution_scene(solution)
-        self._sensors = [sensor_at(view.pose, view.camera, self.height, self.width) for view in views]
-        self._batch = mi.load_dict(batch_dict(self._sensors))
-        self._hidden = {"max_depth": depth, "hide_emitters": True}
-        self._path = mi.load_dict({"type": "path", **self._hidden})
-        self._replay = mi.load_dict({"type": "prb", **self._hidden})
+        sensors = [sensor_at(view.pose, view.camera, self.height, self.width) for view in views]
+        self._batch = mi.load_dict(batch_dict(sensors))
+        hidden = {"max_depth": depth, "hide_emitters": True}
+        self._path = mi.load_dict({"type": "path", **hidden})
+        self._replay = mi.load_dict({"type": "prb", **hidden})
         parameters = mi.traverse(self._scene)
         self._parameters = parameters
-        suffixes = {
-            "environment": f"{LIGHT}.data",
-            "vertices": "vertex_positions",
-            **{name: f"{plugin}.data" for name, plugin in PLUGIN_MAPS.items()},
-        }
+        suffixes = {name: f"{plugin}.data" for name, plugin in (*PLUGIN_MAPS.items(), ("environment", LIGHT))}
         self._keys = {name: parameter_name(parameters, suffix) for name, suffix in suffixes.items()}
 
     def image(self, maps: Maps, spp: int, seed: int) -> Float[np.ndarray, "n h w 4"]:
@@ -99,7 +91,7 @@ class TexturedScene:
         image_gradient: Float[np.ndarray, "n h w 3"],
         spp: int,
         seed: int,
-        wrt: Sequence[Parameter] = APPEARANCE,
+        wrt: Sequence[Name] = NAMES,
     ) -> dict[str, Float[np.ndarray, "..."]]:
         """Derivatives of sum(image_gradient * image) with respect to maps, each of its map's shape.
 
@@ -108,7 +100,7 @@ class TexturedScene:
             image_gradient: derivative of a loss with respect to the radiance (premultiplied) of `image`.
             spp: samples per pixel.
             seed: equal seeds draw equal samples.
-            wrt: what to differentiate with respect to. With `vertices` among them every view is a launch of its own.
+            wrt: what to differentiate with respect to.
 
         Raises:
             UnirenderError: the image gradient has another size or is not finite, or derivatives stay NaN.
@@ -120,11 +112,7 @@ class TexturedScene:
             )
         for attempt in range(NAN_ATTEMPTS + 1):
             attached = self._show(maps, wrt)
-            drawn = pass_seed(seed, attempt)
-            if "vertices" in wrt:
-                self._backward_each(image_gradient, spp, drawn)
-            else:
-                self._backward(self._batch, self._replay, np.concatenate(list(image_gradient), axis=1), spp, drawn)
+            self._backward(np.concatenate(list(image_gradient), axis=1), spp, pass_seed(seed, attempt))
             found = {name: gradient(tensor) for name, tensor in attached.items()}
             if all(np.isfinite(values).all() for values in found.values()):
                 return {name: values.reshape(maps[name].shape) for name, values in found.items()}
@@ -144,8 +132,6 @@ class TexturedScene:
                 raise UnirenderError(f"textured scene: got a map {name!r}, expected some of {', '.join(self._keys)}")
             if name == "environment":
                 value = wrapped(tensor)
-            elif name == "vertices":
-                value = mi.Float(tensor.array)
             else:
                 height, width, *rest = tensor.shape
                 most = MOST_METALLIC if name == "metallic" else 1
@@ -155,19 +141,13 @@ class TexturedScene:
         self._parameters.update()
         return {name: made[name] for name in attached}
 
-    def _backward_each(self, image_gradient: Float[np.ndarray, "n h w 3"], spp: int, seed: int) -> None:
-        mi = mitsuba()
-        moving = mi.load_dict({"type": "prb_projective", "sppi": 0, **self._hidden})
-        for index, (sensor, wanted) in enumerate(zip(self._sensors, image_gradient, strict=True)):
-            self._backward(moving_sensor(sensor), moving, wanted, spp, derive_seed(seed, "view", index))
-
-    def _backward(self, sensor: Any, integrator: Any, wanted: Float[np.ndarray, "h w 3"], spp: int, seed: int) -> None:
+    def _backward(self, wanted: Float[np.ndarray, "h nw 3"], spp: int, seed: int) -> None:
         import drjit as dr
 
         mi = mitsuba()
         alpha = np.zeros((*wanted.shape[:2], 1), np.float32)
         grad = mi.TensorXf(np.ascontiguousarray(np.concatenate([wanted, alpha], axis=-1), np.float32))
-        integrator.render_backward(self._scene, None, grad, sensor, dr.opaque(mi.UInt32, seed), spp)
+        self._replay.render_backward(self._scene, None, grad, self._batch, dr.opaque(mi.UInt32, seed), spp)
 
     def _stack(self, film: Float[np.ndarray, "h nw 4"]) -> Float[np.ndarray, "n h w 4"]:
         return np.stack(np.split(film, self.count, axis=1))
@@ -183,8 +163,3 @@ def batch_dict(sensors: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def pass_seed(seed: int, attempt: int) -> int:
     """Of a picture and of its derivative alike: with one seed both draw the same samples."""
     return derive_seed(seed, "textured scene", attempt)
-
-
-def moving_sensor(sensor: dict[str, Any]) -> Any:
-    """A loaded sensor under which outlines may cross the picture's border."""
-    return mitsuba().load_dict({**sensor, "film": {**sensor["film"], "sample_border": True}})

@@ -332,8 +332,6 @@ def test_parts_follow_the_data(tmp_path: Path) -> None:
     [
         ({"scenes": 0}, "--scenes 0: expected at least 1"),
         ({"repeats": 0}, "--repeats 0: expected at least 1"),
-        ({"block_steps": 0}, "--block-steps 0: expected at least 1"),
-        ({"overfit_minutes": 0.0}, "--overfit-minutes 0: expected more than 0"),
         ({"parts": ("start", "start")}, "--parts start start: expected none of them twice"),
         ({"parts": ("network", "training")}, "--parts training: expected --data beside it"),
         ({"preset": "none"}, "preset: got 'none'"),

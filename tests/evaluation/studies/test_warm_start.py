@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -156,15 +155,7 @@ def test_our_method_is_the_row_of_the_benchmark() -> None:
     assert method.config["mode"] == "mean"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scenes": 0}, "--scenes 0: expected at least 1"),
-        ({"geometries": ()}, "--geometries : expected at least one"),
-        ({"geometries": ("known-mesh", "known-mesh")}, "none of them twice"),
-    ],
-)
-def test_options_that_cannot_be_right(options: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=message):
-        BenchWarmStart(out=tmp_path / "out", **options).run()
+def test_options_that_cannot_be_right(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--scenes 0: expected at least 1"):
+        BenchWarmStart(out=tmp_path / "out", scenes=0).run()
     assert not (tmp_path / "out").exists()

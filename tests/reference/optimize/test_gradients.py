@@ -6,20 +6,16 @@ Both derivatives along a direction are estimated with several seeds. They agree 
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import refine_problems as problems
 
-from unirender_reference.backend import mitsuba
-from unirender_reference.optimize.mask_scene import MaskScene
-from unirender_reference.optimize.textured_scene import Parameter, TexturedScene, maps_of, moving_sensor
-from unirender_reference.shader import gradient
+from unirender_reference.optimize.parameters import NAMES, Name
+from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
 
 TOLERANCE = 0.03  # of the central difference; of the curvature over the step, and of float32
 SHARP = 0.03  # standard error of either estimate, of the central difference
-HORIZONS = 0.08  # TOLERANCE where a coarse mesh moves, whose horizons are not differentiated
 SEEDS = 6
 
 
@@ -32,21 +28,16 @@ def compare(central: np.ndarray, derived: np.ndarray, tolerance: float = TOLERAN
     return bool(abs(mean - other) <= tolerance * abs(mean) + 3 * error), text
 
 
-def all_maps() -> dict[str, np.ndarray]:
-    truth = problems.solution()
-    return {**maps_of(truth), "vertices": truth.obj.vertices}
-
-
 def sampled(estimate: Callable[[int], float]) -> np.ndarray:
     return np.array([estimate(seed) for seed in range(SEEDS)])
 
 
-def weights(count: int, channels: int = 3) -> np.ndarray:
+def weights(count: int) -> np.ndarray:
     rng = np.random.default_rng(3)
-    return rng.uniform(0.2, 1, (count, problems.SIDE, problems.SIDE, channels)).astype(np.float32)
+    return rng.uniform(0.2, 1, (count, problems.SIDE, problems.SIDE, 3)).astype(np.float32)
 
 
-def direction_of(name: Parameter, shape: tuple[int, ...]) -> tuple[np.ndarray, float]:
+def direction_of(name: Name, shape: tuple[int, ...]) -> tuple[np.ndarray, float]:
     """Where to and how far a parameter moves."""
     rng = np.random.default_rng(5)
     if name == "environment":  # one texel of the first column, which the emitter stores twice
@@ -56,18 +47,13 @@ def direction_of(name: Parameter, shape: tuple[int, ...]) -> tuple[np.ndarray, f
     return rng.uniform(0.3, 1, shape).astype(np.float32), 0.04
 
 
-APPEARANCE: tuple[Parameter, ...] = ("albedo", "roughness", "metallic", "environment")
-
-
 @pytest.fixture(scope="module")
 def scene() -> TexturedScene:
     return TexturedScene(problems.solution(), problems.blank_views(2), depth=3)
 
 
-def central_difference(scene: TexturedScene, name: Parameter, move: np.ndarray, step: float, spp: int) -> np.ndarray:
-    maps, weight = all_maps(), weights(scene.count)
-    if name != "vertices":
-        del maps["vertices"]
+def central_difference(scene: TexturedScene, name: Name, move: np.ndarray, step: float, spp: int) -> np.ndarray:
+    maps, weight = maps_of(problems.solution()), weights(scene.count)
 
     def at(scale: float, seed: int) -> float:
         images = scene.image({**maps, name: maps[name] + scale * move}, spp, seed)
@@ -84,9 +70,9 @@ def gradients(scene: TexturedScene) -> list[dict[str, np.ndarray]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", APPEARANCE)
+@pytest.mark.parametrize("name", NAMES)
 def test_textures_and_light_agree_with_central_differences(
-    scene: TexturedScene, gradients: list[dict[str, np.ndarray]], name: Parameter
+    scene: TexturedScene, gradients: list[dict[str, np.ndarray]], name: Name
 ) -> None:
     move, step = direction_of(name, gradients[0][name].shape)
     central = central_difference(scene, name, move, step, spp=512)
@@ -113,73 +99,3 @@ def test_different_samples_remove_the_bias_of_a_squared_error(scene: TexturedSce
     scores = [(found.mean() - expected) / (found.std(ddof=1) / np.sqrt(seeds)) for found in (apart, same)]
     assert abs(scores[0]) < 3.5, f"expected {expected:.4g}, got {apart.mean():.4g}, {scores[0]:.1f} standard errors"
     assert abs(scores[1]) > 7, f"equal samples: expected {expected:.4g}, got {same.mean():.4g}, no bias found"
-
-
-@pytest.fixture(scope="module")
-def growing() -> tuple[TexturedScene, np.ndarray, np.ndarray]:
-    """A scene of one view, how the vertices move (the ball grows, unevenly), and the picture's central differences."""
-    truth = problems.solution()
-    scene = TexturedScene(truth, problems.blank_views(1), depth=2)
-    move = truth.obj.vertices * np.array([1, 0.6, 0.3], np.float32)
-    return scene, move, central_difference(scene, "vertices", move, 0.01, 1024)
-
-
-@pytest.mark.long
-def test_vertices_by_picture(growing: tuple[TexturedScene, np.ndarray, np.ndarray], monkeypatch: Any) -> None:
-    """All that a moving vertex changes in direct light: outlines, shading normals, places in the textures.
-
-    But not the horizons of the mesh's flat faces, which are shadows' edges (`sppi=0`): hence the wider tolerance.
-    """
-    scene, move, central = growing
-    maps = all_maps()
-
-    def derived(seed: int) -> float:
-        found = scene.gradients(maps, weights(1), 64, 50 + seed, ("vertices",))["vertices"]
-        return float((found.astype(np.float64) * move).sum())
-
-    agree, text = compare(central, sampled(derived), HORIZONS)
-    assert agree, text
-    replay = scene._replay  # the twin: path replay alone does not see outlines
-    monkeypatch.setattr(
-        scene, "_backward_each", lambda wanted, spp, seed: scene._backward(scene._batch, replay, wanted[0], spp, seed)
-    )
-    twin, text = compare(central, sampled(derived), HORIZONS)
-    assert not twin, f"without outlines, too: {text}"
-
-
-@pytest.mark.long
-def test_vertices_by_mask() -> None:
-    truth, views = problems.solution(), problems.blank_views(2)
-    scene, vertices, weight = MaskScene(truth.obj, views), truth.obj.vertices, weights(2, 1)
-    move = vertices * np.array([1, 0.6, 0.3], np.float32)
-
-    def central(seed: int, step: float = 0.02) -> float:
-        high, low = (scene.image(vertices + s * move, 256, seed).astype(np.float64) for s in (step, -step))
-        return float(((high - low) * weight).sum() / (2 * step))
-
-    def derived(seed: int) -> float:
-        return float((scene.gradients(vertices, weight, 64, seed).astype(np.float64) * move).sum())
-
-    expected, estimates = sampled(central), sampled(derived)
-    agree, text = compare(expected, estimates)
-    assert agree, text
-    twin, _ = compare(expected, 1.05 * estimates)
-    assert not twin, f"a derivative that is 5 % off passes, too: {text}"
-
-
-def test_alpha_has_no_gradient(growing: tuple[TexturedScene, np.ndarray, np.ndarray]) -> None:
-    """Why masks need a scene of their own: projective integrators do not differentiate the alpha channel."""
-    import drjit as dr
-
-    scene, move, _ = growing
-    mi = mitsuba()
-    moving = mi.load_dict({"type": "prb_projective", "sppi": 0, "max_depth": 2, "hide_emitters": True})
-    found = {}
-    for name, channel in (("alpha", 3), ("red", 0)):
-        wanted = np.zeros((problems.SIDE, problems.SIDE, 4), np.float32)
-        wanted[..., channel] = 1
-        attached = scene._show(all_maps(), ("vertices",))["vertices"]
-        grad, seed = mi.TensorXf(wanted), dr.opaque(mi.UInt32, 0)
-        moving.render_backward(scene._scene, None, grad, moving_sensor(scene._sensors[0]), seed, 64)
-        found[name] = float((gradient(attached) * move).sum())
-    assert abs(found["alpha"]) < 1e-3 < 10 < abs(found["red"]), found

@@ -1,11 +1,9 @@
 """A run of `unirender bench derived-light`: measures with progress, prints, writes."""
 
-import hashlib
-from datetime import UTC, datetime
-
 from rich.console import Console
 
 from unirender_evaluation.records import Record
+from unirender_evaluation.studies.about import code_digest, line, today
 from unirender_evaluation.studies.derived_light.measure import DerivedLight, measure, methods, settings
 from unirender_evaluation.studies.derived_light.tables import table, to_json
 from unirender_evaluation.studies.folder import open_folder, write_files
@@ -30,11 +28,11 @@ def run(what: DerivedLight, console: Console) -> list[Record]:
         about = {
             **settings(what),
             "mitsuba": installed_version("mitsuba"),
-            "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
-            "date": datetime.now(UTC).date().isoformat(),
+            "code": code_digest(what.code),
+            "date": today(),
         }
-        line = ", ".join(f"{name} {about[name]}" for name in ("resolution", "mitsuba", "code", "date"))
-        write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{line}.\n", f"{NAME}.json": to_json(records, about)})
+        below = line({name: about[name] for name in ("resolution", "mitsuba", "code", "date")})
+        write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{below}", f"{NAME}.json": to_json(records, about)})
         made.show(console)
         console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
         return records

@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from unirender.errors import UsageError
 from unirender.option_checks import at_least
 
 
@@ -75,21 +74,13 @@ class BenchRace:
     """A bundled suite, or the path of a suite's TOML file."""
     objects: int = 4
     """Objects, evenly spaced."""
-    iterations: int = 400
-    """Steps of the plain loop."""
-    losses: tuple[Literal["srgb", "linear"], ...] = ("srgb", "linear")
-    """Of the plain loop, a run each; the one that is first at the best albedo of them all counts."""
-    every: int = 20
-    """Steps of the plain loop between two measures of its albedo."""
     seed: int = 0
     """Of both."""
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""
-        at_least(1, objects=self.objects, iterations=self.iterations, every=self.every)
+        at_least(1, objects=self.objects)
         at_least(0, seed=self.seed)
-        if not self.losses or len(set(self.losses)) < len(self.losses):
-            raise UsageError(f"--losses {' '.join(self.losses)}: expected srgb, linear or both, each once")
 
     def run(self) -> int:
         """Runs what is missing and prints the table."""
@@ -105,11 +96,10 @@ class BenchRace:
         console = Console()
         with open_folder(self.out) as folder:
             study = Study.of(self.suite, self.objects, self.seed, "studies/optimiser/race")
-            settings = RaceSettings(OptimizeConfig(seed=self.seed), self.iterations, self.losses, self.every)
+            settings = RaceSettings(OptimizeConfig(seed=self.seed))
             races = race_all(study, settings, folder, console)
-            protocol = study.protocol(
-                **{"plain loop": f"Adam, {self.iterations} steps of 16 samples, measured every {self.every} steps"}
-            )
+            plain = f"Adam, {settings.iterations} steps of 16 samples, measured every {settings.plain_every} steps"
+            protocol = study.protocol(**{"plain loop": plain})
             table = race_table(races, protocol)
             files = {"race.md": table.markdown(), "race.json": to_json(races, protocol), "race.png": draw(races)}
             write_files(folder, files)

@@ -39,7 +39,7 @@ class RaceSettings:
     Attributes:
         ours: our optimiser.
         iterations: of the plain loop.
-        losses: of the plain loop, a run each.
+        losses: of the plain loop, a run each; the one that is first at the best albedo of them all counts.
         plain_every: iterations of the plain loop between two measures.
         our_every: iterations of our refinement between two measures.
     """

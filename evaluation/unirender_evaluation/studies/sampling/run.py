@@ -1,13 +1,12 @@
 """A run of `unirender bench sampling`: measures with progress, prints, writes."""
 
-import hashlib
 import os
 from collections.abc import Sequence
-from datetime import UTC, datetime
 
 from rich.console import Console
 
 from unirender_evaluation.records import Record
+from unirender_evaluation.studies.about import code_digest, today
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.studies.sampling import tables
@@ -64,6 +63,6 @@ def protocol(what: SamplingStudy, scenes: Sequence[Scene]) -> tuple[tuple[str, s
         ("weights", what.weights[:12]),
         ("suite", f"{what.suite.spec.name} {what.suite.sha256[:12]}"),
         ("cores", str(os.cpu_count())),
-        ("code", f"{hashlib.sha256(what.code.encode()).hexdigest()[:12]}, torch {installed_version('torch')}"),
-        ("date", datetime.now(UTC).date().isoformat()),
+        ("code", f"{code_digest(what.code)}, torch {installed_version('torch')}"),
+        ("date", today()),
     )

@@ -17,6 +17,9 @@ from unirender_evaluation.studies.speed.parts import NEED_DATA, PARTS, PartName
 if TYPE_CHECKING:
     from unirender_evaluation.studies.speed.run import Measures
 
+BLOCK_STEPS = 8  # of training; blocks of training and of bare passes take turns
+OVERFIT_MINUTES = 3.0
+
 
 @dataclass(frozen=True)
 class BenchSpeed:
@@ -47,10 +50,6 @@ class BenchSpeed:
     """Of the model, and of the autocast in training. auto: bfloat16 only on hardware that computes in it."""
     repeats: int = 9
     """Of every measure whose median is taken; half as many of cold starts."""
-    block_steps: int = 8
-    """Training steps of a block; blocks of training and of bare passes take turns."""
-    overfit_minutes: float = 3.0
-    """Length of the part overfit."""
 
     def check(self) -> tuple[PartName, ...]:
         """Looks at the values; the parts that will be measured.
@@ -58,9 +57,7 @@ class BenchSpeed:
         Raises:
             UsageError: one is outside its range, or a part has no data.
         """
-        at_least(1, scenes=self.scenes, repeats=self.repeats, block_steps=self.block_steps)
-        if not self.overfit_minutes > 0:
-            raise UsageError(f"--overfit-minutes {self.overfit_minutes:g}: expected more than 0")
+        at_least(1, scenes=self.scenes, repeats=self.repeats)
         if len(set(self.parts)) < len(self.parts):
             raise UsageError(f"--parts {' '.join(self.parts)}: expected none of them twice")
         missing = [part for part in self.parts if part in NEED_DATA and self.data is None]
@@ -120,9 +117,9 @@ class BenchSpeed:
             "start": partial(start_part, suite, scenes[0], self.checkpoint, options, few),
         }
         if self.data is not None:
-            about = self.data, self.preset, self.config(), device, dtype, self.block_steps, self.repeats
+            about = self.data, self.preset, self.config(), device, dtype, BLOCK_STEPS, self.repeats
             measures["training"] = partial(training_part, *about)
-            measures["overfit"] = partial(overfit_part, self.data, self.overfit_minutes, device, dtype)
+            measures["overfit"] = partial(overfit_part, self.data, OVERFIT_MINUTES, device, dtype)
         return {name: measures[name] for name in PARTS if name in parts}
 
     def _protocol(self) -> tuple[tuple[str, str], ...]:

@@ -6,10 +6,8 @@ stopped goes on, inside a training too.
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.store import Store, content_key
+from unirender_evaluation.studies.about import description, line
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.training import tables
 from unirender_evaluation.studies.training.choices import BASE_PRESET, Choice
@@ -167,27 +166,18 @@ def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], c
         for record, new in measure(study, rows, scenes):
             records.append(record)
             computed += new
-        table, about = tables.table(rows, records), description(study, rows)
-        text = table.markdown() + "\n" + ", ".join(f"{name} {value}" for name, value in about.items()) + ".\n"
+        table, trained_on = tables.table(rows, records), study.trained_on
+        about = description(
+            study.suite,
+            study.code,
+            data=f"{trained_on['data'][:12]} ({trained_on['groups']} groups)",
+            preset=study.preset,
+            steps=f"{study.steps}",
+            batch=f"{rows[0].config.batch_size}",
+            torch=str(installed_version("torch")),
+        )
+        text = f"{table.markdown()}\n{line(about)}"
         write_files(study.out, {f"{NAME}.md": text, f"{NAME}.json": tables.to_json(rows, records, about)})
         table.show(console)
         console.print(f"{computed} new records of {len(records)}; {study.out / NAME}.md, .json", highlight=False)
         return records
-
-
-def description(study: TrainingStudy, rows: Sequence[Choice]) -> dict[str, str]:
-    """What a reader must know to compare."""
-    trained_on = study.trained_on
-    return {
-        "suite": f"{study.suite.spec.name} {study.suite.sha256[:12]}",
-        "resolution": f"{study.suite.spec.resolution}",
-        "data": f"{trained_on['data'][:12]} ({trained_on['groups']} groups)",
-        "preset": study.preset,
-        "steps": f"{study.steps}",
-        "batch": f"{rows[0].config.batch_size}",
-        "torch": str(installed_version("torch")),
-        "mitsuba": str(installed_version("mitsuba")),
-        "cores": str(os.cpu_count()),
-        "code": hashlib.sha256(study.code.encode()).hexdigest()[:12],
-        "date": datetime.now(UTC).date().isoformat(),
-    }

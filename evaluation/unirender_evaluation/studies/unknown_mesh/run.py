@@ -1,21 +1,18 @@
 """A run of `unirender bench unknown-mesh`: measures with progress, prints, writes."""
 
 import contextlib
-import hashlib
-import os
 from collections.abc import Sequence
-from datetime import UTC, datetime
 
 from rich.console import Console
 
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
 from unirender_evaluation.stratification import Material
+from unirender_evaluation.studies.about import description, line
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
 from unirender_evaluation.suites import Scene
-from unirender_evaluation.versions import installed_version
 from unirender_reference.optimize.live import live_report
 from unirender_reference.optimize.report import Progress
 
@@ -46,8 +43,8 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
                 records.append(record)
                 computed += new
         made = tables.tables(records, names, what.settings)
-        about = description(what)
-        lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+        about = description(what.suite, what.code)
+        lines = [*(table.markdown() for table in made), line(about)]
         content = tables.to_json(records, names, about)
         write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
         for table in made:
@@ -59,15 +56,3 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
 def scene_name(scene: Scene, material: Material) -> str:
     """Object, family and material."""
     return f"{scene.object} ({scene.family}, metallic {material[0]:g}, roughness {material[1]:g})"
-
-
-def description(what: UnknownMesh) -> dict[str, str]:
-    """What a reader must know to compare."""
-    return {
-        "suite": f"{what.suite.spec.name} {what.suite.sha256[:12]}",
-        "resolution": f"{what.suite.spec.resolution}",
-        "mitsuba": str(installed_version("mitsuba")),
-        "cores": str(os.cpu_count()),
-        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
-        "date": datetime.now(UTC).date().isoformat(),
-    }

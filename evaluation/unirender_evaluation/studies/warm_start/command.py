@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import get_args
 
 import tyro
 
-from unirender.errors import UsageError
 from unirender.option_checks import at_least
 from unirender_reference.optimize.single_config import SingleConfig
 
@@ -25,12 +24,6 @@ class BenchWarmStart:
     """Folder of tables and records."""
     scenes: int = 8
     """Scenes, evenly spaced over the suite, a picture each."""
-    geometries: tuple[Literal["known-mesh", "predicted-normals", "true-normals"], ...] = (
-        "known-mesh",
-        "predicted-normals",
-        "true-normals",
-    )
-    """What is known of the shape."""
     checkpoint: Path | None = None
     """Folder of our model, or a shipped one by its name. None: tiny."""
     single: tyro.conf.AvoidSubcommands[SingleConfig] = field(default_factory=SingleConfig)
@@ -43,8 +36,6 @@ class BenchWarmStart:
             UsageError: one is outside its range.
         """
         at_least(1, scenes=self.scenes)
-        if not self.geometries or len(set(self.geometries)) < len(self.geometries):
-            raise UsageError(f"--geometries {' '.join(self.geometries)}: expected at least one, none of them twice")
 
     def run(self) -> int:
         """Measures what is missing, prints and writes `warm_start.md` and `.json`; returns the exit status."""
@@ -52,13 +43,13 @@ class BenchWarmStart:
         from rich.console import Console
 
         from unirender_evaluation.rows import evenly
-        from unirender_evaluation.studies.warm_start.measure import WarmStart
+        from unirender_evaluation.studies.warm_start.measure import Geometry, WarmStart
         from unirender_evaluation.studies.warm_start.run import our_method, run
         from unirender_evaluation.suites import load_suite
         from unirender_evaluation.versions import versions
 
         suite = load_suite(self.suite)
         base = our_method(self.checkpoint)
-        what = WarmStart(suite, self.out, base, self.single, self.geometries, versions())
+        what = WarmStart(suite, self.out, base, self.single, get_args(Geometry), versions())
         run(what, evenly(suite.scenes, self.scenes), Console())
         return 0

@@ -1,21 +1,18 @@
 """A run of `unirender bench warm-start`: measures with progress, prints, writes."""
 
-import hashlib
-import os
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from unirender_evaluation.records import Record
+from unirender_evaluation.studies.about import description, line
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.studies.warm_start import tables
 from unirender_evaluation.studies.warm_start.measure import WarmStart, measure
 from unirender_evaluation.suites import Scene
-from unirender_evaluation.versions import installed_version
 
 NAME = "warm_start"
 
@@ -45,24 +42,12 @@ def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Reco
         total = len(scenes) * len(list(what.questions()))
         records, computed = collect(measure(what, scenes), total, "warm start", console)
         made = tables.tables(records, what.geometries)
-        about = description(what)
-        lines = [table.markdown() for table in made] + [", ".join(f"{k} {v}" for k, v in about.items()) + ".\n"]
+        prediction = f"{what.base.name} {what.base.config.get('weights', '')[:12]}".strip()
+        about = description(what.suite, what.code, prediction=prediction)
+        lines = [*(table.markdown() for table in made), line(about)]
         content = tables.to_json(records, what.geometries, about)
         write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
         for table in made:
             table.show(console)
         console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
         return records
-
-
-def description(what: WarmStart) -> dict[str, str]:
-    """What a reader must know to compare."""
-    return {
-        "suite": f"{what.suite.spec.name} {what.suite.sha256[:12]}",
-        "resolution": f"{what.suite.spec.resolution}",
-        "prediction": f"{what.base.name} {what.base.config.get('weights', '')[:12]}".strip(),
-        "mitsuba": str(installed_version("mitsuba")),
-        "cores": str(os.cpu_count()),
-        "code": hashlib.sha256(what.code.encode()).hexdigest()[:12],
-        "date": datetime.now(UTC).date().isoformat(),
-    }
