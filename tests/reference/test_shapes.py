@@ -1,11 +1,13 @@
 """Procedural objects: determinism, disjoint splits, closed outward meshes, charts, textures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
 from unirender_reference.shapes import HELD_OUT_FAMILIES, TRAIN_FAMILIES, MeshObject, Split, make_object, unit_sphere
-from unirender_reference.shapes.generator import FAMILIES, draw_family
+from unirender_reference.shapes.generator import FAMILIES, _part_texture, draw_family
 from unirender_reference.shapes.implicit import mesh_field
 from unirender_reference.shapes.material_maps import ROUGHEST, SMOOTHEST, normal_from_height, random_material
 from unirender_reference.shapes.mesh_object import signed_volume
@@ -143,6 +145,28 @@ def test_textures_are_solid_functions_of_position():
         assert color.max() <= 0.9501
         np.testing.assert_array_equal(texture(points[::-1]), color[::-1])
     assert len(kinds) == 10
+
+
+def test_checks_are_equally_large_on_both_sides_of_zero():
+    drawn = (random_texture(np.random.default_rng(seed)) for seed in range(99))
+    checker = next(texture for kind, texture in drawn if kind == "checker")
+    points = np.zeros((1, 8001, 3), np.float32)
+    points[0, :, 0] = np.linspace(-2, 2, 8001)
+    steps = np.flatnonzero(np.abs(np.diff(checker(points)[0], axis=0)).max(-1))
+    assert len(steps) >= 4
+    assert np.ptp(np.diff(steps)) <= 2
+
+
+def test_a_texture_has_the_place_and_the_size_of_its_part():
+    """A part that is moved and enlarged looks the same."""
+    part = rounded_box_part(np.array([1.0, 0.6, 0.4]), 0.1)
+    moved = replace(part, position_map=3 * part.position_map + np.array([5, 1, -2], np.float32))
+    kinds = set()
+    for seed in range(6):
+        (kind, own), (_, same) = (_part_texture(np.random.default_rng(seed), each, True) for each in (part, moved))
+        assert np.isclose(own, same, atol=1e-3).mean() > 0.99, kind
+        kinds.add(kind)
+    assert len(kinds - {"constant"}) >= 3
 
 
 def test_share_of_textured_objects():
