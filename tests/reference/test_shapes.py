@@ -11,6 +11,7 @@ from unirender_reference.shapes.generator import FAMILIES, _part_texture, draw_f
 from unirender_reference.shapes.implicit import mesh_field
 from unirender_reference.shapes.material_maps import ROUGHEST, SMOOTHEST, normal_from_height, random_material
 from unirender_reference.shapes.mesh_object import signed_volume
+from unirender_reference.shapes.noise import value_noise
 from unirender_reference.shapes.parametric import rounded_box_part
 from unirender_reference.shapes.surface import Part, corner_normals, grid_part
 from unirender_reference.textures import random_color, random_palette, random_texture
@@ -145,6 +146,17 @@ def test_textures_are_solid_functions_of_position():
         assert color.max() <= 0.9501
         np.testing.assert_array_equal(texture(points[::-1]), color[::-1])
     assert len(kinds) == 10
+
+
+def test_noise_meets_its_lattice_and_is_smooth_between():
+    noise = replace(value_noise(np.random.default_rng(2)), offset=np.zeros(3, np.float32))
+    at, right = np.random.default_rng(3).integers(-40, 40, (50, 3)), np.array([1, 0, 0])
+    known, beside = (noise.lattice[tuple(place.T % 32)] for place in (at, at + right))
+    for step, share in ((0.0, 0), (0.25, 0.103515625), (0.5, 0.5), (0.9999, 1)):  # t^3 (6 t^2 - 15 t + 10)
+        np.testing.assert_allclose(noise(at + step * right), known + share * (beside - known), atol=1e-4)
+    points = at + np.random.default_rng(4).random((50, 3))
+    octaves = sum(0.5**k * noise(points * 2**k + 7.31 * k) for k in range(3))
+    np.testing.assert_allclose(noise.fractal(points, 3), octaves / 1.75, atol=1e-5)
 
 
 def test_checks_are_equally_large_on_both_sides_of_zero():
