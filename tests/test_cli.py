@@ -2,7 +2,6 @@
 
 import functools
 import importlib.metadata
-import itertools
 import json
 import shutil
 import subprocess
@@ -268,18 +267,9 @@ def test_an_edit_is_the_same_from_the_command_line_and_from_python(ball: Path, t
     written = channels_rgb(read_exr(tmp_path / "edited" / "image.exr")[0])
     edited = UniRenderPipeline.from_pretrained().edit(Image.open(ball), roughness=0.9, metallic=1.0)
     np.testing.assert_allclose(written, edited.image_linear, rtol=0, atol=6e-4)  # of half precision
-
-
-def test_edit_and_relight(ball: Path, tmp_path: Path) -> None:
-    assert run("edit", ball, "--output", tmp_path / "rough", "--roughness", "0.9", "--metallic", "1") == 0
-    light = np.full((8, 16, 3), 0.1, dtype=np.float32)
-    light[2, 4] = 40.0
-    write_exr(tmp_path / "light.exr", image_channels(light), half=False)
-    assert run("relight", ball, "--environment", tmp_path / "light.exr", "--output", tmp_path / "relit") == 0
-    shown = (ball, tmp_path / "rough" / "image.png", tmp_path / "relit" / "image.png")
-    pictures = [np.array(Image.open(path)) for path in shown]
-    assert all(picture.shape == (100, 150, 4) for picture in pictures)
-    assert all(np.abs(a.astype(int) - b).mean() > 1 for a, b in itertools.pairwise(pictures))
+    before, after = (np.array(Image.open(path)).astype(int) for path in (ball, tmp_path / "edited" / "image.png"))
+    assert after.shape == (100, 150, 4)
+    assert np.abs(after - before).mean() > 1
 
 
 def test_every_option_reaches_the_model(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,6 +408,9 @@ def test_a_flat_albedo_is_recorded_and_that_of_other_commands(ball: Path, tmp_pa
     plain, flat, relit = (read_result(tmp_path / name).require("albedo")["albedo"] for name in commands)
     assert np.abs(flat - plain).max() > 0.001
     np.testing.assert_array_equal(relit, flat)
+    before, after = (np.array(Image.open(path)).astype(int) for path in (ball, tmp_path / "relit" / "image.png"))
+    assert after.shape == (100, 150, 4)
+    assert np.abs(after - before).mean() > 1
 
 
 def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
