@@ -11,8 +11,8 @@ from unirender_reference.shapes.generator import FAMILIES, _part_texture, draw_f
 from unirender_reference.shapes.implicit import mesh_field
 from unirender_reference.shapes.material_maps import ROUGHEST, SMOOTHEST, normal_from_height, random_material
 from unirender_reference.shapes.mesh_object import signed_volume
-from unirender_reference.shapes.noise import value_noise
-from unirender_reference.shapes.parametric import rounded_box_part
+from unirender_reference.shapes.noise import soft_step, value_noise
+from unirender_reference.shapes.parametric import revolution, rounded_box_part
 from unirender_reference.shapes.surface import Part, corner_normals, grid_part
 from unirender_reference.textures import random_color, random_palette, random_texture
 
@@ -157,6 +157,14 @@ def test_noise_meets_its_lattice_and_is_smooth_between():
     points = at + np.random.default_rng(4).random((50, 3))
     octaves = sum(0.5**k * noise(points * 2**k + 7.31 * k) for k in range(3))
     np.testing.assert_allclose(noise.fractal(points, 3), octaves / 1.75, atol=1e-5)
+    np.testing.assert_allclose(soft_step(np.array([-1, -0.05, 0, 0.05, 1]), 0.2), [0, 0.25, 0.5, 0.75, 1])
+
+
+def test_a_vase_is_as_wide_as_its_knots():
+    """Its wall is a mean of radii in [0.2, 1]."""
+    for seed in range(5):
+        around = revolution(np.random.default_rng(seed)).vertices[:, [0, 2]]
+        assert 0.3 < np.linalg.norm(around, axis=1).max() <= 1
 
 
 def test_checks_are_equally_large_on_both_sides_of_zero():
