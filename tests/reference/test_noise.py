@@ -241,6 +241,8 @@ def test_samples_say_what_was_asked_and_reached() -> None:
     header = sample.provenance
     assert (header["floor_asked_db"], header["floor_reached"], header["batches"]) == ("32", "yes", str(FLOOR_BATCHES))
     mask = sample.intrinsics.require("mask")["mask"]
+    for name, value in (("roughness", 0.3), ("metallic", 0.9)):
+        np.testing.assert_allclose(sample.intrinsics.require(name)[name], value * (mask > 0), atol=1e-3)
     maps = {"image": sample.image_linear, "diffuse": sample.intrinsics.diffuse, "specular": sample.intrinsics.specular}
     plain = render_sample(spec, 64, seed=4)
     again = {"image": plain.image_linear, **plain.intrinsics.require("diffuse", "specular")}
