@@ -52,7 +52,7 @@ def test_planes_that_meet_keep_their_edge() -> None:
     normal, mask, depth = gutter()
     found = integrate_normals(normal, mask[..., 0] > 0, CAMERA)
     ratio = found / depth
-    assert np.abs(ratio / np.median(ratio) - 1).max() < 0.02
+    assert np.abs(ratio / np.median(ratio) - 1).max() < 2e-4  # 5e-4 where one side of each pair counts whole
 
 
 def test_parts_that_do_not_touch_lie_at_one_depth_and_nothing_is_nothing() -> None:
