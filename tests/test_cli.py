@@ -1,5 +1,6 @@
 """The command line end to end, with the shipped checkpoint: results, or one clear line; never a partial folder."""
 
+import functools
 import importlib.metadata
 import json
 import shutil
@@ -7,16 +8,19 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
 import pytest
+import torch
 from PIL import Image
 from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light, refuse
 from unirender.command_line import parse
+from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
@@ -262,6 +266,57 @@ def test_an_edit_is_the_same_from_the_command_line_and_from_python(ball: Path, t
     written = channels_rgb(read_exr(tmp_path / "edited" / "image.exr")[0])
     edited = UniRenderPipeline.from_pretrained().edit(Image.open(ball), roughness=0.9, metallic=1.0)
     np.testing.assert_allclose(written, edited.image_linear, rtol=0, atol=6e-4)  # of half precision
+    before, after = (np.array(Image.open(path)).astype(int) for path in (ball, tmp_path / "edited" / "image.png"))
+    assert after.shape == (100, 150, 4)
+    assert np.abs(after - before).mean() > 1
+
+
+def test_every_option_reaches_the_model(ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default, under the name that the pipeline has for it; it then stops."""
+    calls: list[tuple[UniRenderPipeline, tuple[Any, ...], dict[str, Any]]] = []
+
+    def stop(pipeline: UniRenderPipeline, *arguments: Any, **settings: Any) -> None:
+        calls.append((pipeline, arguments, settings))
+        raise UnirenderError("far enough")
+
+    monkeypatch.setattr(UniRenderPipeline, "from_pretrained", functools.cache(UniRenderPipeline.from_pretrained))
+    for name in ("decompose", "decompose_batch", "edit", "relight", "render"):
+        monkeypatch.setattr(UniRenderPipeline, name, stop)
+    light, maps = tmp_path / "light.exr", tmp_path / "maps.exr"
+    write_exr(light, image_channels(np.full((8, 16, 3), 0.5, np.float32)), half=False)
+    ones = np.ones((8, 8, 1), np.float32)
+    known = Intrinsics(normal=ones * np.array([0, 0, 1], np.float32), roughness=ones, metallic=ones, mask=ones)
+    write_exr(maps, intrinsics_channels(known))
+    film = tmp_path / "film"
+    film.mkdir()
+    shutil.copy(ball, film)
+    model = ["--checkpoint", "tiny", "--dtype", "bfloat16", "--device", "cpu", "--seed", "3", "--steps", "4"]
+    model += ["--samples", "5", "--sampler", "unipc", "--size", "96", "--fov", "40", "--output", str(tmp_path / "out")]
+    taken = ["--no-closed", "--flat", "--tile", "--material", "map"]
+    decomposed = {"closed": False, "flat": True, "tile": True, "material": "map", "looks": 1}
+    lit = ["--environment", str(light), "--exposure", "1"]
+    changed = ["--roughness", "0.2", "--metallic", "0.7", "--no-anchored"]
+    anchored, shadowed = {"anchored": False}, {"shadows": True, "exposure": "keep"}
+    for arguments, own in (
+        (["decompose", ball, *taken], decomposed),
+        (["decompose", film, *taken], decomposed),
+        (["edit", ball, *taken, *changed], decomposed | anchored | {"roughness": 0.2, "metallic": 0.7}),
+        (["relight", ball, *taken, *lit, "--shadows"], decomposed | shadowed | {"anchored": True}),
+        (["relight", ball, *lit[:2], "--no-anchored"], anchored | {"exposure": "auto", "shadows": False}),
+        (["render", maps, *lit], {"derived": frozenset({"diffuse"})}),
+        (["render", maps, *lit, "--no-shadows"], {"derived": frozenset({"specular", "diffuse"})}),
+    ):
+        assert run(*arguments, *model) == 1
+        pipeline, given, settings = calls.pop()
+        camera = given[0].camera if arguments[0] == "render" else settings.pop("camera", None) or settings["cameras"][0]
+        assert camera.fov_deg == 40
+        generator = settings.pop("generator")
+        assert np.atleast_1d(generator)[0].initial_seed() == 3
+        expected = own | {"mode": "sample", "num_inference_steps": 4, "num_samples": 5, "sampler": "unipc", "size": 96}
+        assert expected.items() <= settings.items()
+        assert pipeline.dtype == torch.bfloat16
+        if "exposure" in settings:
+            assert given[1].mean() == (1.0 if "--exposure" in arguments else 0.5)
 
 
 def test_an_alpha_channel_that_hides_nothing_is_no_mask(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -338,22 +393,23 @@ def test_sampler_size_and_tiles_are_recorded(ball: Path, tmp_path: Path) -> None
     assert np.abs(albedos[0] - albedos[1]).max() > 0.01
 
 
-def test_a_flat_albedo_is_recorded_and_that_of_every_command(ball: Path, tmp_path: Path) -> None:
+def test_a_flat_albedo_is_recorded_and_that_of_other_commands(ball: Path, tmp_path: Path) -> None:
     light = tmp_path / "light.exr"
     write_exr(light, image_channels(np.ones((8, 16, 3), np.float32)), half=False)
     commands = {
         "plain": ("decompose", ball),
         "flat": ("decompose", ball, "--flat"),
-        "edited": ("edit", ball, "--flat", "--metallic", "1"),
         "relit": ("relight", ball, "--flat", "--environment", light),
     }
     for name, arguments in commands.items():
         assert run(*arguments, "--output", tmp_path / name) == 0
         assert json.loads((tmp_path / name / "meta.json").read_text())["flat"] == (name != "plain")
-    plain, *flat = (read_result(tmp_path / name).require("albedo")["albedo"] for name in commands)
-    assert np.abs(flat[0] - plain).max() > 0.001
-    for albedo in flat[1:]:
-        np.testing.assert_array_equal(albedo, flat[0])
+    plain, flat, relit = (read_result(tmp_path / name).require("albedo")["albedo"] for name in commands)
+    assert np.abs(flat - plain).max() > 0.001
+    np.testing.assert_array_equal(relit, flat)
+    before, after = (np.array(Image.open(path)).astype(int) for path in (ball, tmp_path / "relit" / "image.png"))
+    assert after.shape == (100, 150, 4)
+    assert np.abs(after - before).mean() > 1
 
 
 def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,9 @@
 """`unirender bench ...` with arguments that cannot be right: one line and status 2, before anything is done."""
 
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,7 +16,9 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.bench_config import BenchConfig, build_rows
 from unirender_evaluation.benchmark import run
+from unirender_evaluation.metrics import chosen_variants
 from unirender_evaluation.run_command import BenchRun, print_verdict
+from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.truth import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 
@@ -145,6 +149,34 @@ def test_a_second_run_in_the_same_folder_waits_for_the_first(tmp_path: Path) -> 
             run(BenchConfig(suite=str(write_suite(tmp_path / "suite", objects=1)), out=out), Console(quiet=True))
         assert {path.name: path.read_text() for path in out.iterdir()} == {"records.jsonl": '{"half a line', LOCK: ""}
     assert not (out / LOCK).exists()
+
+
+def test_every_option_of_a_run_reaches_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with another value than its default; the run itself does not begin."""
+    found: list[BenchConfig] = []
+
+    def stop(config: BenchConfig, console: Console) -> None:
+        found.append(config)
+        raise UnirenderError("far enough")
+
+    monkeypatch.setattr("unirender_evaluation.benchmark.run", stop)
+    given: dict[str, Any] = {"suite": "standard", "out": tmp_path, "checkpoint": tmp_path / "c", "methods": ("ours",)}
+    given |= {"method": ("m:A",), "limit": 3, "seed": 5, "check_scenes": 2, "check_seed": 9, "recheck": True}
+    given |= {"device": "mps"}
+    words: dict[str, Any] = {"sample_scenes": 1, "optimise_scenes": 2, "view_objects": 3, "predictions": ("a=x",)}
+    others: tuple[dict[str, Any], ...] = ({"jobs": 0}, {"cluster": "slurm:2"})
+    for more in others:
+        command = BenchRun(**given, **more, **words, variant=("masked-linear-raw",))
+        with pytest.raises(UnirenderError, match="far enough"):
+            command.run()
+        options: dict[str, Any] = {"jobs": 2, **given, **more}
+        expected = BenchConfig(
+            **options,
+            predictions={"a": Path("x")},
+            subsets=replace(STANDARD, sample=1, optimise=2, views=3),
+            variants=chosen_variants(("masked-linear-raw",)),
+        )
+        assert found.pop() == expected
 
 
 def test_repeated_options_add_up(tmp_path: Path) -> None:

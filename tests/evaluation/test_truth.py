@@ -26,6 +26,7 @@ from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
 from unirender_evaluation.truth_object import ObjectJob, object_hash, render_object
 from unirender_evaluation.truth_render import good_spp, render_to_ceiling, stored_ceiling_db
+from unirender_reference.noise import noise_floor_db
 from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
 
 
@@ -38,10 +39,13 @@ def test_stored_noise_survives_half_floats(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(variance[bright]) / mean[bright], 1e-3, rtol=0.06)
 
 
-def test_sampling_goes_on_until_the_ceiling_is_reached() -> None:
+@pytest.mark.parametrize("kind", ["image", "specular"])
+def test_sampling_goes_on_until_the_ceiling_is_reached(kind: Kind) -> None:
     """Both ceilings, the estimated and the stored one, reach the target; sampling stops there or at the limit."""
-    spec = read_spec("tiny")
+    spec = replace(read_spec("tiny"), light_target_db=44.0, light_spp=128)
+    first, target = {"image": (spec.spp, spec.target_db), "specular": (128, 44.0)}[kind]
     mask, calls = np.ones((8, 8, 1), np.float32), []
+    mask[:2] = 0.5
     unit = np.random.default_rng(0).uniform(0.01, 0.07, (8, 8, 3))  # variance of one sample
 
     def render(spp: int, seed: int) -> Estimate:
@@ -49,18 +53,20 @@ def test_sampling_goes_on_until_the_ceiling_is_reached() -> None:
         noise = np.random.default_rng(seed).standard_normal((8, 8, 3)) * np.sqrt(unit / spp)
         return Estimate((0.5 + noise).astype(np.float32), (unit / spp).astype(np.float32), nan_pixels=2)
 
-    found, channels = render_to_ceiling(render, mask, spec, 7, "image")
+    found, channels = render_to_ceiling(render, mask, spec, 7, kind)
     assert 1 < len(calls) <= 3, "the first render says how many samples are missing"
-    assert len({seed for _, seed in calls}) == len(calls), "every render has its own seed"
+    assert first <= calls[0][0] < 1.2 * first
+    assert [seed for _, seed in calls] == [7, 8, 9][: len(calls)], "every render has its own seed"
     assert found.spp == sum(count for count, _ in calls)
     assert all(count % spec.batches == 0 for count, _ in calls)
     assert found.nan_pixels == 2 * len(calls)
     np.testing.assert_allclose(found.variance, unit / found.spp, rtol=1e-4)
-    assert spec.target_db <= found.floor_db < spec.target_db + 0.5
-    assert spec.target_db <= stored_ceiling_db(channels, mask, "image") < spec.target_db + 0.7
+    assert target <= found.floor_db < target + 0.5
+    assert found.floor_db == noise_floor_db(found.mean, found.variance, mask, kind == "image")
+    assert target <= stored_ceiling_db(channels, mask, kind) < target + 0.7
     assert np.abs((found.mean - 0.5) / np.sqrt(unit / found.spp)).max() < 6
     short = replace(spec, max_spp=320)
-    assert render_to_ceiling(render, mask, short, 7, "image")[0].floor_db < spec.target_db, "max_spp ends it"
+    assert render_to_ceiling(render, mask, short, 7, kind)[0].floor_db < target, "max_spp ends it"
 
 
 @pytest.mark.parametrize("wanted", [1, 9, 256, 1000, 20_000, 60_000])

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from unirender_reference.dataset_config import GRID, DatasetConfig
 from unirender_reference.plan import plan_groups
 
 SIZE, SPP = 8, 16
+DEFAULTS = {entry.name: entry.default for entry in fields(DatasetConfig)}
 DENOISER = importlib.util.find_spec("mitsuba_oidn") is not None
 
 
@@ -85,6 +87,19 @@ def test_the_objects_of_the_suites_are_named_as_such(tmp_path: Path, caplog: pyt
 def test_wrong_options_are_usage_errors(options: dict[str, Any], words: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=words):
         Dataset(out=tmp_path, **options).check()
+
+
+def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
+    """Each with another value than its default; those that exclude one another in turn."""
+    given: dict[str, Any] = {"objects": 3, "pairs": 5, "resolution": 48, "vary": "independent", "seed": 7, "spp": 128}
+    given |= {"meshes": "models", "holdout": 5, "turn_objects": True, "materials": "maps", "lights": tmp_path}
+    given |= {"light_share": 0.25, "light_holdout": 3, "turn_lights": False, "light_height": 32}
+    other = set()
+    for more in ({"split": "test", "noise_floor": 30.0, "workers": 3}, {"denoise": True, "cluster": "slurm:2"}):
+        found = Dataset(out=tmp_path, **given, **more).check()
+        assert {name: getattr(found, name) for name in given | more} == given | more
+        other |= {name for name, default in DEFAULTS.items() if getattr(found, name) != default}
+    assert other == DEFAULTS.keys() - {"lights_digest"}  # which is no option
 
 
 def test_numbers_that_are_not_given_depend_on_what_is_asked_for(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from gltf_files import (
     write_normal_mapped,
 )
 from PIL import ExifTags, Image
+from scipy.spatial.transform import Rotation
 from sixteen_bit_files import write_tiff16
 from trimesh.visual.gloss import specular_to_pbr
 
@@ -94,7 +95,8 @@ def test_maps_are_the_file_s_texels(tmp_path):
     assert obj.metallic[inner] == pytest.approx(file.pixels["both"][..., 2] / 255 * 0.5, abs=1e-6)
     linear = srgb_decode(file.pixels["base"] / 255) * [0.5, 1.0, 0.25]
     assert obj.albedo == pytest.approx(np.pad(linear, ((1, 1), (1, 1), (0, 0)), mode="wrap"), abs=1e-6)
-    assert obj.provenance["textures_baked"] == "0"
+    told = {name: obj.provenance[name] for name in ("textures", "textures_averaged", "textures_baked")}
+    assert told == {"textures": "1", "textures_averaged": "0", "textures_baked": "0"}
 
 
 def test_mirrored_coordinates_keep_the_picture_s_vectors(tmp_path):
@@ -276,6 +278,21 @@ def test_quantized_sparse_and_fan(tmp_path):
     obj = load_mesh(quad_glb(tmp_path, fill, ["KHR_mesh_quantization"]))
     assert len(obj.faces) == 2
     assert face_areas(obj).sum() / 2 == pytest.approx(2.0, rel=1e-5)
+
+
+def test_a_node_turns_by_its_quaternion(tmp_path):
+    """About an axis of its own: each entry of the matrix counts."""
+    quaternion = np.array([0.2, -0.5, 0.4, 0.7]) / np.sqrt(0.94)
+    obj = load_mesh(quad_glb(tmp_path, lambda w: w.mesh(w.quad(None), rotation=quaternion.tolist())))
+    turned = Rotation.from_quat(quaternion)
+    found, expected = (points[points[:, 0].argsort()] for points in (obj.vertices * np.sqrt(2), turned.apply(CORNERS)))
+    assert found == pytest.approx(expected, abs=1e-5)
+    assert obj.normals == pytest.approx(np.tile(turned.apply([0, 0, 1]), (4, 1)), abs=1e-5)
+
+
+def test_a_texture_is_refined_to_the_nearest_texels():
+    texels = np.arange(6, dtype=np.float32).reshape(2, 3, 1)
+    np.testing.assert_array_equal(images.nearest(texels, 4, 9), texels.repeat(2, axis=0).repeat(3, axis=1))
 
 
 def test_specular_glossiness_is_converted_as_trimesh_does(tmp_path):

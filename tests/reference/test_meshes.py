@@ -17,6 +17,7 @@ from trimesh.visual.material import PBRMaterial
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes import load_mesh
+from unirender_reference.meshes.limits import texture_side
 from unirender_reference.shapes import MeshObject
 from unirender_reference.shapes.surface import face_normals
 
@@ -166,6 +167,11 @@ def test_repeating_texture_is_unrolled(tmp_path):
     far = load_mesh(write_glb(tmp_path / "far.glb", np.array(GLTF_UV) * 50, png_bytes(tmp_path, four_colors())))
     assert far.provenance["textures_averaged"] == "1"
     assert far.albedo == pytest.approx(load_linear_mean(), abs=5e-3)
+
+
+def test_textures_are_smaller_where_many_share_the_atlas():
+    """A count of texels for all of them together."""
+    assert [texture_side(count) for count in (0, 1, 4, 5, 16, 400)] == [1024, 1024, 1024, 915, 512, 102]
 
 
 def load_linear_mean() -> np.ndarray:

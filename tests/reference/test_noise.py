@@ -26,7 +26,7 @@ from unirender_reference.noise import (
     render_to_floor,
 )
 from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
-from unirender_reference.render import Renderer, SceneSpec
+from unirender_reference.render import Renderer, SceneSpec, render_sample
 
 SHAPE = (64, 64, 3)
 WHOLE = np.ones((64, 64, 1), np.float32)
@@ -235,15 +235,20 @@ def test_a_64_fold_render_confirms_the_floor() -> None:
 
 
 def test_samples_say_what_was_asked_and_reached() -> None:
-    """Image, s and d each have floor and samples of their own; a limit that ends one is told."""
-    spec = SceneSpec(sphere(subdivisions=3), light(1), 0.5, 0.5, resolution=16)
+    """Image, s and d each have floor and samples of their own; a limit that ends one is told. They are the scene's."""
+    spec = SceneSpec(sphere(subdivisions=3), light(1), 0.3, 0.9, resolution=16)
     sample = render_sample_to_floor(spec, 32, seed=3)
     header = sample.provenance
     assert (header["floor_asked_db"], header["floor_reached"], header["batches"]) == ("32", "yes", str(FLOOR_BATCHES))
     mask = sample.intrinsics.require("mask")["mask"]
+    for name, value in (("roughness", 0.3), ("metallic", 0.9)):
+        np.testing.assert_allclose(sample.intrinsics.require(name)[name], value * (mask > 0), atol=1e-3)
     maps = {"image": sample.image_linear, "diffuse": sample.intrinsics.diffuse, "specular": sample.intrinsics.specular}
+    plain = render_sample(spec, 64, seed=4)
+    again = {"image": plain.image_linear, **plain.intrinsics.require("diffuse", "specular")}
     for name, mean in maps.items():
         assert mean is not None
+        np.testing.assert_allclose((mean * mask).mean(), (again[name] * mask).mean(), rtol=0.02, err_msg=name)
         expected, sure = floor_range(mean, sample.variance[name], mask, premultiplied=name == "image")
         assert float(header[f"{name}_floor_db"]) == pytest.approx(expected, abs=0.02)
         assert float(header[f"{name}_sure_db"]) == pytest.approx(sure, abs=0.02)

@@ -206,7 +206,9 @@ def test_scene_hashes_are_those_of_the_scenes_in_any_order() -> None:
         for light in lights
         for obj in (objects[0], moved)
     ]
-    for order in (specs, specs[::-1], sorted(specs, key=lambda spec: spec.light is lights[0])):
+    by_object = sorted(specs, key=lambda spec: spec.obj is moved)  # which is then read once for each light, or once
+    by_both = sorted(specs, key=lambda spec: (spec.obj is moved, spec.light is lights[0]))
+    for order in (specs, specs[::-1], by_object, by_both):
         assert list(scene_hashes(order)) == [scene_hash(spec) for spec in order]
     assert len(set(scene_hashes(specs))) == len(specs)
 

@@ -1,15 +1,18 @@
 """Procedural objects: determinism, disjoint splits, closed outward meshes, charts, textures."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
 from unirender_reference.shapes import HELD_OUT_FAMILIES, TRAIN_FAMILIES, MeshObject, Split, make_object, unit_sphere
-from unirender_reference.shapes.generator import FAMILIES, draw_family
+from unirender_reference.shapes.generator import FAMILIES, _part_texture, draw_family
 from unirender_reference.shapes.implicit import mesh_field
 from unirender_reference.shapes.material_maps import ROUGHEST, SMOOTHEST, normal_from_height, random_material
 from unirender_reference.shapes.mesh_object import signed_volume
-from unirender_reference.shapes.parametric import rounded_box_part
+from unirender_reference.shapes.noise import soft_step, value_noise
+from unirender_reference.shapes.parametric import revolution, rounded_box_part
 from unirender_reference.shapes.surface import Part, corner_normals, grid_part
 from unirender_reference.textures import random_color, random_palette, random_texture
 
@@ -143,6 +146,47 @@ def test_textures_are_solid_functions_of_position():
         assert color.max() <= 0.9501
         np.testing.assert_array_equal(texture(points[::-1]), color[::-1])
     assert len(kinds) == 10
+
+
+def test_noise_meets_its_lattice_and_is_smooth_between():
+    noise = replace(value_noise(np.random.default_rng(2)), offset=np.zeros(3, np.float32))
+    at, right = np.random.default_rng(3).integers(-40, 40, (50, 3)), np.array([1, 0, 0])
+    known, beside = (noise.lattice[tuple(place.T % 32)] for place in (at, at + right))
+    for step, share in ((0.0, 0), (0.25, 0.103515625), (0.5, 0.5), (0.9999, 1)):  # t^3 (6 t^2 - 15 t + 10)
+        np.testing.assert_allclose(noise(at + step * right), known + share * (beside - known), atol=1e-4)
+    points = at + np.random.default_rng(4).random((50, 3))
+    octaves = sum(0.5**k * noise(points * 2**k + 7.31 * k) for k in range(3))
+    np.testing.assert_allclose(noise.fractal(points, 3), octaves / 1.75, atol=1e-5)
+    np.testing.assert_allclose(soft_step(np.array([-1, -0.05, 0, 0.05, 1]), 0.2), [0, 0.25, 0.5, 0.75, 1])
+
+
+def test_a_vase_is_as_wide_as_its_knots():
+    """Its wall is a mean of radii in [0.2, 1]."""
+    for seed in range(5):
+        around = revolution(np.random.default_rng(seed)).vertices[:, [0, 2]]
+        assert 0.3 < np.linalg.norm(around, axis=1).max() <= 1
+
+
+def test_checks_are_equally_large_on_both_sides_of_zero():
+    drawn = (random_texture(np.random.default_rng(seed)) for seed in range(99))
+    checker = next(texture for kind, texture in drawn if kind == "checker")
+    points = np.zeros((1, 8001, 3), np.float32)
+    points[0, :, 0] = np.linspace(-2, 2, 8001)
+    steps = np.flatnonzero(np.abs(np.diff(checker(points)[0], axis=0)).max(-1))
+    assert len(steps) >= 4
+    assert np.ptp(np.diff(steps)) <= 2
+
+
+def test_a_texture_has_the_place_and_the_size_of_its_part():
+    """A part that is moved and enlarged looks the same."""
+    part = rounded_box_part(np.array([1.0, 0.6, 0.4]), 0.1)
+    moved = replace(part, position_map=3 * part.position_map + np.array([5, 1, -2], np.float32))
+    kinds = set()
+    for seed in range(6):
+        (kind, own), (_, same) = (_part_texture(np.random.default_rng(seed), each, True) for each in (part, moved))
+        assert np.isclose(own, same, atol=1e-3).mean() > 0.99, kind
+        kinds.add(kind)
+    assert len(kinds - {"constant"}) >= 3
 
 
 def test_share_of_textured_objects():

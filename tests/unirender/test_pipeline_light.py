@@ -140,12 +140,14 @@ def test_mirrors_are_lit_pixel_by_pixel_under_a_light_with_detail(
     mirror = slice_of(surface(280, 280, roughness=0.05))
     inside = interior(mirror)
     fine, coarse = (every_pixel(mirror, light(rows))[0][inside] for rows in (2 * COARSE_ROWS, 16))
-    assert np.array_equal(derived_specular(mirror, light(2 * COARSE_ROWS))[inside], fine)
-    assert not np.array_equal(derived_specular(mirror, light(2 * COARSE_ROWS), mirrors=False)[inside], fine)
+    mask, environment = mirror.require("mask")["mask"], light(2 * COARSE_ROWS)
+    lit = mirror.replace(environment=environment, metallic=mask, diffuse=mask.repeat(3, axis=-1))
+    assert np.array_equal(ready_to_render(lit, shadows=False).require("specular")["specular"][inside], fine)
+    assert not np.array_equal(derived_specular(mirror, environment, mirrors=False)[inside], fine)
     assert not np.array_equal(derived_specular(mirror, light(16))[inside], coarse)
     assert not caplog.records
     monkeypatch.setattr(derived_light, "MANY_PIXELS", 1000)
-    under_light(mirror, light(2 * COARSE_ROWS), "keep")
+    under_light(mirror, environment, "keep")
     assert "one by one" in caplog.text
 
 

@@ -79,6 +79,8 @@ def test_the_finest_level_is_the_map_and_coarser_ones_are_smoother() -> None:
     np.testing.assert_allclose(
         pyramid.sample(poles.T, np.zeros(4, np.float32)), sample_environment(environment, poles), rtol=1e-3
     )
+    below = pyramid.sample(poles[1:2].T, np.full(1, 99, np.float32))  # the last row of the coarsest level
+    assert environment.min() < below.min() < below.max() < environment.max()
 
 
 def test_some_pixels_have_the_surroundings_they_have_among_all() -> None:

@@ -12,8 +12,9 @@ from unirender import cli
 from unirender.errors import UsageError
 from unirender.training.checkpoint import STATE_FILE
 from unirender.training.command import Train
+from unirender.training.config import RunConfig
 from unirender.training.presets import PRESETS
-from unirender.training.run import train
+from unirender.training.run import run_config, train
 from unirender_reference.folder_lock import locked, made_folder
 
 
@@ -49,6 +50,18 @@ def test_options_count_in_python_as_in_the_command(tmp_path: Path) -> None:
             train(options, own, tmp_path / "run")
     with pytest.raises(UsageError, match=r"it trains a part of a network .* expected --init with a trained one"):
         train(Train(tmp_path), PRESETS["tiny_inverse"], tmp_path / "run")
+
+
+def test_every_option_of_a_run_reaches_it(tmp_path: Path) -> None:
+    """Each with another value than its default."""
+    given: dict[str, Any] = {"steps": 7, "minutes": 2.0, "log_every": 3, "save_minutes": 4.0, "refresh_minutes": 5.0}
+    given |= {"accumulate": 6, "keep_best": "albedo.psnr"}
+    options = Train(tmp_path, **given, validate=2, validate_suite="a/other.toml")
+    found = run_config(options, PRESETS["tiny"], tmp_path / "run", 8)
+    scored = "2 scenes of the suite other"
+    assert found == RunConfig(tmp_path / "run", **given, parallel=8, preset="tiny", scored_on=scored)
+    unlimited = run_config(Train(tmp_path), PRESETS["tiny"], tmp_path, 1)
+    assert unlimited == RunConfig(tmp_path, steps=PRESETS["tiny"].steps, preset="tiny")
 
 
 def test_a_run_of_a_part_goes_on_without_what_it_began_with(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -131,6 +132,44 @@ def test_a_warm_start_takes_the_place_of_the_transport(data: Path, tmp_path: Pat
     np.testing.assert_allclose(obj.roughness, 0.6, atol=0.003)
     with pytest.raises(UnirenderError, match="no model at hand"):
         dataclasses.replace(chosen, out=tmp_path / "p").run()
+
+
+def test_every_option_reaches_what_it_is_for(
+    data: Path, solution: Solution, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Each with another value than its default, up to the call that takes it."""
+    one, mesh, out = tmp_path / "one.png", data / "mesh.glb", tmp_path / "out"
+
+    def taken_by(function: str, *arguments: str | Path) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        calls = []
+
+        def stop(*given: Any, **named: Any) -> None:
+            calls.append((given, named))
+            raise UnirenderError("far enough")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(f"unirender_reference.optimize.{function}", stop)
+            with pytest.raises(UnirenderError, match="far enough"):
+                command(*arguments, "--out", out).run()
+        return calls[0]
+
+    folder = ["--up", "z", "--hold-out", "3", "--most-views", "4", "--size", "12"]
+    given, named = taken_by("folder.read_views", data / "views", *folder)
+    assert (given, named) == ((data / "views",), {"up": "z", "hold_out": 3, "most_views": 4, "longest_side": 12})
+    options = ["--mesh", mesh, "--threads", "1", "--no-pictures", *QUICK]
+    given, named = taken_by("run.optimize", data / "views", *options)
+    assert (given[2].refine.iterations, given[3], named["pictures"], named["threads"]) == (2, out, False, 1)
+
+    view = rendered_views(solution, 1, 0, 12).seen[0]
+    write_png(one, np.concatenate([view.image, view.mask], axis=-1))
+    known = ["--mask", "m.png", "--fov", "40", "--normal", "n.png", "--size", "10"]
+    given, _ = taken_by("picture.read_picture_input", one, *known)
+    assert given == (one, Path("m.png"), 40, Path("n.png"), 10)
+    options = ["--mesh", mesh, "--fov", "40", "--single.light-rows", "12"]
+    given, named = taken_by("single_view.optimize_image", one, *options)
+    assert (given[2].fov_deg, given[3].light_rows, named["hdr"], named["init"]) == (40, 12, False, None)
+    assert len(named["geometry"].faces) == len(solution.obj.faces)
+    assert not out.exists()
 
 
 def test_a_mesh_in_other_units_is_refused(data: Path, solution: Solution, tmp_path: Path):
