@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.atlas import build_atlas
 from unirender_reference.meshes.doubles import without_doubles
@@ -52,8 +53,9 @@ def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
 
 def load_mesh_placed(path: str | Path, root: Path | None = None) -> tuple[MeshObject, Sphere]:
     """Loads a mesh like `load_mesh`, and says where it stood: cameras in the file's units move along with it."""
-    with _one_sentence(Path(path)):
-        return _assembled(Path(path), _read(Path(path), root))
+    path = as_path(path, "mesh")
+    with _one_sentence(path):
+        return _assembled(path, _read(path, root))
 
 
 def read_model(path: str | Path, root: Path | None = None) -> Model:
