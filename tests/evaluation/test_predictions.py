@@ -1,6 +1,7 @@
 """Folders of predictions: how their files are read, and that all that is wrong with one is found at once."""
 
 import json
+import os
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -513,11 +514,20 @@ def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -
     assert problems_of(suite, tmp_path) == ()
     (folder / "out.exr").write_text("an answer")
     (folder / "deeper").mkdir()
+    twin = tmp_path / task.folder.upper()
+    twin.mkdir()
+    pipe, loop = tmp_path / task.folder / "normal.png", tmp_path / task.folder / "roughness.png"
+    os.mkfifo(pipe)
+    loop.symlink_to(loop.name)
     links = (tmp_path / "far.png", tmp_path / task.folder / "albedo.png", folder / "given.png")
     for link in links:
         link.symlink_to("nowhere.png")
     problems = problems_of(suite, tmp_path)
-    assert len(problems) == 5, problems
+    assert len(problems) == 8, problems
+    assert any(problem.startswith(f"{pipe}: a pipe, a socket or a device, expected a file; ") for problem in problems)
+    assert f"{loop}: a link to {loop.name}, which is not there; copy the file, or remove the link" in problems
+    expected = f"expected names like {task.folder}; {task.folder} is there, too: keep one of them"
+    assert f"{twin}: the suite {suite.spec.name!r} has no such picture, {expected}" in problems
     for path in (folder / "out.exr", folder / "deeper"):
         assert f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png" in problems
     for link in links:
