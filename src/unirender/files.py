@@ -39,6 +39,7 @@ from unirender.exr import (
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, MAPS, Intrinsics
+from unirender.paths import forget_half_made
 from unirender.vectors import nonzero
 from unirender.whole_files import move_into_place, naming
 
@@ -53,14 +54,17 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[Path]:
+def new_folder(path: str | Path, *, overwrite: bool | None = None, tidy: bool = True) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
+
+    It lies beside `path`, hidden; one that a killed process left there goes after a day (`forget_half_made`).
 
     Only a result folder (one with `meta.json`) is ever replaced, and none that others were written into.
 
     Args:
         path: where it is to be.
         overwrite: whether a result that is there is replaced; None: it is not, and nobody can ask for it.
+        tidy: whether to look for what killed processes left.
 
     Raises:
         UsageError: `path` is the working directory or lies around it.
@@ -90,6 +94,8 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[P
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if tidy:
+                forget_half_made(path.parent, {path.name})
             temporary.mkdir(mode=0o700)
         except OSError as error:
             raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
