@@ -63,7 +63,8 @@ def planned(config: BenchConfig) -> Plan:
     here, known = prepare(config), Store.open(config.out / "records.jsonl", mend=False).known
     every = itertools.chain(*(here.jobs(scene) for scene in here.scenes), views_jobs(here, config))
     # Without the jobs themselves, which hold the pictures of their scene.
-    facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in every]
+    wanted = (job for job in every if job.possible or job.key in known)
+    facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in wanted]
     labels = dict.fromkeys(label for label, _, _ in facts)
     check = stored_check(check_request(config), here, known.keys())
     return Plan(

@@ -15,6 +15,7 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender_evaluation.bounds import REFERENCE_KEY
+from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.records import RunInfo
 from unirender_evaluation.run_check import CheckRequest, draw_seed, read_check, reference_row, run_check
 from unirender_evaluation.store import Store
@@ -116,6 +117,9 @@ def test_a_suite_without_its_meshes_is_not_rendered_again(
     assert reference_row(check, folder.run.scenes).key == REFERENCE_KEY
     text = verdict_text([], RunInfo("t", "h", 64, ()), check)
     assert f"  open   truth: not rendered again, {check['reason']}" in text
+    jobs = list(folder.run.jobs(suite.scenes[0]))
+    assert {job.label for job in jobs if job.is_done(lambda key: False)} == {MITSUBA.label, f"physics: {MITSUBA.label}"}
+    assert {job.label for job in jobs} > {MITSUBA.label, f"physics: {MITSUBA.label}"}
 
 
 def test_half_a_file_is_no_check(tmp_path: Path) -> None:
