@@ -14,7 +14,9 @@ PACKAGES = {"src": "unirender", "reference": "unirender_reference", "evaluation"
 VOCABULARY = {
     f"unirender.{name}"
     for name in (
+        "arguments",
         "camera",
+        "cicp",
         "color",
         "composite",
         "display_files",

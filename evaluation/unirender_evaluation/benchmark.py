@@ -99,7 +99,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     say_missing(config.out, missing, say, "has files for")
     before = set(store.known)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         check = run_check(request, here, store, progress, say)
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)

@@ -20,6 +20,7 @@ from unirender_evaluation.benchmark import check_request, prepare, views_jobs
 from unirender_evaluation.records import Record
 from unirender_evaluation.run_check import stored_check
 from unirender_evaluation.store import Store
+from unirender_evaluation.truth_check import scenes_here
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ def planned(config: BenchConfig) -> Plan:
     here, known = prepare(config), Store.open(config.out / "records.jsonl", mend=False).known
     every = itertools.chain(*(here.jobs(scene) for scene in here.scenes), views_jobs(here, config))
     # Without the jobs themselves, which hold the pictures of their scene.
-    facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in every]
+    wanted = (job for job in every if job.possible or job.key in known)
+    facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in wanted]
     labels = dict.fromkeys(label for label, _, _ in facts)
     check = stored_check(check_request(config), here, known.keys())
     return Plan(
@@ -70,7 +72,7 @@ def planned(config: BenchConfig) -> Plan:
         rows=tuple(
             _planned_row(label, [(done, record) for own, done, record in facts if own == label]) for label in labels
         ),
-        check_scenes=config.check_scenes,
+        check_scenes=config.check_scenes if scenes_here(here.suite) else 0,
         check_date=None if check is None else str(check["date"]),
         jobs=config.jobs,
         cluster=config.cluster,
@@ -102,6 +104,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     console.print(table)
     scenes = "1 scene" if plan.check_scenes == 1 else f"{plan.check_scenes} scenes"
     check = f"Mitsuba renders {scenes}" if plan.check_date is None else f"that of {plan.check_date} is reused"
+    if plan.check_date is None and not plan.check_scenes:
+        check = "none, since the meshes of the suite are not here"
     console.print(f"Truth check: {check}.", highlight=False)
     if any(row.seconds is not None for row in plan.rows):
         console.print(

@@ -26,7 +26,7 @@ from unirender_evaluation.methods import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import evenly
 from unirender_evaluation.store import Job
-from unirender_evaluation.suite_objects import scene_object
+from unirender_evaluation.suite_objects import object_is_here, scene_object
 from unirender_evaluation.suites import Material, Scene, Suite, material_key
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
@@ -136,7 +136,7 @@ def prediction(task: Task, mitsuba: MitsubaScene) -> Prediction:
 def mitsuba_jobs(
     suite: Suite, scenes: Sequence[Scene], scene: Scene, key_of: KeyOf, backbones: Sequence[str], most: int | None
 ) -> Iterator[Job]:
-    """Mitsuba's records of one scene, the physics table's aside.
+    """Mitsuba's records of one scene, the physics table's aside; possible where the object is here.
 
     Args:
         suite: the suite.
@@ -154,7 +154,8 @@ def mitsuba_jobs(
             if task.asks_light:
                 continue  # which Mitsuba is given
             key = key_of(task.identity, MITSUBA, {REFERENCE, LPIPS})
-            yield Job(key, MITSUBA.label, partial(_record, task, mitsuba, key, backbones))
+            make = partial(_record, task, mitsuba, key, backbones)
+            yield Job(key, MITSUBA.label, make, possible=object_is_here(suite, scene))
 
 
 def _record(task: Task, mitsuba: MitsubaScene, key: str, backbones: Sequence[str]) -> Record:

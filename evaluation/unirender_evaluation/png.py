@@ -1,12 +1,18 @@
 """PNG files of predictions, of 8 and 16 bits a channel, as values in [0, 1]."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.cicp import read_cicp
 from unirender.errors import UnirenderError
+from unirender.icc import states_other_colors
 from unirender.sixteen_bits import sixteen_bit_values
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 LINEAR_GAMMA = 0.9  # of the gAMA chunk: 1 is linear, 0.45 like sRGB
 COLOURED = 0.1  # mean difference of the channels; a network's grey pictures have a hundredth
@@ -22,26 +28,29 @@ def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarr
         encoded: whether its values are taken as sRGB-encoded.
 
     Raises:
-        UnirenderError: not a readable PNG, one in colour where `channels` is 1, or one that states to be linear where
-            it is taken as encoded.
+        UnirenderError: not a readable PNG, one in colour where `channels` is 1, or one that states other colours than
+            sRGB's where it is taken as encoded.
     """
     from PIL import Image as Pil
 
     try:
         with Pil.open(path) as picture:
-            stated = picture.info.get("gamma", 0) if "srgb" not in picture.info else 0
+            stated = _other_colors(path, picture) if encoded else None
             if (full := sixteen_bit_values(path)) is not None:
                 value = full[..., :3]
             elif picture.mode.startswith("I"):
                 value = np.asarray(picture, np.float32) / 65535.0
             else:
                 value = np.asarray(picture.convert("RGB"), np.float32) / 255.0
-    except (OSError, ValueError, SyntaxError) as error:
+    except UnirenderError:
+        raise
+    except (OSError, ValueError, SyntaxError, Pil.DecompressionBombError) as error:
         raise UnirenderError(f"predictions: {path} is not a readable PNG ({error}); write it again") from None
-    if encoded and stated > LINEAR_GAMMA:
+    if stated is not None:
         raise UnirenderError(
-            f"predictions: {path} states linear values (gAMA {stated:.3g}), expected sRGB-encoded ones; write it "
-            'without that chunk, or, where they are linear, say png_colour = "linear" in conventions.toml'
+            f"predictions: {path} states {stated}, expected sRGB-encoded values; convert it to sRGB, or write it "
+            'without that where it is in sRGB already; if its values are linear, say png_colour = "linear" in '
+            "conventions.toml"
         )
     value = value if value.ndim == 3 else value[..., None]
     if channels == 3:
@@ -53,3 +62,13 @@ def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarr
             "the blue; of a network's three channels that should be one, their mean"
         )
     return value.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def _other_colors(path: Path, picture: "Image.Image") -> str | None:
+    """What a PNG states of its colours that is not sRGB, by the first chunk that counts (`unirender.cicp`)."""
+    if (coded := read_cicp(path)) is not None:
+        return None if coded.is_srgb else str(coded)
+    if picture.info.get("icc_profile"):
+        return "colours of another ICC profile" if states_other_colors(picture, f"predictions: {path}") else None
+    gamma = 0 if "srgb" in picture.info else picture.info.get("gamma", 0)
+    return f"linear values (gAMA {gamma:.3g})" if gamma > LINEAR_GAMMA else None

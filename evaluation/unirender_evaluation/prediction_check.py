@@ -100,8 +100,8 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
         predictions = PredictionFolder(predictions.folder, Conventions())  # and on to the files
     answered = 0
     for path in _visible(predictions.folder):
-        if _is_broken_link(path):
-            found.append(_broken_link(path))
+        if unusable := _unusable(path):
+            found.append(unusable)
         elif path.is_dir() and path.name in asked:
             files = list(_visible(path))
             found += [_unread_settings(file, predictions.folder) for file in files if _is_settings(file)]
@@ -129,8 +129,10 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
             f"{path}: has folders of {inside} of the pictures itself, expected them in {path.parent}; score it by "
             f"itself, with --predictions NAME={path}"
         )
-    close = difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
-    return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}"
+    twins = [name for name in asked if name.casefold() == path.name.casefold()]
+    close = twins or difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
+    both = f"; {close[0]} is there, too: keep one of them" if twins and path.with_name(close[0]).is_dir() else ""
+    return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}{both}"
 
 
 def _visible(folder: Path) -> Iterator[Path]:
@@ -150,8 +152,8 @@ def _is_answer(path: Path, question: Question) -> bool:
 def _layout_problems(folder: Path, files: list[Path], question: Question) -> Iterator[str]:
     for path in files:
         expected = _is_answer(path, question) or path.name in IGNORED
-        if _is_broken_link(path):
-            yield _broken_link(path)
+        if unusable := _unusable(path):
+            yield unusable
         elif path.is_dir() and path.name not in question.answers:
             yield f"{path}: an unknown folder, expected files {question.files}"
         elif path.is_dir():
@@ -182,8 +184,8 @@ def _meant(path: Path, question: Question) -> str:
 def _problems_in_an_answers_folder(folder: Path) -> Iterator[str]:
     """What lies beside the files that `bench export` puts there: nothing else is looked at."""
     for path in _visible(folder):
-        if _is_broken_link(path):
-            yield _broken_link(path)
+        if unusable := _unusable(path):
+            yield unusable
         elif _is_settings(path):
             yield _unread_settings(path, folder.parents[1])
         elif path.is_dir() or (path.suffix.lower() in PICTURE_LIKE and path.name not in GIVEN):
@@ -202,12 +204,13 @@ def _unread_settings(path: Path, folder: Path) -> str:
     return f"{path}: is not read, expected {folder / FILE} for all pictures, or none; rename, move or remove it"
 
 
-def _is_broken_link(path: Path) -> bool:
-    return path.is_symlink() and not path.exists()
-
-
-def _broken_link(path: Path) -> str:
-    return f"{path}: a link to {path.readlink()}, which is not there; copy the file, or remove the link"
+def _unusable(path: Path) -> str | None:
+    """What is wrong with what is neither a file nor a folder, and would count as an answer that is not there."""
+    if path.is_file() or path.is_dir():
+        return None
+    if path.is_symlink():
+        return f"{path}: a link to {path.readlink()}, which is not there; copy the file, or remove the link"
+    return f"{path}: a pipe, a socket or a device, expected a file; save what it gives as a file, or remove it"
 
 
 def _other_truth(folder: Path, asked: dict[str, Question], suite: Suite) -> Iterator[str]:

@@ -29,6 +29,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, read_exr
@@ -61,7 +62,8 @@ class PredictionFolder:
         UnirenderError: it does not exist or has no subfolder.
     """
 
-    def __init__(self, folder: Path, conventions: Conventions | None = None) -> None:
+    def __init__(self, folder: str | Path, conventions: Conventions | None = None) -> None:
+        folder = as_path(folder, "predictions")
         if not folder.is_dir():
             found = "a file, unpack it if it is an archive" if folder.is_file() else "no such folder"
             raise UnirenderError(f"predictions: {folder}: {found}; expected a folder with a subfolder per picture")

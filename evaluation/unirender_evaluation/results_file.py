@@ -19,6 +19,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
 from unirender_evaluation.records import (
@@ -79,7 +80,7 @@ def read_results(path: str | Path) -> Results:
     Raises:
         UnirenderError: it cannot be read or is not valid; the message lists the problems.
     """
-    return from_document(read_document(Path(path)), str(path))
+    return from_document(read_document(as_path(path)), str(path))
 
 
 def read_document(path: Path) -> Any:

@@ -23,7 +23,7 @@ from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth_check import TruthCheck, check_truth, chosen_scenes
+from unirender_evaluation.truth_check import TruthCheck, check_truth, chosen_scenes, scenes_here, where_meshes_belong
 from unirender_evaluation.versions import LPIPS, REFERENCE
 from unirender_evaluation.workers import Run
 
@@ -52,6 +52,8 @@ def run_check(
 ) -> dict[str, Any]:
     """The check's summary; its records are in the store, those of scenes outside the run laid by.
 
+    Where no object of the suite is here, its truth is not rendered again, and `passed` is None; no file is written.
+
     Args:
         request: what is to be checked.
         here: the run.
@@ -69,6 +71,10 @@ def run_check(
             "(--recheck renders again)"
         )
         return stored
+    if not scenes_here(here.suite):
+        reason = f"its meshes are not in {where_meshes_belong(here.suite)}"
+        say(f"No truth check: {reason}. Rows that need the true shape cannot run; of Mitsuba's, what is stored counts.")
+        return {"passed": None, "reason": reason, "seed": request.seed or 0, "checked_scenes": []}
     seed = draw_seed(here.suite, request.scenes, here.scenes) if request.seed is None else request.seed
     outcome = _render(here.suite, request.scenes, seed, progress)
     summary = outcome.summary()

@@ -139,7 +139,7 @@ class BenchRun:
             print_table(console, table)
         print_verdict(console, result.verdict)
         console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
-        return 0 if result.truth_check.get("passed") else 1
+        return 1 if result.truth_check.get("passed", False) is False else 0
 
 
 def print_verdict(console: "Console", verdict: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import METRICS, Variant, metric_key
@@ -55,6 +56,8 @@ def score(
     from unirender_evaluation.scoring import score_image, score_maps
 
     variant = Variant.parse(protocol) if isinstance(protocol, str) else protocol
+    if variant is not None:
+        as_instance(variant, Variant, "score: protocol")
     options: dict[str, Any] = {
         "lpips": _networks(lpips),
         "lpips_scales": ("raw" if variant is None else variant.scale,),
@@ -90,8 +93,9 @@ def score(
 
 
 def _networks(backbones: Sequence[str]) -> "list[Lpips]":
-    if isinstance(backbones, str):
-        raise UnirenderError(f"score: got lpips={backbones!r}, expected a list of names: lpips=[{backbones!r}]")
+    if isinstance(backbones, str) or not isinstance(backbones, Sequence):
+        name = backbones if isinstance(backbones, str) else "vgg"
+        raise UnirenderError(f"score: got lpips={backbones!r:.60}, expected a list of names: lpips=[{name!r}]")
     if not backbones:
         return []
     from unirender_evaluation.lpips import load

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance
 from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
@@ -60,7 +61,8 @@ def score_maps(
     Raises:
         UnirenderError: if the truth has no mask or an empty one, or sizes differ.
     """
-    w = _truth_mask(truth.mask)
+    as_instance(prediction, Intrinsics, "prediction")
+    w = _truth_mask(as_instance(truth, Intrinsics, "truth").mask)
     own = _own_mask(prediction.mask, w)
     values: dict[str, float] = {}
     if own is not w:

@@ -140,13 +140,16 @@ class Job:
         label: for the progress bar.
         make: computes it.
         kept: whether the picture that belongs to it is there (or none is wanted).
+        possible: whether what it needs is here; where it is not, a record that is stored counts, and none is made.
     """
 
     key: str
     label: str
     make: Callable[[], Record]
     kept: bool = True
+    possible: bool = True
 
     def is_done(self, has: Callable[[str], bool]) -> bool:
         """Whether nothing is to do; `has` says whether a record is there."""
-        return has(self.key) and self.kept
+        there = has(self.key)
+        return (there and self.kept) or not self.possible

@@ -8,6 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.stratification import Material, stratified_materials
@@ -132,7 +133,7 @@ def suite_path(name_or_path: str | Path) -> Path:
     Raises:
         UnirenderError: the package has none of that name.
     """
-    path = Path(name_or_path)
+    path = as_path(name_or_path, "suite")
     if path.suffix == ".toml":
         return path
     bundled = suite_folder() / f"{name_or_path}.toml"

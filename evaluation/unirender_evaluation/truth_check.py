@@ -123,6 +123,12 @@ def scenes_here(suite: Suite) -> list[Scene]:
     return [scene for scene in suite.scenes if object_is_here(suite, scene)]
 
 
+def where_meshes_belong(suite: Suite) -> str:
+    """The folder where a suite looks for its meshes, and where to get them or how to name another."""
+    source = suite.spec.objects_from or f"name their folder as `objects` under [folders] in {suite.spec.path}"
+    return f"{suite.spec.folder('objects') or 'any folder'} ({source})"
+
+
 def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
     """`count` scenes at random, of different objects as long as there are enough.
 
@@ -164,11 +170,9 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
 
     chosen_from = (len(scenes_here(suite)), len(suite.scenes))
     if chosen_from[0] < chosen_from[1]:
-        where = suite.spec.folder("objects") or "any folder"
-        source = suite.spec.objects_from or f"name their folder as `objects` under [folders] in {suite.spec.path}"
         logger.warning(
-            "the truth check chooses from %d of %d scenes: the meshes of the others are not in %s (%s)",
-            *(*chosen_from, where, source),
+            "the truth check chooses from %d of %d scenes: the meshes of the others are not in %s",
+            *(*chosen_from, where_meshes_belong(suite)),
         )
     checks: list[Check] = []
     others: list[str] = []

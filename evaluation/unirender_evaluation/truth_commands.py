@@ -97,7 +97,7 @@ class BenchTruth:
 
         work, console = self.work or cache_dir() / "truth", Console()
         folders = {"out": self.out, "objects": self.objects, "lights": self.lights}
-        with Progress(console=console, transient=not console.is_terminal) as progress:
+        with Progress(console=console, disable=not console.is_terminal) as progress:
             bar = progress.add_task("truth", total=None)
             with closing(make_truth(self.suite, work, self.workers, **folders)) as finished:
                 for done, total in finished:

@@ -121,14 +121,24 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     lines += [f"  FAILS  {breach}" for breach in breaches] or [
         "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
     ]
+    lines += _truth_lines(check)
+    if run.limit is not None:
+        lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
+    return "\n".join(lines)
+
+
+def _truth_lines(check: dict) -> list[str]:
+    """What the truth check found, or why there was none."""
+    if check["passed"] is None:
+        return [f"  open   truth: not rendered again, {check['reason']}"]
     state = "HOLDS" if check["passed"] else "FAILS"
     agree = "differ from" if check["failed"] else "agree with"
     objects = f"{check['geometries']} object{'s' * (check['geometries'] != 1)}"
-    lines.append(
+    lines = [
         f"  {state}  truth: {check['members']} members, and mask, albedo and normal of {objects}, "
         f"rendered again with other seeds {agree} the truth file (check seed {check['seed']}, {check['date']}, "
         f"smallest pass share {check['smallest_pass_share']:.3f}); {_twins_text(check)}"
-    )
+    ]
     here, scenes = check["chosen_from"]
     if here < scenes:
         lines.append(f"         (chosen from {here} of {scenes} scenes: the meshes of the others are not here)")
@@ -138,9 +148,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
             f"         (the object generator makes other meshes of {', '.join(check['other_objects'])} "
             "than when the truth was made)"
         )
-    if run.limit is not None:
-        lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
-    return "\n".join(lines)
+    return lines
 
 
 def _twins_text(check: dict) -> str:

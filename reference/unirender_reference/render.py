@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
@@ -73,8 +74,8 @@ class Renderer:
     def __init__(self, obj: MeshObject, camera: Camera | None = None, resolution: int = 64) -> None:
         if not isinstance(resolution, Integral) or resolution < 1:
             raise UnirenderError(f"resolution: got {resolution!r:.60}, expected a whole number of pixels, at least 1")
-        self.obj = obj
-        self.camera = camera or Camera()
+        self.obj = as_instance(obj, MeshObject, "renderer")
+        self.camera = Camera() if camera is None else as_instance(camera, Camera, "renderer")
         self.resolution = resolution
         self.counters = Counters()
         self.scene = EditableScene(obj, self.camera, resolution)
@@ -206,6 +207,7 @@ def renderer_of(spec: SceneSpec, renderer: Renderer | None = None) -> Renderer:
     Raises:
         UnirenderError: the one given has another object (by its arrays, not by its name), camera or resolution.
     """
+    as_instance(spec, SceneSpec, "scene")
     if renderer is None:
         return Renderer(spec.obj, spec.camera, spec.resolution)
     same = renderer.obj is spec.obj or (

@@ -21,6 +21,7 @@ from numbers import Integral
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, as_numbers
 from unirender.lighting import as_light
@@ -152,8 +153,7 @@ def _arguments(
     geometry: MeshObject | None,
 ) -> tuple[dict[str, Float[np.ndarray, "h w c"]], Float[np.ndarray, "eh ew 3"], Float[np.ndarray, "h w 1"]]:
     """Maps, light (checked; it may be black), and the mask: 0 where there is no normal."""
-    if not isinstance(intrinsics, Intrinsics):
-        raise UnirenderError(f"shade: got {type(intrinsics).__name__}, expected unirender.intrinsics.Intrinsics")
+    as_instance(intrinsics, Intrinsics, "shade")
     if not isinstance(spp, Integral):
         raise UnirenderError(f"spp: got {spp!r:.60}, expected a whole number of samples, at least 1")
     if geometry is not None and not isinstance(geometry, MeshObject):

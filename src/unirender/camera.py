@@ -84,7 +84,7 @@ class Camera:
         Raises:
             UnirenderError: the text is no such camera.
         """
-        found = _DESCRIPTION.fullmatch(text.strip())
+        found = _DESCRIPTION.fullmatch(text.strip()) if isinstance(text, str) else None
         if found is None:
             raise UnirenderError(f"camera: got {text!r}, expected a text like {cls().describe()!r}; pass --fov")
         fov_deg, x, y = (float(number) for number in found.groups())

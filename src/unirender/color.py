@@ -11,27 +11,34 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_floats
+from unirender.errors import UnirenderError
+
 LUMINANCE_REC709 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 MIN_MASK = 1e-6  # a coverage that is divided by; less than half precision stores
 
 
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Linear -> display value. Defined on [0, inf); negative input follows the linear toe."""
-    linear = np.asarray(linear, dtype=np.float32)
+    """Linear -> display value. Defined on [0, inf); negative input follows the linear toe.
+
+    Raises:
+        UnirenderError: no numbers, or those of 8 or 16 bits.
+    """
+    linear = np.asarray(as_floats(linear, "linear values"), dtype=np.float32)
     power = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
 
 
 def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Display value -> linear; the inverse of `srgb_encode`."""
-    srgb = np.asarray(srgb, dtype=np.float32)
+    """Display value -> linear; the inverse of `srgb_encode`, with the same errors."""
+    srgb = np.asarray(as_floats(srgb, "display values"), dtype=np.float32)
     power = np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4)
     return np.where(srgb <= 0.04045, srgb / 12.92, power).astype(np.float32)
 
 
 def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
-    return srgb_encode(np.clip(image_linear, 0.0, 1.0))
+    return srgb_encode(np.clip(as_floats(image_linear, "image"), 0.0, 1.0))
 
 
 def display_slope(
@@ -54,7 +61,16 @@ def display_slope(
 def unpremultiply(
     image_linear: Float[np.ndarray, "*batch h w c"], mask: Float[np.ndarray, "*batch h w 1"]
 ) -> Float[np.ndarray, "*batch h w c"]:
-    """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0."""
+    """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0.
+
+    Raises:
+        UnirenderError: one of them is of whole numbers, or the mask has not one channel.
+    """
+    image_linear, mask = as_floats(image_linear, "image"), as_floats(mask, "mask")
+    if mask.ndim != image_linear.ndim or mask.shape[-1] != 1:
+        raise UnirenderError(
+            f"mask: got shape {mask.shape} for an image of {image_linear.shape}, expected [height, width, 1]"
+        )
     return np.where(mask > 0, image_linear / np.maximum(mask, MIN_MASK), 0).astype(np.float32)
 
 

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
 from unirender.surface_light import MIN_ALPHA
@@ -171,6 +172,7 @@ def _integrate_lobes(
 
 
 def _maps(intrinsics: Intrinsics, *names: str) -> dict[str, np.ndarray]:
+    as_instance(intrinsics, Intrinsics, "composite")
     maps = {name: getattr(intrinsics, name) for name in names}
     missing = [name for name, value in maps.items() if value is None]
     if missing:

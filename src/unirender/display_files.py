@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
+from unirender.cicp import Cicp, read_cicp
 from unirender.errors import UnirenderError
 from unirender.icc import in_srgb
 from unirender.primaries import REC709, SAME_PRIMARIES
@@ -98,8 +99,11 @@ def srgb_values_and_remarks(
 ) -> tuple[Float[np.ndarray, "h w c"], dict[str, str]]:
     """The same, and remarks by kind on what was lost in reading it; `upright` as of `stored_values`."""
     image = open_picture(path, upright=upright)
+    coded = read_cicp(path)
+    if coded is not None and coded.is_srgb:
+        image.info.pop("icc_profile", None)  # which counts less
     srgb = in_srgb(image, name)
-    remarks = _png_remarks(image)
+    remarks = _png_remarks(image, coded)
     full = sixteen_bit_values(path, upright=upright) if srgb is image else None
     if full is not None:
         return full, remarks
@@ -108,10 +112,15 @@ def srgb_values_and_remarks(
     return display_values(srgb, name), remarks | ({"depth": SIXTEEN_BITS} if cut else {})
 
 
-def _png_remarks(image: Image.Image) -> dict[str, str]:
-    """What is due on a PNG that states another gamma or other primaries than sRGB's, and nothing that counts more (an
-    sRGB chunk, an ICC profile)."""
-    if {"srgb", "icc_profile"} & image.info.keys():
+def _png_remarks(image: Image.Image, coded: Cicp | None) -> dict[str, str]:
+    """What is due on a PNG that states other colours than sRGB's and has no ICC profile, by which it is converted; of
+    gamma and primaries where nothing counts more (`unirender.cicp`)."""
+    if image.info.get("icc_profile"):
+        return {}
+    if coded is not None:
+        said = f"the file states {coded}, its values are taken as sRGB: convert it"
+        return {} if coded.is_srgb else {"primaries": said}
+    if "srgb" in image.info:
         return {}
     remarks, gamma = {}, image.info.get("gamma")
     if gamma is not None and abs(gamma - SRGB_GAMMA) > SAME_GAMMA:

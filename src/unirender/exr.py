@@ -15,6 +15,7 @@ import numpy as np
 import OpenEXR
 from jaxtyping import Float
 
+from unirender.arguments import as_instance, as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
@@ -55,7 +56,7 @@ def write_exr(
         UnirenderError: shapes differ, a value is not finite, or it does not fit into half precision.
         OSError: it cannot be written; what was there stays.
     """
-    replace_file(Path(path), exr_bytes(channels, half=half, attributes=attributes))
+    replace_file(as_path(path), exr_bytes(channels, half=half, attributes=attributes))
 
 
 def write_environment(
@@ -98,6 +99,7 @@ def exr_bytes(
     channels: Mapping[str, np.ndarray], *, half: bool = True, attributes: Mapping[str, str] | None = None
 ) -> bytes:
     """The bytes of an EXR file; arguments and errors as `write_exr`."""
+    as_instance(channels, Mapping, "EXR channels")
     shapes = {name: np.shape(value) for name, value in channels.items()}
     if not channels or len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 2:
         raise UnirenderError(f"EXR channels: got shapes {shapes}, expected one common [height, width]")
@@ -113,7 +115,7 @@ def exr_bytes(
             )
         stored[name] = np.ascontiguousarray(value, dtype=np.float16 if half else np.float32)
     header: dict[str, object] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    for key, value in (attributes or {}).items():
+    for key, value in as_instance(attributes or {}, Mapping, "EXR attributes").items():
         text = str(value).encode(errors="backslashreplace").decode()  # the name of a file need not be UTF-8
         header[key if key.startswith(ATTRIBUTE_PREFIX) else ATTRIBUTE_PREFIX + key] = text
     stream = io.BytesIO()
@@ -130,7 +132,7 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
         UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels of another part
             than its picture.
     """
-    path = Path(path)
+    path = as_path(path)
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -166,7 +168,14 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
 
 
 def image_channels(image_linear: Float[np.ndarray, "h w c"]) -> Channels:
-    """`[h w 3]` or `[h w 4]` premultiplied linear image -> channels R, G, B[, A]."""
+    """`[h w 3]` or `[h w 4]` premultiplied linear image -> channels R, G, B[, A].
+
+    Raises:
+        UnirenderError: it is no array of such a shape.
+    """
+    as_instance(image_linear, np.ndarray, "picture")
+    if image_linear.ndim != 3 or image_linear.shape[-1] not in (3, 4):
+        raise UnirenderError(f"picture: got shape {image_linear.shape}, expected (height, width, 3 or 4)")
     return {name: image_linear[..., i] for i, name in enumerate("RGBA"[: image_linear.shape[-1]])}
 
 
@@ -186,6 +195,7 @@ def channels_rgb(channels: Channels, prefix: str = "", components: str = "RGB") 
 def intrinsics_channels(intrinsics: Intrinsics) -> Channels:
     """The image-aligned maps that are present, as channels; the mask as `mask.Y`."""
     channels: Channels = {}
+    as_instance(intrinsics, Intrinsics, "channels of intrinsics")
     for name in IMAGE_MAPS:
         value = getattr(intrinsics, name)
         if value is not None:
@@ -205,9 +215,10 @@ def intrinsics_from_channels(
         UnirenderError: a map has some of its channels only, or values outside the contract.
     """
     maps: dict[str, np.ndarray] = {}
+    as_instance(channels, Mapping, "EXR channels")
     for name in IMAGE_MAPS:
         if any(channel in channels for channel in MAP_CHANNELS[name]):
             maps[name] = channels_rgb(channels, name, _COMPONENTS.get(name, "Y"))
     if "mask" not in maps and "A" in channels:
         maps["mask"] = channels["A"][..., None]
-    return Intrinsics(**maps, environment=environment, camera=camera or Camera())
+    return Intrinsics(**maps, environment=environment, camera=Camera() if camera is None else camera)

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.arguments import as_floats, as_instance, as_path
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
@@ -37,7 +38,8 @@ from unirender.exr import (
     write_environment,
     write_exr,
 )
-from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.intrinsics import IMAGE_MAPS, MAPS, Intrinsics
+from unirender.paths import forget_half_made
 from unirender.vectors import nonzero
 from unirender.whole_files import move_into_place, naming
 
@@ -52,21 +54,24 @@ logger = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[Path]:
+def new_folder(path: str | Path, *, overwrite: bool | None = None, tidy: bool = True) -> Iterator[Path]:
     """A temporary folder that becomes `path` when the block ends without an error, and vanishes otherwise.
+
+    It lies beside `path`, hidden; one that a killed process left there goes after a day (`forget_half_made`).
 
     Only a result folder (one with `meta.json`) is ever replaced, and none that others were written into.
 
     Args:
         path: where it is to be.
         overwrite: whether a result that is there is replaced; None: it is not, and nobody can ask for it.
+        tidy: whether to look for what killed processes left.
 
     Raises:
         UsageError: `path` is the working directory or lies around it.
         UnirenderError: `path` exists and is not empty, and `overwrite` is not given or it is no result folder; or it
             cannot be made or replaced.
     """
-    shown, path = path, Path(path).resolve()
+    shown, path = path, as_path(path, "folder").resolve()
     if path == Path.cwd() or path in Path.cwd().parents:
         raise UsageError(f"{shown}: is the folder that you are in (or one around it), expected a new one; name another")
     if path.exists() and not path.is_dir():
@@ -89,6 +94,8 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None) -> Iterator[P
     try:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if tidy:
+                forget_half_made(path.parent, {path.name})
             temporary.mkdir(mode=0o700)
         except OSError as error:
             raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
@@ -133,13 +140,27 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
 
 
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
-    """Display values in [0, 1], 1, 3 or 4 channels, as an 8-bit PNG."""
+    """Display values in [0, 1], 1, 3 or 4 channels, as an 8-bit PNG.
+
+    Raises:
+        UnirenderError: no such values, or no path.
+    """
+    values = as_floats(values, "picture")
+    if values.ndim != 3 or values.shape[-1] not in (1, 3, 4):
+        raise UnirenderError(f"picture: got shape {values.shape}, expected (height, width, 1, 3 or 4)")
     pixels = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(path, format="PNG")
+    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(as_path(path), format="PNG")
 
 
 def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    """A map as people look at it: colours and light through sRGB, normals as (n + 1) / 2, the others as they are."""
+    """A map as people look at it: colours and light through sRGB, normals as (n + 1) / 2, the others as they are.
+
+    Raises:
+        UnirenderError: there is no map of that name, or it is of no numbers.
+    """
+    if name not in MAPS:
+        raise UnirenderError(f"map: got {name!r:.60}, expected one of {', '.join(MAPS)}")
+    value = as_floats(value, name)
     if name == "normal":
         return np.where(nonzero(value)[..., None], value * 0.5 + 0.5, 0)
     return value if name in ("roughness", "metallic", "mask") else image_srgb(value)
@@ -163,6 +184,8 @@ def write_result(
         image_linear: a rendered image, premultiplied; written as `image.exr` and `image.png` (with alpha if the mask is
             known).
     """
+    if intrinsics is not None:
+        as_instance(intrinsics, Intrinsics, "result")
     attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
         if any(name in IMAGE_MAPS for name in intrinsics.present):
@@ -216,7 +239,7 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
         UnirenderError: there is nothing of the kind, a file is broken, or the folder's environment is another one than
             s and d were written with.
     """
-    path = Path(path)
+    path = as_path(path)
     file = path / INTRINSICS_FILE if path.is_dir() else path
     if path.is_dir() and not file.is_file():
         inside = sorted(found.parent.name for found in path.glob(f"*/{INTRINSICS_FILE}"))

@@ -26,6 +26,7 @@ from unirender.files import (
     write_result,
 )
 from unirender.intrinsics import MAPS
+from unirender.paths import forget_half_made
 from unirender.pictures import Picture, checked_file
 from unirender.whole_files import replace_file
 
@@ -146,6 +147,7 @@ def decompose_folder(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
+    forget_half_made(output, {path.name for path in pictures})
     done, damaged, mask_of = FolderResult(), set[Path](), mask_finder(masks)
 
     def wanted() -> Iterator[tuple[Path, Picture, dict[str, Any]]]:
@@ -169,7 +171,8 @@ def decompose_folder(
         results = decompose([picture for _, picture, _ in batch])
         for (path, _, meta), result in zip(batch, results, strict=True):
             try:
-                with new_folder(output / path.name, overwrite=overwrite or path in damaged) as folder:
+                again = overwrite or path in damaged
+                with new_folder(output / path.name, overwrite=again, tidy=False) as folder:
                     written = write_decomposition(folder, result, meta)
             except UnirenderError as error:
                 done.failed[path.name] = str(error)

@@ -40,7 +40,10 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
         if colors.mode == "RGB" and _is_srgb(profile):
             return image
         srgb, intent = ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC
-        converted = ImageCms.profileToProfile(colors, profile, srgb, renderingIntent=intent, outputMode="RGB")
+        flags = ImageCms.Flags.NOOPTIMIZE if colors.mode == "L" else ImageCms.Flags.NONE  # dark grey was up to 10 off
+        converted = ImageCms.profileToProfile(
+            colors, profile, srgb, renderingIntent=intent, outputMode="RGB", flags=flags
+        )
     except (ImageCms.PyCMSError, OSError, ValueError) as error:
         reason = f"for {space} and the picture is {colors.mode}" if space else str(error)
         raise UnirenderError(
@@ -50,6 +53,19 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
     if alpha is not None:
         converted.putalpha(alpha)
     return converted
+
+
+def states_other_colors(image: Image.Image, name: str) -> bool:
+    """Whether a picture's colours are others under its ICC profile than they are in sRGB.
+
+    Raises:
+        UnirenderError: as `in_srgb`.
+    """
+    converted = in_srgb(image, name)
+    if converted is image:
+        return False
+    seen, stored = (np.asarray(each.convert("RGB"), np.int16) for each in (converted, image))
+    return bool(np.abs(seen - stored).max() > SAME_PROFILE)
 
 
 def _opaque_mode(image: Image.Image) -> str:

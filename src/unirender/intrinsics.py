@@ -142,8 +142,11 @@ class Intrinsics:
         """The named maps as a dict.
 
         Raises:
-            UnirenderError: one of them is not known.
+            UnirenderError: one of them is not known, or there is no map of that name.
         """
+        if unknown := [name for name in names if name not in MAPS]:
+            named = ", ".join(map(repr, unknown))
+            raise UnirenderError(f"intrinsics: there is no map {named}, expected some of {', '.join(MAPS)}")
         missing = [name for name in names if getattr(self, name) is None]
         if missing:
             raise UnirenderError(
@@ -198,7 +201,13 @@ def check_radiance(name: str, value: Any) -> None:
 
 
 def unit_normals(normal: Float[np.ndarray, "*size 3"]) -> Float[np.ndarray, "*size 3"]:
-    """Normals of length 1; unit ones stay as they are, to the bit, and 0, no surface, stays 0."""
+    """Normals of length 1; unit ones stay as they are, to the bit, and 0, no surface, stays 0.
+
+    Raises:
+        UnirenderError: no array of three channels.
+    """
+    if not isinstance(normal, np.ndarray) or normal.shape[-1:] != (3,):
+        raise UnirenderError(f"normal: got {type(normal).__name__} of shape {np.shape(normal)}, expected [..., 3]")
     length = lengths(normal)
     known = length > SHORTEST_NORMAL
     off = np.where(known, np.abs(length - 1) > UNIT_TOLERANCE, length > 0)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_floats, as_instance
 from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_radiance, check_radiance
@@ -52,7 +53,13 @@ def as_light(environment: Any) -> Float[np.ndarray, "h w 3"]:
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
-    """Unit directions of the texels, camera axes."""
+    """Unit directions of the texels, camera axes.
+
+    Raises:
+        UnirenderError: height and width are no whole numbers of at least 1.
+    """
+    if not all(isinstance(side, Integral) and side >= 1 for side in (height, width)):
+        raise UnirenderError(f"environment: got size {(height, width)}, expected whole numbers of at least 1")
     theta = np.pi * np.arange(height) / max(height - 1, 1)
     phi = 2 * np.pi * (np.arange(width) + 0.5) / width
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
@@ -80,6 +87,9 @@ def sample_environment(
     """
     check_map(environment)
     height, width = environment.shape[:2]
+    directions = as_floats(directions, "directions")
+    if directions.shape[-1:] != (3,):
+        raise UnirenderError(f"directions: got shape {directions.shape}, expected [..., 3]")
     squared = np.einsum("...c,...c->...", directions, directions)
     if not (np.abs(squared - 1) < UNIT_TOLERANCE).all():
         raise UnirenderError(
@@ -120,6 +130,7 @@ def rotate_environment(
 
 def mirror_environment(environment: Float[np.ndarray, "*n h w 3"]) -> Float[np.ndarray, "*n h w 3"]:
     """The light seen in a mirror that flips x; exact."""
+    as_instance(environment, np.ndarray, "environment")
     return environment[..., ::-1, :].copy()
 
 

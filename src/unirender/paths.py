@@ -2,15 +2,17 @@
 
 import contextlib
 import os
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from unirender.errors import UnirenderError
 
 HALF_MADE = ".*.????????"  # folders of `tempfile`
+HALF_WRITTEN = re.compile(r"\.(.+)\.[0-9a-f]{12}")  # folders of `files.new_folder`
 FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one: it takes minutes
 
 
@@ -30,7 +32,8 @@ def cached_folder(folder: Path) -> Iterator[Path]:
     temporary = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        _forget_half_made(folder.parent)
+        for half_made in folder.parent.glob(HALF_MADE):
+            _forget(half_made)
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:16]}.", dir=folder.parent))
         yield temporary
         try:
@@ -47,8 +50,15 @@ def cached_folder(folder: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _forget_half_made(parent: Path) -> None:
-    for path in parent.glob(HALF_MADE):
-        with contextlib.suppress(OSError):  # another process takes it away
-            if time.time() - path.stat().st_mtime > FORGOTTEN_S:
-                shutil.rmtree(path, ignore_errors=True)
+def forget_half_made(parent: Path, names: Collection[str]) -> None:
+    """Deletes the temporary folders of `files.new_folder(parent / name)` that a killed process left, after a day."""
+    for path in parent.iterdir():
+        found = HALF_WRITTEN.fullmatch(path.name)
+        if found is not None and found[1] in names and not path.is_symlink():
+            _forget(path)
+
+
+def _forget(path: Path) -> None:
+    with contextlib.suppress(OSError):  # another process takes it away
+        if time.time() - path.stat().st_mtime > FORGOTTEN_S:
+            shutil.rmtree(path, ignore_errors=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
@@ -75,7 +76,7 @@ def checked_file(path: str | Path) -> Path:
     Raises:
         UnirenderError: there is no such file, or it is none.
     """
-    path = Path(path)
+    path = as_path(path)
     if not path.exists():
         raise UnirenderError(f"{path}: no such file, expected a picture: {FORMATS}")
     if path.is_dir():

@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from multiprocessing import parent_process
+from multiprocessing import parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from types import TracebackType
 from typing import Any
@@ -49,6 +49,7 @@ class WorkerPool(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int, start: Callable[..., None] | None = None, *arguments: Any) -> None:
+        start_tracker()
         self._starting = _Starting()
         super().__init__(workers, self._starting, _begin, (start, *arguments))
 
@@ -108,13 +109,24 @@ def exit_with_parent() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
+def start_tracker() -> None:
+    """Starts the process in which `multiprocessing` notes what workers share, so that it outlives a closing terminal.
+
+    That process ignores the other two signals by itself. On SIGHUP it would end before this one, which then starts a
+    second one that knows of nothing and prints a `KeyError` for all that it is to forget.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        with interrupts_blocked(signal.SIGHUP):
+            resource_tracker.ensure_running()
+
+
 @contextlib.contextmanager
-def interrupts_blocked() -> Iterator[None]:
-    """Holds SIGINT back until the block is left; for good in processes and threads that the block starts."""
+def interrupts_blocked(number: int = signal.SIGINT) -> Iterator[None]:
+    """Holds a signal back until the block is left; for good in processes and threads that the block starts."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {number})
     try:
         yield
     finally:

@@ -1,6 +1,7 @@
 """Folders of predictions: how their files are read, and that all that is wrong with one is found at once."""
 
 import json
+import os
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -8,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from icc_profiles import P3_D50, SRGB_D50, matrix_profile
+from PIL import Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
 from sixteen_bit_files import write_png16
 from tiny_suites import make_suite
@@ -61,26 +63,50 @@ def test_png_predictions_and_broken_files(suite: Suite, tmp_path: Path) -> None:
         row.predictions.answer(task)
 
 
+LINEAR, SRGB_NUMBERS, HDR_NUMBERS = round(1e5).to_bytes(4, "big"), bytes((1, 13, 0, 1)), bytes((9, 16, 0, 1))
+SRGB_PROFILE = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
 @pytest.mark.parametrize(
-    ("gamma", "srgb", "refused"), [(1.0, False, True), (1.0, True, False), (0.45455, False, False)]
+    ("chunks", "profile", "stated"),
+    [
+        ({b"gAMA": LINEAR}, None, r"linear values \(gAMA 1\)"),
+        ({b"gAMA": (45455).to_bytes(4, "big")}, None, None),
+        ({b"sRGB": b"\0", b"gAMA": LINEAR}, None, None),
+        ({b"gAMA": LINEAR}, SRGB_PROFILE, None),
+        ({}, matrix_profile(P3_D50, 2.2), "colours of another ICC profile"),
+        ({b"gAMA": LINEAR}, matrix_profile(SRGB_D50, 1.0), "colours of another ICC profile"),
+        ({b"cICP": SRGB_NUMBERS, b"gAMA": LINEAR}, matrix_profile(SRGB_D50, 1.0), None),
+        ({b"cICP": HDR_NUMBERS, b"sRGB": b"\0"}, None, r"Rec.2020 primaries and PQ transfer \(cICP\)"),
+        ({}, b"no profile", None),
+    ],
 )
-def test_a_png_that_states_linear_values_is_not_decoded(
-    tmp_path: Path, gamma: float, srgb: bool, refused: bool
+def test_a_png_that_states_other_colours_is_not_decoded(
+    tmp_path: Path, chunks: dict[bytes, bytes], profile: bytes | None, stated: str | None
 ) -> None:
-    """Decoded all the same its colours would be far too dark, and nothing but the score would say so. An sRGB chunk
-    goes before gAMA; of maps that are linear anyway both say nothing."""
-    chunks = PngInfo()
-    if srgb:
-        chunks.add(b"sRGB", b"\0")
-    chunks.add(b"gAMA", round(gamma * 1e5).to_bytes(4, "big"))
+    """Decoded all the same its colours would be wrong (of linear ones far too dark), and nothing but the score would
+    say so. Of cICP, an ICC profile, sRGB and gAMA the first counts; of maps that are linear anyway all say nothing."""
+    more = PngInfo()
+    for name, value in chunks.items():
+        more.add(name, value)
     path = tmp_path / "albedo.png"
-    Image.fromarray(np.full((4, 4, 3), 128, np.uint8)).save(path, pnginfo=chunks)
+    Image.fromarray(np.full((4, 4, 3), (128, 40, 200), np.uint8)).save(path, pnginfo=more, icc_profile=profile)
     read_png(path, 3)
-    if refused:
-        with pytest.raises(UnirenderError, match=r"states linear values \(gAMA 1\), .* png_colour = .linear."):
+    if profile == b"no profile":
+        with pytest.raises(UnirenderError, match=r"albedo.png: its ICC profile cannot be used"):
+            read_png(path, 3, encoded=True)
+    elif stated is not None:
+        with pytest.raises(UnirenderError, match=rf"albedo.png states {stated}, .* png_colour = .linear."):
             read_png(path, 3, encoded=True)
     else:
         read_png(path, 3, encoded=True)
+
+
+def test_a_png_of_too_many_pixels_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "albedo.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4)
+    with pytest.raises(UnirenderError, match=r"not a readable PNG .*exceeds limit"):
+        read_png(tmp_path / "albedo.png", 3)
 
 
 @pytest.mark.parametrize("filter_type", [0, 1])
@@ -488,11 +514,20 @@ def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -
     assert problems_of(suite, tmp_path) == ()
     (folder / "out.exr").write_text("an answer")
     (folder / "deeper").mkdir()
+    twin = tmp_path / task.folder.upper()
+    twin.mkdir()
+    pipe, loop = tmp_path / task.folder / "normal.png", tmp_path / task.folder / "roughness.png"
+    os.mkfifo(pipe)
+    loop.symlink_to(loop.name)
     links = (tmp_path / "far.png", tmp_path / task.folder / "albedo.png", folder / "given.png")
     for link in links:
         link.symlink_to("nowhere.png")
     problems = problems_of(suite, tmp_path)
-    assert len(problems) == 5, problems
+    assert len(problems) == 8, problems
+    assert any(problem.startswith(f"{pipe}: a pipe, a socket or a device, expected a file; ") for problem in problems)
+    assert f"{loop}: a link to {loop.name}, which is not there; copy the file, or remove the link" in problems
+    expected = f"expected names like {task.folder}; {task.folder} is there, too: keep one of them"
+    assert f"{twin}: the suite {suite.spec.name!r} has no such picture, {expected}" in problems
     for path in (folder / "out.exr", folder / "deeper"):
         assert f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png" in problems
     for link in links:

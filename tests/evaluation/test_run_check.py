@@ -4,6 +4,7 @@ Mitsuba renders 32 x 32 pixels of this suite's made-up objects: the check itself
 """
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,13 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender_evaluation.bounds import REFERENCE_KEY
+from unirender_evaluation.mitsuba_method import MITSUBA
+from unirender_evaluation.records import RunInfo
 from unirender_evaluation.run_check import CheckRequest, draw_seed, read_check, reference_row, run_check
 from unirender_evaluation.store import Store
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run
 
@@ -96,6 +100,26 @@ def test_a_drawn_seed_meets_the_scenes_of_a_limited_run(suite: Suite) -> None:
     for _ in range(20):
         assert chosen_scenes(suite, 1, draw_seed(suite, 1, [suite.scenes[2]]))[0] == suite.scenes[2]
     assert len({draw_seed(suite, 1, list(suite.scenes)) for _ in range(5)}) == 5
+
+
+def test_a_suite_without_its_meshes_is_not_rendered_again(
+    suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was passed on without them: what needs none runs, and the verdict says what is open and where to get them."""
+    meshes = {name: {"file": "a.obj", "file_sha256": "none"} for name in suite.provenance["objects"]}
+    monkeypatch.setattr(suite, "provenance", suite.provenance | {"objects": meshes})
+    folder = Folder(suite, tmp_path)
+    check = folder.check()
+    assert (check["passed"], folder.records) == (None, [])
+    assert not (tmp_path / "truth_check.json").exists(), "a run with the meshes makes it"
+    (said,) = folder.said
+    assert re.match(r"No truth check: its meshes are not in any folder \(name their folder as .objects. under", said)
+    assert reference_row(check, folder.run.scenes).key == REFERENCE_KEY
+    text = verdict_text([], RunInfo("t", "h", 64, ()), check)
+    assert f"  open   truth: not rendered again, {check['reason']}" in text
+    jobs = list(folder.run.jobs(suite.scenes[0]))
+    assert {job.label for job in jobs if job.is_done(lambda key: False)} == {MITSUBA.label, f"physics: {MITSUBA.label}"}
+    assert {job.label for job in jobs} > {MITSUBA.label, f"physics: {MITSUBA.label}"}
 
 
 def test_half_a_file_is_no_check(tmp_path: Path) -> None:

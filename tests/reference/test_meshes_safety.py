@@ -37,6 +37,7 @@ def reason(path) -> str:
     message = str(caught.value)
     assert message.startswith(f"mesh {path}: ")
     assert "\n" not in message
+    assert re.search(r"; |\?|: install ", message), "it does not say what to do"
     return message.removeprefix(f"mesh {path}: ")
 
 

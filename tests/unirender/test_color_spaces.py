@@ -44,6 +44,38 @@ def test_a_picture_of_another_profile_is_converted(tmp_path: Path, primaries: np
     np.testing.assert_array_equal(picture[0], seen[0])
 
 
+def test_dark_grey_of_a_linear_profile_is_converted_exactly() -> None:
+    """A colour engine that interpolates between few values makes 6 of what is 13."""
+    grey = Image.fromarray(np.arange(256, dtype=np.uint8)[None])
+    seen = np.asarray(in_srgb(_with_profile(grey, grey_profile(1.0)), "grey"))[0]
+    expected = 255 * srgb_encode(np.linspace(0, 1, 256, dtype=np.float32))
+    np.testing.assert_allclose(seen, np.repeat(expected[:, None], 3, axis=-1), rtol=0, atol=0.51)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ((1, 13), None),  # sRGB
+        ((1, 1), None),  # what video tools write
+        ((12, 13), r"states Display P3 primaries and sRGB transfer \(cICP\), its values are taken as sRGB"),
+        ((9, 16), "states Rec.2020 primaries and PQ transfer"),
+    ],
+)
+def test_cicp_goes_before_all_other_chunks(tmp_path: Path, numbers: tuple[int, int], told: str | None) -> None:
+    """By the specification of PNG; where it is not sRGB, a profile beside it is what can be converted."""
+    more = PngInfo()
+    more.add(b"cICP", bytes((*numbers, 0, 1)))
+    more.add(b"gAMA", (100_000).to_bytes(4, "big"))
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", pnginfo=more)
+    picture = read_picture(tmp_path / "a.png")
+    np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=1e-6)
+    assert list(picture.remarks.values()) == [] if told is None else re.search(told, picture.remarks["primaries"])
+    Image.fromarray(PIXELS).save(tmp_path / "a.png", pnginfo=more, icc_profile=matrix_profile(P3_D50, 2.2))
+    both = read_picture(tmp_path / "a.png")
+    assert not both.remarks
+    assert np.allclose(both.image_srgb, PIXELS / 255, rtol=0, atol=1e-6) == (told is None)
+
+
 @pytest.mark.parametrize("profile", [None, ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
 def test_a_picture_in_srgb_keeps_its_values(tmp_path: Path, profile: bytes | None) -> None:
     Image.fromarray(PIXELS).save(tmp_path / "a.png", icc_profile=profile)

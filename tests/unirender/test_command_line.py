@@ -400,3 +400,20 @@ def test_another_pipe_that_breaks_is_an_error(
         cli.main(["doctor"])
     assert stopped.value.code == 1
     assert "BrokenPipeError: of a worker" in capfd.readouterr().err
+
+
+def test_an_interrupt_while_the_command_is_imported_is_one_line() -> None:
+    """Some tenths of a second pass before the command line can say what happens on Ctrl-C."""
+    script = """
+import signal, sys
+class Interrupts:
+    def find_spec(self, name, path, target=None):
+        if name == "unirender.commands":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupts())
+from unirender.__main__ import main
+main()
+"""
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=heed_ctrl_c, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "unirender: interrupted\n")

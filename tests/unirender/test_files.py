@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import shutil
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -132,6 +133,22 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
         pass
     with pytest.raises(UnirenderError, match="is a file"), new_folder(tmp_path / "file"):
         pass
+
+
+def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
+    """Nothing else that is hidden there: another result's, one that is being made, and what is not named so."""
+    for name, days in ((".a.0123456789ab", 2), (".a.fedcba987654", 0), (".b.0123456789ab", 2), (".a.old.x1", 2)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "meta.json").touch()
+        made_at = time.time() - days * 86400
+        os.utime(tmp_path / name, (made_at, made_at))
+    with new_folder(tmp_path / "a", tidy=False):
+        pass
+    assert (tmp_path / ".a.0123456789ab").is_dir(), "twin: it is the look that takes it away"
+    (tmp_path / "a").rmdir()
+    with new_folder(tmp_path / "a"):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} == {"a", ".a.fedcba987654", ".b.0123456789ab", ".a.old.x1"}
 
 
 @pytest.mark.parametrize("given", [".", "..", "inside/.."])

@@ -101,3 +101,37 @@ def test_a_pool_ends_its_own_workers_alone(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_main_process_has_no_such_parent() -> None:
     with pytest.raises(RuntimeError, match="expected a worker"):
         exit_with_parent()
+
+
+HUNG_UP = """
+import time
+from unirender.process_ends import hear_ends
+from unirender.worker_pool import WorkerPool
+
+if __name__ == "__main__":
+    hear_ends()
+    with WorkerPool(1) as pool:
+        pool.submit(print, "begun", flush=True).result()
+        time.sleep(60)
+"""
+
+
+def test_a_terminal_that_closes_leaves_no_error_of_the_tracker(tmp_path: Path) -> None:
+    """SIGHUP comes to the whole group, to the process that `multiprocessing` tracks names in as well."""
+    (tmp_path / "parent.py").write_text(HUNG_UP)
+    command = [sys.executable, str(tmp_path / "parent.py")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
+        command, stdout=pipe, stderr=pipe, text=True, start_new_session=True, preexec_fn=heed_hang_up
+    ) as parent:
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "begun\n"
+        os.killpg(parent.pid, signal.SIGHUP)
+        errors = parent.communicate(timeout=30)[1]
+    assert errors.rstrip().endswith("Ended: 1"), errors
+    assert "KeyError" not in errors
+
+
+def heed_hang_up() -> None:
+    """Where the tests run under nohup a process inherits that it ignores the signal."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)

@@ -15,14 +15,25 @@ import numpy as np
 import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
+from unirender.color import image_srgb, srgb_decode, unpremultiply
+from unirender.composite import composite_image
+from unirender.exr import read_exr, write_exr
+from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
+from unirender.pictures import read_picture
 from PIL import Image
 from unirender.lighting import resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.scene_export import export_scene
 from unirender.surface_light import diffuse_light, specular_light
-from unirender_reference.lights import Light, make_light
+from unirender_evaluation import read_results, score
+from unirender_evaluation.scoring import score_maps
+from unirender_evaluation.suites import load_suite
+from unirender_reference.lights import Light, load_light, make_light
+from unirender_reference.meshes import load_mesh
+from unirender_reference.optimize.folder import read_views
 from unirender_reference.optimize.views import View
-from unirender_reference.render import Renderer, SceneSpec
+from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.shade import shade, shade_gradients
 from unirender_reference.shapes import make_object
 
@@ -66,7 +77,34 @@ CASES = {
     "pipeline.edit(image, mask, roughness=[0.2, 0.3])": "roughness: got shape (2,), expected one number",
     "pipeline.edit(image, mask, metallic=np.zeros(0))": "metallic: got shape (0,), expected one number",
     "pipeline.edit(image, mask, metallic='gold')": "metallic: got str 'gold', expected numbers",
-    "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics",
+    "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it has one",
+    "export_scene(maps, 'scene')": "folder: got Intrinsics Intrinsics(albedo",
+    "export_scene('not_made', None)": "export: got NoneType, expected unirender.intrinsics.Intrinsics; are arguments",
+    "write_result('not_made', image, {})": "result: got ndarray, expected unirender.intrinsics.Intrinsics",
+    "read_result(None)": "path: got NoneType None, expected a path as text or pathlib.Path",
+    "read_picture(image)": "path: got ndarray array(",
+    "read_picture(b'a.png')": "path: got bytes b'a.png', expected a path",
+    "read_exr('a\\0b')": "path: got str 'a\\x00b', expected a path",
+    "write_exr({}, 'a.exr')": "path: got dict {}, expected a path",
+    "write_exr('not_made.exr', image)": "EXR channels: got ndarray, expected collections.abc.Mapping; are arguments",
+    "write_png('not_made.png', bytes_8)": "picture: got uint8 values, expected floats whose white is 1; divide by 255",
+    "map_picture('light', image)": "map: got 'light', expected one of albedo,",
+    "srgb_decode(bytes_8)": "display values: got uint8 values, expected floats whose white is 1; divide by 255",
+    "image_srgb(None)": "image: got NoneType None, expected numbers",
+    "unpremultiply(image, mask[..., 0])": "mask: got shape (16, 24) for an image of (16, 24, 3), expected",
+    "composite_image(image)": "composite: got ndarray, expected unirender.intrinsics.Intrinsics",
+    "load_light(None)": "light: got NoneType None, expected a path",
+    "load_mesh(3)": "mesh: got int 3, expected a path",
+    "load_suite(None)": "suite: got NoneType None, expected a path",
+    "read_views(maps)": "views: got Intrinsics Intrinsics(albedo",
+    "read_results(3)": "path: got int 3, expected a path",
+    "render_sample(light, 4)": "scene: got ndarray, expected unirender_reference.scene_spec.SceneSpec",
+    "Renderer(light)": "renderer: got ndarray, expected unirender_reference.shapes.mesh_object.MeshObject",
+    "score_maps(decomposition, maps)": "prediction: got Decomposition, expected unirender.intrinsics.Intrinsics; it",
+    "score(maps, maps, 3)": "score: protocol: got int, expected unirender_evaluation.metrics.Variant",
+    "score(image, image, mask=mask, lpips=3)": "score: got lpips=3, expected a list of names: lpips=['vgg']",
+    "maps.require('light')": "intrinsics: there is no map 'light', expected some of albedo,",
+    "Camera.parse(None)": "camera: got None, expected a text like",
     "pipeline.render(decomposition.intrinsics, derived=('shadow',))": "derived: got shadow, expected names out of",
     "pipeline.relight(image, 'sky.exr', mask)": "environment: got str 'sky.exr', expected numbers",
     "pipeline.relight(image, photograph, mask)": "environment: got Image of uint8 values, expected linear radiance as",

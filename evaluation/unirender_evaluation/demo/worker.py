@@ -22,7 +22,7 @@ from typing import Any
 
 from unirender.errors import UnirenderError
 from unirender.pipelines.remembered import forget_pictures
-from unirender.worker_pool import exit_with_parent
+from unirender.worker_pool import exit_with_parent, start_tracker
 
 START_SECONDS = 300.0  # for loading a model on a busy machine
 logger = logging.getLogger(__name__)
@@ -76,6 +76,7 @@ class Worker:
 
     def _begin(self) -> None:
         self._end()
+        start_tracker()
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
         self._folder = tempfile.TemporaryDirectory(prefix="unirender-demo-")

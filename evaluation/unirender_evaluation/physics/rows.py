@@ -15,6 +15,7 @@ from unirender_evaluation.physics.tests import LOSS, PSNR, TESTS, renderer_tests
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job
+from unirender_evaluation.suite_objects import object_is_here
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.tasks import picture, scene_ids
 from unirender_evaluation.versions import REFERENCE
@@ -65,7 +66,8 @@ def physics_jobs(
     bounds = ((TRUE_MAPS, _true_maps), *([(MITSUBA, _mitsuba)] if with_mitsuba else []))
     for info, record in bounds:
         key = key_of("physics", info, {REFERENCE})
-        yield Job(key, f"physics: {info.label}", partial(record, stage, key))
+        possible = info is not MITSUBA or object_is_here(suite, scene)
+        yield Job(key, f"physics: {info.label}", partial(record, stage, key), possible=possible)
     for row in filter(takes_part, rows):
         loops = callable(getattr(row.method, "decompose", None))  # shaded again by Mitsuba
         key = key_of("physics", row.info, row.uses | {REFERENCE} if loops else row.uses)

@@ -124,7 +124,7 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     store = Store.open(what.out / "records.jsonl")
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     before, contents = set(store.known), []
-    with Progress(*columns, console=console, transient=not console.is_terminal) as progress:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         bar = progress.add_task(what.public.name, total=len(samples))
         for sample in samples:
             contents.append(sample.sha256())

@@ -11,7 +11,7 @@ from unirender_evaluation.records import Record
 def study_bar(console: Console) -> Progress:
     """A bar with what is at work, how many are done and the time that remains."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, transient=not console.is_terminal)
+    return Progress(*columns, console=console, disable=not console.is_terminal)
 
 
 def collect(

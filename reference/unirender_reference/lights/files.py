@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.arguments import as_path
 from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
@@ -77,7 +78,7 @@ def load_light(
         UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map; or
             the shape is none of a map.
     """
-    path = Path(path)
+    path = as_path(path, "light")
     if not path.is_file():
         missing = "is a folder" if path.is_dir() else "no such file"
         raise UnirenderError(

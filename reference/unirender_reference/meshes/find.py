@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
@@ -32,7 +33,7 @@ def find_meshes(pattern: str | Path, unreadable: Callable[[Path, str], None] | N
         UnirenderError: the path does not exist, or cannot be listed, or nothing in it is a mesh; at the first step of
             the iteration. At its end: inner folders cannot be listed and `unreadable` is None.
     """
-    text = os.path.expanduser(str(pattern))
+    text = os.path.expanduser(str(as_path(pattern, "meshes")))
     missed: list[tuple[Path, str]] = []
     report = unreadable or (lambda folder, reason: missed.append((folder, reason)))
     if os.path.isdir(text):

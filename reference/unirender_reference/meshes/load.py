@@ -5,6 +5,7 @@ format, in which colour space, what is ignored, and every reason for a refusal.
 """
 
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.atlas import build_atlas
 from unirender_reference.meshes.doubles import without_doubles
@@ -28,6 +30,7 @@ from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
 
 SMALLER = "sharpness of smaller textures"  # among what is ignored
+TOLD = re.compile(r"; |\? |\?$|: install ")  # in messages that say what to do
 READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 
 
@@ -52,14 +55,16 @@ def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
 
 def load_mesh_placed(path: str | Path, root: Path | None = None) -> tuple[MeshObject, Sphere]:
     """Loads a mesh like `load_mesh`, and says where it stood: cameras in the file's units move along with it."""
-    with _one_sentence(Path(path)):
-        return _assembled(Path(path), _read(Path(path), root))
+    path = as_path(path, "mesh")
+    with _one_sentence(path):
+        return _assembled(path, _read(path, root))
 
 
 def read_model(path: str | Path, root: Path | None = None) -> Model:
     """Reads a mesh as pieces with materials of their own, in its own units; arguments and errors are `load_mesh`'s."""
-    with _one_sentence(Path(path)):
-        model = _read(Path(path), root)
+    path = as_path(path, "mesh")
+    with _one_sentence(path):
+        model = _read(path, root)
         check_geometry(_corners(model.pieces), max(piece.step for piece in model.pieces))
         return model
 
@@ -85,11 +90,12 @@ def _corners(pieces: list[Piece]) -> Float[np.ndarray, "m 3 3"]:
 
 @contextlib.contextmanager
 def _one_sentence(path: Path) -> Iterator[None]:
-    """Whatever goes wrong with a file becomes a `UnirenderError` that names it."""
+    """Whatever goes wrong with a file becomes a `UnirenderError` that names it, and says what to do."""
     try:
         yield
     except UnirenderError as error:
-        raise UnirenderError(f"mesh {path}: {error}") from error
+        to_do = "" if TOLD.search(str(error)) else "; export it again"
+        raise UnirenderError(f"mesh {path}: {error}{to_do}") from error
     except MemoryError as error:
         raise UnirenderError(f"mesh {path}: needs more memory than there is; reduce the model") from error
     except Exception as error:  # parsers raise whatever a broken file makes them raise

@@ -18,6 +18,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance, as_path
 from unirender.camera import Camera
 from unirender.color import srgb_decode, srgb_encode, unpremultiply
 from unirender.display_files import is_turned
@@ -62,7 +63,7 @@ def read_views(
         UnirenderError: one sentence that names the file, or the argument, and what is wrong with it.
     """
     _check_arguments(up, hold_out, most_views, longest_side)
-    folder = Path(folder)
+    folder = as_path(folder, "views")
     main = next((folder / name for name in SEEN_FILES if (folder / name).is_file()), None)
     if main is None:
         there = "is no folder" if not folder.is_dir() else f"has no {' or '.join(SEEN_FILES)}"
@@ -249,6 +250,7 @@ def write_views(views: Views, folder: str | Path) -> None:
     Raises:
         UnirenderError: the folder is there already.
     """
+    as_instance(views, Views, "views")
     with new_folder(folder) as temporary:
         (temporary / "images").mkdir()
         frames = [_written(view, temporary, index, views.hdr) for index, view in enumerate(views.seen)]

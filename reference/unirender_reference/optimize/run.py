@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from unirender.arguments import as_instance, as_path
 from unirender.errors import UnirenderError
 from unirender.whole_files import file_sha256
 from unirender_reference.optimize.config import OptimizeConfig
@@ -64,8 +65,11 @@ def optimize(
         UnirenderError: the folder holds another run, all pictures are black, the masks do not bound an object that has
             no mesh, or what a stage says.
     """
-    out = None if out is None else Path(out)
-    config.check()
+    out = None if out is None else as_path(out, "out")
+    as_instance(views, Views, "optimize: views")
+    if obj is not None:
+        as_instance(obj, MeshObject, "optimize: obj")
+    as_instance(config, OptimizeConfig, "optimize: config").check()
     if init is not None and obj is not None:
         raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")
     views.require_light()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_floats, as_instance
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -65,6 +66,9 @@ def optimize_image(
         UnirenderError: sizes differ, the mask is empty, values are out of range, `init` lacks a map, or the mesh does
             not lie under the mask.
     """
+    as_instance(config, SingleConfig, "optimize: config")
+    as_instance(camera, Camera, "optimize: camera")
+    image, mask = as_floats(image, "image"), as_floats(mask, "mask")
     linear = _checked(image, mask, hdr)
     if geometry is not None:
         check_in_picture(mask, camera, geometry)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.arguments import as_instance
 from unirender.display_files import display_colors, display_values, is_turned
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
@@ -174,11 +175,7 @@ def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
     Raises:
         UnirenderError: no intrinsics, or a name of no map that can be derived.
     """
-    if not isinstance(intrinsics, Intrinsics):
-        raise UnirenderError(
-            f"render: got {type(intrinsics).__name__}, expected unirender.intrinsics.Intrinsics; a Decomposition or an "
-            "EditResult has them as its `intrinsics`"
-        )
+    as_instance(intrinsics, Intrinsics, "render")
     if unknown := sorted(set(derived) - set(DERIVABLE)):
         raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from unirender.arguments import as_instance
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
@@ -46,6 +47,7 @@ class Card:
         Raises:
             UnirenderError: a map is missing, there are several pictures, or nothing is covered.
         """
+        as_instance(intrinsics, Intrinsics, "export")
         maps = intrinsics.require("albedo", "normal", "roughness", "metallic", "environment")
         environment, normal = maps.pop("environment"), maps["normal"]
         if normal.ndim != 3:

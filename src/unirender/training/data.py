@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
@@ -73,7 +74,7 @@ class GroupDataset:
             derived: whether samples may have s and d derived from their light besides; takes one or two seconds
                 for each group that was not derived before (`unirender.training.derived`).
         """
-        self.folder = Path(folder)
+        self.folder = as_path(folder, "data")
         available = list_shards(self.folder)
         names = {path: path.relative_to(self.folder).as_posix() for path in available}
         if shards is not None:
