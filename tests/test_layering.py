@@ -14,6 +14,7 @@ PACKAGES = {"src": "unirender", "reference": "unirender_reference", "evaluation"
 VOCABULARY = {
     f"unirender.{name}"
     for name in (
+        "blocks",
         "camera",
         "color",
         "composite",

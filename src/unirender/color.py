@@ -11,27 +11,35 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import by_rows, by_values
+
 LUMINANCE_REC709 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 MIN_MASK = 1e-6  # a coverage that is divided by; less than half precision stores
 
 
 def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Linear -> display value. Defined on [0, inf); negative input follows the linear toe."""
-    linear = np.asarray(linear, dtype=np.float32)
+    return by_values(_encode, np.asarray(linear, dtype=np.float32))
+
+
+def _encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     power = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
 
 
 def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Display value -> linear; the inverse of `srgb_encode`."""
-    srgb = np.asarray(srgb, dtype=np.float32)
+    return by_values(_decode, np.asarray(srgb, dtype=np.float32))
+
+
+def _decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     power = np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4)
     return np.where(srgb <= 0.04045, srgb / 12.92, power).astype(np.float32)
 
 
 def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
-    return srgb_encode(np.clip(image_linear, 0.0, 1.0))
+    return by_values(lambda linear: _encode(np.clip(linear, 0.0, 1.0)), np.asarray(image_linear, dtype=np.float32))
 
 
 def display_slope(
@@ -55,6 +63,10 @@ def unpremultiply(
     image_linear: Float[np.ndarray, "*batch h w c"], mask: Float[np.ndarray, "*batch h w 1"]
 ) -> Float[np.ndarray, "*batch h w c"]:
     """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0."""
+    return by_rows(_straight, image_linear, mask)
+
+
+def _straight(image_linear: Float[np.ndarray, "..."], mask: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.where(mask > 0, image_linear / np.maximum(mask, MIN_MASK), 0).astype(np.float32)
 
 

@@ -14,13 +14,15 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 
+from unirender.blocks import by_rows
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
@@ -134,8 +136,16 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
 
 def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
     """Display values in [0, 1], 1, 3 or 4 channels, as an 8-bit PNG."""
-    pixels = np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(path, format="PNG")
+    _save_png(path, by_rows(_eight_bits, values))
+
+
+def _eight_bits(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _save_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
+    grey = pixels.shape[-1] == 1
+    Image.fromarray(pixels[..., 0] if grey else pixels).save(path, format="PNG")
 
 
 def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
@@ -143,6 +153,11 @@ def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarra
     if name == "normal":
         return np.where(nonzero(value)[..., None], value * 0.5 + 0.5, 0)
     return value if name in ("roughness", "metallic", "mask") else image_srgb(value)
+
+
+def _shown(name: str, value: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+    """The pixels of a map's picture."""
+    return _eight_bits(map_picture(name, value))
 
 
 def write_result(
@@ -175,7 +190,7 @@ def write_result(
         if intrinsics.environment is not None:
             write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
-            write_png(folder / f"{name}.png", map_picture(name, value))
+            _save_png(folder / f"{name}.png", by_rows(partial(_shown, name), value))
     if image_linear is not None:
         mask = None if intrinsics is None else intrinsics.mask
         rgba = image_linear if mask is None else np.concatenate([image_linear, mask], axis=-1)
