@@ -27,6 +27,7 @@ VOCABULARY = {
         "icc",
         "intrinsics",
         "lighting",
+        "machine",
         "paths",
         "pictures",
         "primaries",
