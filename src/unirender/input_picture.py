@@ -14,7 +14,7 @@ DARK = 0.35  # display value that an object reaches at the exposures of the trai
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
-BYTES_A_PIXEL, BYTES_OF_NONE = 190, 5e8  # of memory: what taking apart, editing and relighting take of a picture
+BYTES_A_PIXEL, BYTES_OF_NONE = 140, 5e8  # of memory: what taking a picture apart takes; to change it takes more
 
 
 def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
