@@ -15,6 +15,7 @@ VOCABULARY = {
     f"unirender.{name}"
     for name in (
         "arguments",
+        "blocks",
         "camera",
         "cicp",
         "color",
@@ -28,6 +29,7 @@ VOCABULARY = {
         "icc",
         "intrinsics",
         "lighting",
+        "machine",
         "paths",
         "pictures",
         "primaries",

@@ -11,6 +11,7 @@ from numbers import Real
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import row_blocks
 from unirender.errors import UnirenderError
 from unirender.vectors import lengths
 
@@ -96,13 +97,16 @@ class Camera:
         pixel = 2 * half_height / height
         x = (np.arange(width) + 0.5 - self.principal[0] * width) * pixel
         y = -(np.arange(height) + 0.5 - self.principal[1] * height) * pixel
-        directions = np.stack([*np.meshgrid(x, y), np.full((height, width), -1.0)], axis=-1)
-        directions /= lengths(directions)
-        return directions.astype(np.float32)
+        rays = np.empty((height, width, 3), np.float32)
+        for rows in row_blocks(height, width):
+            directions = np.stack([*np.meshgrid(x, y[rows]), np.full((len(y[rows]), width), -1.0)], axis=-1)
+            rays[rows] = directions / lengths(directions)
+        return rays
 
     def view_directions(self, height: int, width: int) -> Float[np.ndarray, "h w 3"]:
         """Unit directions from each pixel's surface point towards the viewer: `-rays`."""
-        return -self.rays(height, width)
+        rays = self.rays(height, width)
+        return np.negative(rays, out=rays)
 
     def of_square(self, top: int, left: int, side: int, height: int, width: int) -> "Camera":
         """The camera of a square part of a picture: the same rays through the same pixels.

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.arguments import as_floats
+from unirender.blocks import by_rows, by_values
 from unirender.errors import UnirenderError
 
 LUMINANCE_REC709 = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
@@ -24,21 +25,28 @@ def srgb_encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     Raises:
         UnirenderError: no numbers, or those of 8 or 16 bits.
     """
-    linear = np.asarray(as_floats(linear, "linear values"), dtype=np.float32)
+    return by_values(_encode, np.asarray(as_floats(linear, "linear values"), dtype=np.float32))
+
+
+def _encode(linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     power = 1.055 * np.power(np.maximum(linear, 0.0031308), 1 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, 12.92 * linear, power).astype(np.float32)
 
 
 def srgb_decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Display value -> linear; the inverse of `srgb_encode`, with the same errors."""
-    srgb = np.asarray(as_floats(srgb, "display values"), dtype=np.float32)
+    return by_values(_decode, np.asarray(as_floats(srgb, "display values"), dtype=np.float32))
+
+
+def _decode(srgb: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     power = np.power((np.maximum(srgb, 0.04045) + 0.055) / 1.055, 2.4)
     return np.where(srgb <= 0.04045, srgb / 12.92, power).astype(np.float32)
 
 
 def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
-    return srgb_encode(np.clip(as_floats(image_linear, "image"), 0.0, 1.0))
+    values = np.asarray(as_floats(image_linear, "image"), dtype=np.float32)
+    return by_values(lambda linear: _encode(np.clip(linear, 0.0, 1.0)), values)
 
 
 def display_slope(
@@ -71,6 +79,10 @@ def unpremultiply(
         raise UnirenderError(
             f"mask: got shape {mask.shape} for an image of {image_linear.shape}, expected [height, width, 1]"
         )
+    return by_rows(_straight, image_linear, mask)
+
+
+def _straight(image_linear: Float[np.ndarray, "..."], mask: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return np.where(mask > 0, image_linear / np.maximum(mask, MIN_MASK), 0).astype(np.float32)
 
 

@@ -37,8 +37,8 @@ ReadLight = Callable[[Path], "np.ndarray"]  # radiance [h w 3] as it stands in a
 
 def exposed_light(read_light: ReadLight, path: Path, stops: float | None) -> tuple["np.ndarray", str]:
     """Radiance [h w 3] of a light file with stops added, and the pipeline's rule of its exposure."""
-    light = read_light(path) * 2.0 ** (stops or 0.0)
-    return light, "auto" if stops is None else "keep"
+    light = read_light(path)
+    return (light, "auto") if stops is None else (light * 2.0**stops, "keep")
 
 
 def write_edited(folder: Path, result: "EditResult", meta: dict[str, Any], pipeline: "UniRenderPipeline") -> None:

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from unirender.arguments import as_instance
+from unirender.blocks import by_rows
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
 from unirender.surface_light import MIN_ALPHA
@@ -33,7 +34,7 @@ COSINES, ROUGHNESSES = 64, 32  # nodes of the tables of A and B, evenly spaced o
 LOBE_SAMPLES = (64, 32)  # of a lobe, over its two coordinates
 LOBES = 4  # at a time: their samples stay in the processor's cache
 GRAZING = 1e-3  # the least n.v: at 0 a visible lobe does not exist
-BLOCK = 2**18  # pixels whose split sum is made at a time: some 200 bytes each
+BLOCK = 2**16  # pixels whose split sum is made at a time: some 200 bytes each
 TABLES = Path(__file__).with_name("environment_brdf.npy")  # what `integrate_environment_brdf` gives, [2 n r], float64
 
 
@@ -59,8 +60,12 @@ def composite_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:
         UnirenderError: one of albedo, metallic, diffuse, specular or mask is unknown.
     """
     maps = _maps(intrinsics, "albedo", "metallic", "diffuse", "specular", "mask")
-    mask = maps.pop("mask")
-    return (composite(**maps) * mask).astype(np.float32)
+    return by_rows(_composite, *maps.values())
+
+
+def _composite(*maps: Float[np.ndarray, "h w _"]) -> Float[np.ndarray, "h w 3"]:
+    """The premultiplied composite of some rows; the last of the maps is the mask."""
+    return (composite(*maps[:-1]) * maps[-1]).astype(np.float32)
 
 
 def split_sum_image(intrinsics: Intrinsics) -> Float[np.ndarray, "h w 3"]:

@@ -4,6 +4,9 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from unirender.errors import UnirenderError
+from unirender.machine import in_gib, memory_bytes
+
 if TYPE_CHECKING:
     from unirender.pictures import Picture
 
@@ -11,6 +14,7 @@ DARK = 0.35  # display value that an object reaches at the exposures of the trai
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
+BYTES_A_PIXEL, BYTES_OF_NONE = 140, 5e8  # of memory: what taking a picture apart takes; to change it takes more
 
 
 def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
@@ -22,7 +26,7 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
         option: what remarks on a mask that is not there add: how one is given.
 
     Raises:
-        UnirenderError: an unreadable file, or a mask that does not fit.
+        UnirenderError: an unreadable file, a mask that does not fit, or a picture that this machine is too small for.
     """
     import numpy as np
 
@@ -31,6 +35,7 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     picture = read_picture(path)
     remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
+    _check_memory(path, height * width)
     if mask is not None:
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
@@ -64,3 +69,16 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
             f"{picture.clipped:.0%} of the object's pixels are clipped at display white: radiance is lost there"
         )
     return picture, remarks
+
+
+def _check_memory(path: Path, pixels: int) -> None:
+    """Looks at the size of a picture: one sentence before the work instead of an end without a word in it.
+
+    Raises:
+        UnirenderError: it takes more memory than the machine has in all.
+    """
+    if (wanted := BYTES_OF_NONE + BYTES_A_PIXEL * pixels) > (present := memory_bytes()):
+        raise UnirenderError(
+            f"{path}: a picture of {pixels / 1e6:,.0f} megapixels, which would take about {in_gib(wanted)} of memory, "
+            f"and this machine has {in_gib(present)}; scale it down first"
+        )

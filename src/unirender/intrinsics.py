@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import by_rows
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.vectors import lengths
@@ -225,7 +226,7 @@ def _check_range(name: str, value: Float[np.ndarray, "..."]) -> None:
         raise UnirenderError(f"{name}: got an empty array of shape {value.shape}, expected at least one pixel")
     low, high = float(value.min()), float(value.max())
     if name == "normal":
-        longest = float(lengths(value).max())
+        longest = float(by_rows(lengths, value).max())
         if longest > 1 + NORMAL_TOLERANCE:
             raise UnirenderError(
                 f"normal: longest vector has length {longest:.3f}, expected unit vectors (0 outside the mask); "

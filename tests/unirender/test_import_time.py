@@ -1,6 +1,8 @@
 """The quick start of the command line: what `unirender decompose` must not import, and that deferring loses nothing."""
 
 import gc
+import importlib
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -12,6 +14,7 @@ import pytest
 from PIL import Image
 
 from unirender.cli import main
+from unirender.models.lean_imports import HIDDEN, lean_imports
 
 # Each takes from 0.1 to 1.5 s to import, and decomposing a picture uses none of it.
 FORBIDDEN = (
@@ -120,6 +123,29 @@ with tempfile.TemporaryDirectory() as folder:
     assert printed.splitlines() == ["False 42", "1", "no libfoo", "no libfoo"]
 
 
+def test_packages_are_listed_when_somebody_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a module in the place of the one of diffusers, which other tests have imported."""
+    (tmp_path / "asks_at_once.py").write_text(
+        "import importlib.metadata as m\nlisted = m.packages_distributions()\nhas = lambda name: name in listed\n"
+    )
+    asked: list[str] = []
+
+    def listing() -> dict[str, list[str]]:
+        asked.append("once")
+        return {"PIL": ["pillow"]}
+
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", listing)
+    monkeypatch.setattr("unirender.models.lean_imports.LISTS_FILES", "asks_at_once")
+    with lean_imports():
+        module = importlib.import_module("asks_at_once")
+    del sys.modules["asks_at_once"]
+    assert not asked
+    assert (module.has("PIL"), module.has("cv2"), dict(module.listed)) == (True, False, listing())
+    assert len(asked) == 2, "by the module once, and by the line above"
+    assert importlib.metadata.packages_distributions is listing
+
+
 def test_a_call_from_python_changes_nothing_of_the_process(tmp_path: Path) -> None:
     before, frozen = (gc.get_threshold(), list(sys.meta_path)), gc.get_freeze_count()
     with pytest.raises(SystemExit, match="1"):
@@ -129,8 +155,6 @@ def test_a_call_from_python_changes_nothing_of_the_process(tmp_path: Path) -> No
 
 
 def test_what_is_imported_already_is_left_alone() -> None:
-    from unirender.models.lean_imports import HIDDEN, lean_imports
-
     there = {name: sys.modules.get(name) for name in HIDDEN}
     path = list(sys.meta_path)
     with lean_imports():

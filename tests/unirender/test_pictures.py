@@ -16,7 +16,7 @@ from unirender.color import srgb_encode
 from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.input_picture import read_input
+from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -406,6 +406,18 @@ def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
     Image.new("1", (side, side)).save(tmp_path / "bomb.png")
     with pytest.raises(UnirenderError, match="scale it down"):
         read_picture(tmp_path / "bomb.png")
+
+
+def test_a_picture_that_the_machine_is_too_small_for_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.new("RGB", (400, 300), "white").save(tmp_path / "a.png")
+    needed = BYTES_OF_NONE + BYTES_A_PIXEL * 400 * 300
+    monkeypatch.setattr("unirender.input_picture.memory_bytes", lambda: needed)
+    read_input(tmp_path / "a.png", None)
+    monkeypatch.setattr("unirender.input_picture.memory_bytes", lambda: needed - 1)
+    with pytest.raises(UnirenderError, match=r"a\.png: a picture of 0 megapixels.* and this machine has 0 GiB; scale"):
+        read_input(tmp_path / "a.png", None)
 
 
 def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.arguments import as_path
+from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
@@ -215,5 +216,5 @@ def _as_its_header_says(pixels: Float[np.ndarray, "h w 3"], path: Path) -> Float
             factor *= values
         elif any(values):  # Photoshop writes zeros
             primaries = values
-    channels = image_channels((pixels / factor).astype(np.float32))
+    channels = image_channels(by_rows(lambda rows: (rows / factor).astype(np.float32), pixels))
     return channels_rgb(in_rec709(channels, primaries, ("",), f"light {path}"))

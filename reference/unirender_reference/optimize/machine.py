@@ -4,8 +4,7 @@ import os
 from collections.abc import Mapping
 
 from unirender.errors import UnirenderError
-
-GIB = 2**30
+from unirender.machine import in_gib, memory_bytes
 
 
 def require_cores(threads: int) -> None:
@@ -32,17 +31,6 @@ def require_memory(needed: Mapping[str, float]) -> None:
     for option, wanted in needed.items():
         if wanted > present:
             raise UnirenderError(
-                f"{option}: would take about {_gib(wanted)} of memory, and this machine has {_gib(present)}; expected "
-                "a smaller number"
+                f"{option}: would take about {in_gib(wanted)} of memory, and this machine has {in_gib(present)}; "
+                "expected a smaller number"
             )
-
-
-def memory_bytes() -> float:
-    """Of the machine; infinite where the system does not tell."""
-    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
-        return float("inf")
-    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-
-
-def _gib(count: float) -> str:
-    return f"{count / GIB:,.0f} GiB"

@@ -9,7 +9,8 @@ itself. Inside `lean_imports`
 - the packages of `HIDDEN` look as if they were not installed, and diffusers does without them. Afterwards they can be
   imported, but diffusers keeps to what it saw;
 - diffusers does not load the compiler only to tell it what not to compile (`_WithoutCompiler`). Whoever asks for
-  `torch.compile` gets it at any time.
+  `torch.compile` gets it at any time;
+- diffusers does not list the files of all that is installed, a quarter of a second, before it asks whose they are.
 
 For processes of our own alone: whoever imports `unirender` as a library has all of diffusers. What was imported before
 stays as it is. Where diffusers or torch is built otherwise than expected here, the start is slower, nothing else.
@@ -18,7 +19,7 @@ stays as it is. Where diffusers or torch is built otherwise than expected here, 
 import contextlib
 import functools
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from types import FunctionType, ModuleType
@@ -33,6 +34,7 @@ DEFERRED = (
     "scipy.stats",
 )
 COMPILER = "torch._dynamo"
+LISTS_FILES = "diffusers.utils.import_utils"  # asks at once for `importlib.metadata.packages_distributions`
 ASKS_FOR_COMPILER = "diffusers.utils.torch_utils"  # the first module of diffusers that does, and all others' way to it
 
 
@@ -69,12 +71,14 @@ class _Finder(MetaPathFinder):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if fullname not in (*DEFERRED, ASKS_FOR_COMPILER):
+        if fullname not in (*DEFERRED, ASKS_FOR_COMPILER, LISTS_FILES):
             return None
         spec = PathFinder.find_spec(fullname, path, target)
         if spec is not None and spec.loader is not None:
-            deferred = fullname in DEFERRED
-            spec.loader = _Deferred(spec.loader) if deferred else _WithoutCompiler(spec.loader, self.undo)
+            if fullname == ASKS_FOR_COMPILER:
+                spec.loader = _WithoutCompiler(spec.loader, self.undo)
+            else:
+                spec.loader = (_Deferred if fullname in DEFERRED else _WithoutListing)(spec.loader)
         return spec
 
 
@@ -111,6 +115,36 @@ class _Deferred(_Around):
             return getattr(module, attribute)
 
         vars(module)["__getattr__"] = run  # PEP 562
+
+
+class _WithoutListing(_Around):
+    """Runs the code of `diffusers.utils.import_utils`, which keeps what it is given for the list of packages."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        import importlib.metadata  # as that module does
+
+        listing = importlib.metadata.packages_distributions
+        importlib.metadata.packages_distributions = lambda: _Packages(listing)
+        try:
+            self.loader.exec_module(module)
+        finally:
+            importlib.metadata.packages_distributions = listing
+
+
+class _Packages(Mapping[str, list[str]]):
+    """Which distributions a package is of, listed when that is first asked for."""
+
+    def __init__(self, listing: Callable[[], Mapping[str, list[str]]]) -> None:
+        self._listed = functools.cache(listing)
+
+    def __getitem__(self, package: str) -> list[str]:
+        return self._listed()[package]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._listed())
+
+    def __len__(self) -> int:
+        return len(self._listed())
 
 
 class _WithoutCompiler(_Around):

@@ -15,11 +15,13 @@ gets its own s and d back; under one that has nothing to do with it, nothing is 
 
 import math
 from collections.abc import Collection
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import uniform_filter1d
 
+from unirender.blocks import by_rows
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.remembered import MapsKey, remembered
@@ -67,11 +69,23 @@ def with_carried_light(
     carried = {}
     for name in names:
         trust = agreement(new[name], explained[name], mask)
-        log_ratio = np.log((old[name] + FLOOR) / (explained[name] + FLOOR))
-        bounded = np.clip(log_ratio, -math.log(MOST_RATIO), math.log(MOST_RATIO))
+        bounded = by_rows(_bounded_log_ratio, old[name], explained[name])
         smooth = _smoothed(bounded, mask, SMOOTHING * (1 - trust) * math.sqrt(mask.sum()))
-        carried[name] = (new[name] * np.exp(trust * smooth)).astype(np.float32)
+        carried[name] = by_rows(partial(_scaled, trust), new[name], smooth)
     return after.replace(**carried)
+
+
+def _bounded_log_ratio(
+    light: Float[np.ndarray, "h w 3"], explained: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    log_ratio = np.log((light + FLOOR) / (explained + FLOOR))
+    return np.clip(log_ratio, -math.log(MOST_RATIO), math.log(MOST_RATIO))
+
+
+def _scaled(
+    trust: float, light: Float[np.ndarray, "h w 3"], log_ratio: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    return (light * np.exp(trust * log_ratio)).astype(np.float32)
 
 
 @remembered(most=1)

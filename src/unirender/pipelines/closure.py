@@ -14,6 +14,7 @@ Notation: I the picture, R the rendering of the maps; both linear and premultipl
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import by_rows
 from unirender.intrinsics import Intrinsics
 
 MAX_GAIN = 4.0  # G
@@ -33,8 +34,16 @@ def close_decomposition(
     """
     maps = intrinsics.require("albedo", "specular", "diffuse", "mask")
     mask = maps.pop("mask")
+    root = by_rows(_root_of_gain, image_linear, rendered, mask)
+    closed = {name: value * root for name, value in maps.items()}
+    np.clip(closed["albedo"], 0, 1, out=closed["albedo"])
+    return intrinsics.replace(**closed)
+
+
+def _root_of_gain(
+    image_linear: Float[np.ndarray, "h w 3"], rendered: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]
+) -> Float[np.ndarray, "h w 3"]:
+    """sqrt(g); 1 outside the mask."""
     gain = np.clip((image_linear + FLOOR) / (rendered + FLOOR), 1 / MAX_GAIN, MAX_GAIN)
     gain = np.where(image_linear >= CLIPPED * mask, np.maximum(gain, 1), gain)
-    root = np.where(mask > 0, np.sqrt(gain), 1).astype(np.float32)
-    closed = {name: value * root for name, value in maps.items()}
-    return intrinsics.replace(**closed | {"albedo": np.clip(closed["albedo"], 0, 1)})
+    return np.where(mask > 0, np.sqrt(gain), 1).astype(np.float32)

@@ -7,6 +7,7 @@ edit.
 import numpy as np
 from jaxtyping import Bool, Float
 
+from unirender.blocks import by_rows
 from unirender.composite import composite_image
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
@@ -107,6 +108,12 @@ def anchor(
     Where g is not bounded and R_0 is well above e = 0.02 this is I R_1 / R_0; where R_0 is dark it is the difference
     form. Without a change the input comes back as it was. All premultiplied and linear.
     """
+    return by_rows(_anchored, image_linear, before, after)
+
+
+def _anchored(
+    image_linear: Float[np.ndarray, "h w 3"], before: Float[np.ndarray, "h w 3"], after: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w 3"]:
     gain = np.clip((image_linear + ANCHOR_FLOOR) / (before + ANCHOR_FLOOR), 1 / ANCHOR_GAIN, ANCHOR_GAIN)
     return np.maximum(image_linear + gain * (after - before), 0).astype(np.float32)
 
@@ -141,7 +148,7 @@ def under_light(
     derived = derived_light(intrinsics, environment, names, mirrors=mirrors, shadows=shadows)
     factor = exposure_factor(derived["diffuse"], maps["mask"], RELIGHT_TARGET) if exposure == "auto" else 1.0
     scaled = {name: value * np.float32(factor) for name, value in derived.items()}
-    return intrinsics.replace(environment=(environment * factor).astype(np.float32), **(scaled | given))
+    return intrinsics.replace(environment=(environment * factor).astype(np.float32, copy=False), **(scaled | given))
 
 
 def check_exposure(exposure: str) -> None:

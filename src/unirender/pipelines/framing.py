@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
+from unirender.blocks import by_rows
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
@@ -158,11 +159,11 @@ class Frame:
 
     def leave_maps(self, maps: Maps, mask: Float[np.ndarray, "h w 1"]) -> Maps:
         """Several of them, by name; the coverage enters and leaves once."""
-        if not self.identity:
-            inside = self.enter(mask)
-            back = self.leave(inside)
-            maps = {name: divide(self.leave(value * inside), back) for name, value in maps.items()}
-        return {name: np.where(mask > 0, value, 0).astype(np.float32) for name, value in maps.items()}
+        if self.identity:
+            return {name: _covered(value, mask) for name, value in maps.items()}
+        inside = self.enter(mask)
+        back = self.leave(inside)
+        return {name: by_rows(_left, self.leave(value * inside), back, mask) for name, value in maps.items()}
 
     def enter_intrinsics(self, intrinsics: Intrinsics, environment_size: tuple[int, int] | None = None) -> Intrinsics:
         """All maps and the camera -> square; the mask has to be known.
@@ -181,6 +182,18 @@ class Frame:
             environment = resample_environment(environment, environment_size)
         mask, camera = np.clip(self.enter(mask), 0, 1), self.camera(intrinsics.camera)
         return Intrinsics(mask=mask, environment=environment, camera=camera).replace(**changes)
+
+
+def _covered(value: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
+    """A map, and 0 where the mask is 0."""
+    return np.where(mask > 0, value, 0).astype(np.float32)
+
+
+def _left(
+    premultiplied: Float[np.ndarray, "h w c"], back: Float[np.ndarray, "h w 1"], mask: Float[np.ndarray, "h w 1"]
+) -> Float[np.ndarray, "h w c"]:
+    """A map that came back beside its coverage, and 0 where the picture's mask is 0."""
+    return _covered(divide(premultiplied, back), mask)
 
 
 def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 c"]:

@@ -100,7 +100,7 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     mask = mask[..., None] if mask.ndim == 2 else mask
     if mask.shape != (*size, 1):
         raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
-    mask = _checked("mask", mask, "divide an 8-bit mask by 255")
+    mask = np.array(_checked("mask", mask, "divide an 8-bit mask by 255"))  # results keep it, and may not share it
     if not (mask > 0.5).any():  # as `unirender.exposure` asks
         raise UnirenderError(
             f"mask: no pixel is covered by more than one half, the most by {mask.max():.3g}, expected an object in view"
@@ -291,4 +291,4 @@ def _checked(name: str, value: np.ndarray, advice: str) -> Float[np.ndarray, "..
     low, high = float(value.min()), float(value.max())
     if low < -RANGE_TOLERANCE or high > 1 + RANGE_TOLERANCE:
         raise UnirenderError(f"{name}: got values in [{low:.4g}, {high:.4g}], expected [0, 1]; {advice}")
-    return np.asarray(np.clip(value, 0, 1))
+    return value if low >= 0 and high <= 1 else np.asarray(np.clip(value, 0, 1))

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import by_rows
 from unirender.intrinsics import SHORTEST_NORMAL
 from unirender.vectors import lengths
 
@@ -23,10 +24,18 @@ def masked_mean(value: Float[np.ndarray, "h w 1"], mask: Float[np.ndarray, "h w 
 
 def divide(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
     """Undoes a premultiplication; 0 where there is no coverage."""
+    return by_rows(_divided, premultiplied, mask)
+
+
+def _divided(premultiplied: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w c"]:
     return np.where(mask > MIN_COVERAGE, premultiplied / np.maximum(mask, MIN_COVERAGE), 0).astype(np.float32)
 
 
 def unit_normal(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Normals of length 1, also of those that `unirender.intrinsics.unit_normals` takes for unit ones; 0 stays 0."""
+    return by_rows(_unit, normal)
+
+
+def _unit(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     length = lengths(normal)
     return np.where(length > SHORTEST_NORMAL, normal / np.maximum(length, SHORTEST_NORMAL), 0).astype(np.float32)

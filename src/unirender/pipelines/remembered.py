@@ -9,6 +9,8 @@ import hashlib
 from collections.abc import Callable
 from typing import TypeVar
 
+import numpy as np
+
 from unirender.intrinsics import Intrinsics
 
 T = TypeVar("T")
@@ -21,7 +23,7 @@ class MapsKey:
     def __init__(self, intrinsics: Intrinsics) -> None:
         self.intrinsics = intrinsics
         digests = (
-            (name, value.shape, value.dtype.str, hashlib.sha256(value.tobytes()).digest())
+            (name, value.shape, value.dtype.str, hashlib.sha256(np.ascontiguousarray(value).data).digest())
             for name, value in intrinsics.maps.items()
         )
         self._key = (intrinsics.camera, *digests)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from unirender.blocks import by_rows
 from unirender.color import image_srgb as encode_srgb
 from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
@@ -67,6 +68,15 @@ def _leave(
     closed_form = network.conditioning.physics_prior or PRIORS["split_sum"]
     pictures = {"rendered": divide(rendered, inside), "closed form": divide(closed_form.image(small), inside)}
     radiance, small_image = frame.leave_maps(pictures, mask).values()
-    change = encode_srgb(radiance) - encode_srgb(small_image)
-    large_image = divide(closed_form.image(intrinsics), mask)
-    return srgb_decode(np.clip(encode_srgb(large_image) + change, 0, 1)) * mask
+    return by_rows(_with_change, closed_form.image(intrinsics), mask, small_image, radiance)
+
+
+def _with_change(
+    large: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+    before: Float[np.ndarray, "h w 3"],
+    after: Float[np.ndarray, "h w 3"],
+) -> Float[np.ndarray, "h w 3"]:
+    """A premultiplied image with what `after` has beyond `before`, in display values; these two are straight."""
+    change = encode_srgb(after) - encode_srgb(before)
+    return srgb_decode(np.clip(encode_srgb(divide(large, mask)) + change, 0, 1)) * mask

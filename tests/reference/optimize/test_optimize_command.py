@@ -23,11 +23,12 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.files import read_result, write_png, write_result
 from unirender.intrinsics import MAPS, Intrinsics
+from unirender.machine import memory_bytes
 from unirender_reference.meshes import load_mesh_placed
 from unirender_reference.optimize.commands import Optimize
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
-from unirender_reference.optimize.machine import memory_bytes, require_cores, require_memory
+from unirender_reference.optimize.machine import require_cores, require_memory
 from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input, unit_normals
 from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.single_render import rerendered
