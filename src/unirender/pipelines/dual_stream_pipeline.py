@@ -17,7 +17,7 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
-from unirender.diffusion.sampling import check_scheduler, make_sampler
+from unirender.diffusion.sampling import check_scheduler, check_timesteps, make_sampler
 from unirender.errors import UnirenderError
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
@@ -120,8 +120,8 @@ class DualStreamPipeline(DiffusionPipeline):
             self.check_size(size)
         # A scheduler remembers its steps: each call has its own, so that calls at the same time do not share them.
         scheduler = copy.deepcopy(self.scheduler) if sampler is None else make_sampler(sampler, self.scheduler)
-        if mode == "sample":
-            check_scheduler(scheduler)
+        check = check_scheduler if mode == "sample" else check_timesteps
+        check(scheduler)
         # Weights that accelerate offloads lie elsewhere than they compute; of others the model knows, with one search.
         device = self._execution_device if hasattr(self.dual_stream, "_hf_hook") else self.dual_stream.device
         return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, device, self._progress)
