@@ -48,6 +48,7 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 
 Predict = Callable[[Float[Tensor, "b c h w"], Int[Tensor, " b"]], Float[Tensor, "b c h w"]]
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
+StepEnd = Callable[[int, int, Float[Tensor, "b c h w"]], Float[Tensor, "b c h w"]]
 
 
 def steps_of(mode: str, num_inference_steps: int | None) -> int:
@@ -109,8 +110,8 @@ def check_scheduler(scheduler: Any) -> None:
             f"scheduler: got {name}, expected one of {', '.join(SCHEDULERS)} (not of sde): others draw noise of their "
             "own or scale their input"
         )
-    advice = f"make it by {name}.from_config of the config of the checkpoint's own"
     check_timesteps(scheduler)
+    advice = f"make it by {name}.from_config of the config of the checkpoint's own"
     if config.get("prediction_type") != PREDICTION_TYPE:
         raise UnirenderError(
             f"scheduler: got a {name} with prediction_type {config.get('prediction_type')!r}, expected "
@@ -139,7 +140,6 @@ def check_scheduler(scheduler: Any) -> None:
             )
 
 
-@functools.cache
 def check_timesteps(scheduler: Any) -> None:
     """Looks whether a scheduler counts its timesteps as the network does, which knows pure noise by the last one: in
     one step, too, it would be told of another amount of noise than it sees.
@@ -157,6 +157,7 @@ def check_timesteps(scheduler: Any) -> None:
         )
 
 
+@functools.cache
 def _signal() -> Float[Tensor, " t"]:
     """sqrt(alpha_bar) of the noise schedule that all networks are trained with."""
     return make_scheduler().alphas_cumprod.sqrt()
@@ -174,6 +175,7 @@ def denoise(
     scheduler: Any,
     steps: int,
     progress: Progress = iter,
+    step_end: StepEnd | None = None,
 ) -> Float[Tensor, "b c h w"]:
     """Runs `steps` scheduler steps from T down to clean.
 
@@ -184,20 +186,24 @@ def denoise(
             here.
         steps: 1 returns the prediction at T itself.
         progress: wraps the iteration over timesteps.
+        step_end: (index of the step, its timestep, what came out) -> what the next step begins with.
     """
     if steps == 1:
-        t = torch.full((len(noise),), last_timestep(scheduler), device=noise.device)
-        return predict(noise, t)
+        last = last_timestep(scheduler)
+        x_0 = predict(noise, torch.full((len(noise),), last, device=noise.device))
+        return x_0 if step_end is None else step_end(0, last, x_0)
     set_timesteps(scheduler, steps, noise.device)
     x_t = noise * scheduler.init_noise_sigma
     uneven = _strides_unevenly(scheduler, steps)
     following = [*scheduler.timesteps[1:], None]
-    for t, next_t in zip(progress(scheduler.timesteps), following, strict=True):
+    for step, (t, next_t) in enumerate(zip(progress(scheduler.timesteps), following, strict=True)):
         x_0 = predict(x_t, t.expand(len(x_t)))
         if uneven:
             x_t = _ddim_step(scheduler, x_0, x_t, t, next_t)
         else:
             x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
+        if step_end is not None:
+            x_t = step_end(step, int(t), x_t)
     return x_t
 
 

@@ -84,6 +84,7 @@ class Network:
             generator=how.generators(len(images)),
             camera=_repeat([look.camera(camera) for camera in cameras for look in looks], how.count),
             progress=self.progress,
+            step_end=how.step_end,
         )
         arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
         rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(seen) * how.count)]
@@ -116,6 +117,7 @@ class Network:
             camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
             derived=torch.tensor(_repeat(flags, how.count), device=self.device),
+            step_end=how.step_end,
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
         pictures = means.permute(0, 2, 3, 1).float().cpu().numpy()
