@@ -100,8 +100,9 @@ def check_scheduler(scheduler: Any) -> None:
 
     Raises:
         UnirenderError: it takes what the network predicts, x0, for something else, or changes it; its noise schedule is
-            not the network's, which ends in noise alone, or has other timesteps; it would divide by zero there, or where all is clean; or it is
-            of another kind, which may draw noise of its own, that no seed would fix, or want its input scaled.
+            not the network's, which ends in noise alone, or has other timesteps; it would divide by zero there, or
+            where all is clean; or it is of another kind, which may draw noise of its own, that no seed would fix, or
+            want its input scaled.
     """
     name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
     kinds = {base.__name__ for base in type(scheduler).__mro__}

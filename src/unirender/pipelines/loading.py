@@ -1,6 +1,7 @@
 """A pipeline folder is read whole, or refused in one sentence that names it."""
 
 import contextlib
+import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from unirender.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
 PLACE = "_name_or_path"  # in the configuration of what diffusers has read
+OF_QUANTIZATION = "quantization_config"  # diffusers' own, in the configuration of a part with fewer bits
 OF_FILES = (OSError, SafetensorError)
 
 
@@ -79,6 +81,26 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
     if missing:
         raise UnirenderError(
             f"{folder}: {len(missing)} weights are missing, the first is {missing[0]}; copy the folder again"
+        )
+
+
+def check_options(part: ConfigMixin, file: Path) -> None:
+    """Of options that a class does not know diffusers only warns, and answers as if they were not there. They are a
+    newer version's, or misspelt.
+
+    Args:
+        part: as it was read.
+        file: its configuration.
+
+    Raises:
+        UnirenderError: there are such options.
+    """
+    known = {*inspect.signature(type(part).__init__).parameters, OF_QUANTIZATION}
+    unknown = sorted(name for name in json.loads(file.read_text(encoding="utf-8")).keys() - known if name[0] != "_")
+    if unknown:
+        raise UnirenderError(
+            f"{file}: options {', '.join(unknown)} are not known to this {type(part).__name__}, whose answers may "
+            "depend on them; update unirender, or take them out if they are misspelt"
         )
 
 

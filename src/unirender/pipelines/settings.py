@@ -17,6 +17,7 @@ from unirender.pipelines.looks import check_looks
 TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
 NOISE = ("mode", "num_inference_steps", "num_samples", "generator", "sampler", "callback_on_step_end")
 SETTINGS = ("camera", *NOISE, "size", *TAKING_APART)
+MATERIALS = ("scalar", "map")  # one number per object, or maps
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
 
@@ -165,6 +166,17 @@ def check_switches(**switches: Any) -> None:
     for name, value in switches.items():
         if not isinstance(value, bool | np.bool_):
             raise UnirenderError(f"{name}: got {value!r:.60}, expected True or False")
+
+
+def check_material(material: Any) -> str:
+    """What roughness and metallic are, as it was given.
+
+    Raises:
+        UnirenderError: neither one number per object nor maps.
+    """
+    if material not in MATERIALS:
+        raise UnirenderError(f"material: got {material!r:.60}, expected 'scalar' or 'map'")
+    return material
 
 
 def same_noise(seed: int, count: int) -> list[torch.Generator]:

@@ -38,7 +38,15 @@ from unirender.pipelines.inputs import (
 from unirender.pipelines.network import Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
-from unirender.pipelines.settings import Sampling, check_settings, check_switches, list_cameras, same_noise, step_end_of
+from unirender.pipelines.settings import (
+    Sampling,
+    check_material,
+    check_settings,
+    check_switches,
+    list_cameras,
+    same_noise,
+    step_end_of,
+)
 
 # Shapes and ranges are checked in `unirender.pipelines.inputs`.
 Picture = np.ndarray | Image.Image
@@ -189,9 +197,7 @@ class UniRenderPipeline(DualStreamPipeline):
                 f"decompose: got {len(images_srgb)} pictures, {len(masks)} masks and {len(cameras)} cameras, expected "
                 "at least one picture, and one of each for every picture"
             )
-        material = self.config["material"] if material is None else material
-        if material not in ("scalar", "map"):
-            raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
+        material = check_material(self.config["material"] if material is None else material)
         step_end = step_end_of(self, callback_on_step_end)
         how = Sampling.of(mode, num_inference_steps, num_samples, generator, looks, step_end)
         network = self._network(mode, sampler, size)
