@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from diffusers.training_utils import EMAModel
 from safetensors.numpy import load_file, save_file
 from tiny_models import MODEL, make_pipeline
 from tiny_stable_diffusion import tiny_vae
@@ -138,6 +139,18 @@ def test_a_config_that_would_answer_otherwise_is_refused(
     path.write_text(json.dumps(json.loads(path.read_text()) | options | {"_mine": 1, "quantization_config": None}))
     with pytest.raises(UnirenderError, match=says):
         UniRenderPipeline.from_pretrained(folder)
+
+
+def test_a_network_that_diffusers_averaged_is_read(folder: Path, tmp_path: Path) -> None:
+    pipeline = UniRenderPipeline.from_pretrained(folder)
+    kind = type(pipeline.dual_stream)
+    average = EMAModel(
+        pipeline.dual_stream.parameters(), model_cls=kind, model_config=dict(pipeline.dual_stream.config)
+    )
+    average.save_pretrained(str(tmp_path / "ema"))
+    averaged = kind.from_pretrained(tmp_path / "ema")
+    UniRenderPipeline(averaged, pipeline.scheduler).save_pretrained(tmp_path / "whole")
+    UniRenderPipeline.from_pretrained(tmp_path / "whole")
 
 
 def test_a_pipeline_without_its_network_is_refused(folder: Path) -> None:

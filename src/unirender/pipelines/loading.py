@@ -17,7 +17,8 @@ from unirender.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
 PLACE = "_name_or_path"  # in the configuration of what diffusers has read
-OF_QUANTIZATION = "quantization_config"  # diffusers' own, in the configuration of a part with fewer bits
+OF_AVERAGE = ("decay", "min_decay", "optimization_step", "update_after_step", "use_ema_warmup", "inv_gamma", "power")
+OF_DIFFUSERS = {"quantization_config", *OF_AVERAGE}  # what it adds to a network's configuration, by its EMAModel, too
 OF_FILES = (OSError, SafetensorError)
 
 
@@ -95,7 +96,7 @@ def check_options(part: ConfigMixin, file: Path) -> None:
     Raises:
         UnirenderError: there are such options.
     """
-    known = {*inspect.signature(type(part).__init__).parameters, OF_QUANTIZATION}
+    known = OF_DIFFUSERS | inspect.signature(type(part).__init__).parameters.keys()
     unknown = sorted(name for name in json.loads(file.read_text(encoding="utf-8")).keys() - known if name[0] != "_")
     if unknown:
         raise UnirenderError(
