@@ -1,7 +1,8 @@
 """Both directions of a trained network: p(attributes | image) and p(image | attributes).
 
 The stream that is given is clean and is encoded once; the other one is sampled (`unirender.diffusion.sampling`), in one
-step or in many.
+step or in many. Gradients flow through both, to what is given and to the weights; who needs none calls under
+`torch.no_grad()`.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,6 @@ from unirender.models.priors import Maps
 Cameras = Camera | Sequence[Camera] | None
 
 
-@torch.no_grad()
 def infer_attributes(
     model: DualStreamModel,
     conditioning: Conditioning,
@@ -77,7 +77,6 @@ def infer_attributes(
     return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress, step_end).float())
 
 
-@torch.no_grad()
 def infer_image(
     model: DualStreamModel,
     conditioning: Conditioning,

@@ -59,6 +59,7 @@ class Network:
     device: torch.device
     progress: Callable[[Iterable[Any]], Iterable[Any]]
 
+    @torch.no_grad()
     def attributes(
         self,
         images: Sequence[Float[np.ndarray, "s s 3"]],
@@ -92,6 +93,7 @@ class Network:
         found = [rows[i * each : (i + 1) * each] for i in range(len(images))]
         return found if how.looks == 1 else [[mean_of_looks(own, self.conditioning.packing)] for own in found]
 
+    @torch.no_grad()
     def images(
         self, scenes: Sequence[Intrinsics], how: Sampling, derived: Sequence[Collection[str]] | None = None
     ) -> list[Float[np.ndarray, "s s 3"]]:
