@@ -40,7 +40,7 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
             raise UnirenderError(f"{path}: is the folder of a training run; its pipeline is {inside}")
         raise UnirenderError(
             f"{path}: no pipeline folder ({INDEX_FILE} is missing), expected one written by `unirender train`, "
-            f"or one of the names {', '.join(shipped_names())}"
+            f"or one of the names {', '.join(shipped_names())}; of a hub, download the folder first"
         )
     return path
 
