@@ -22,7 +22,7 @@ from unirender.camera import Camera
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.inputs import as_environment, as_list, as_picture
+from unirender.pipelines.inputs import as_list, as_picture
 from unirender.pipelines.settings import Sampling
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
@@ -65,11 +65,6 @@ def test_a_light_that_is_none_is_refused(pipeline: UniRenderPipeline, light: np.
     image, mask = picture()
     with pytest.raises(UnirenderError, match=f"environment: .*{words}"):
         pipeline.relight(image, light.astype(np.float32), mask)
-
-
-def test_a_light_is_no_path() -> None:
-    with pytest.raises(UnirenderError, match=r"got the path 'studio\.hdr', expected radiance .*load_light\(path\)"):
-        as_environment("studio.hdr")
 
 
 def test_an_unknown_exposure_is_refused(pipeline: UniRenderPipeline) -> None:

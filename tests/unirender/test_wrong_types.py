@@ -68,7 +68,7 @@ CASES = {
     "pipeline.edit(image, mask, metallic='gold')": "metallic: got str 'gold', expected numbers",
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics",
     "pipeline.render(decomposition.intrinsics, derived=('shadow',))": "derived: got shadow, expected names out of",
-    "pipeline.relight(image, 'sky.exr', mask)": "environment: got str 'sky.exr', expected numbers",
+    "pipeline.relight(image, 'sky.exr', mask)": "environment: got the path 'sky.exr', expected radiance [eh ew 3]",
     "pipeline.relight(image, photograph, mask)": "environment: got Image of uint8 values, expected linear radiance as",
     "pipeline.relight(image, bytes_8, mask)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "Intrinsics(environment=photograph)": "environment: got Image of uint8 values, expected linear radiance as floats;",
