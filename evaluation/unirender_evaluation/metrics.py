@@ -162,8 +162,10 @@ def mse(
     """Mean squared error; coverage-weighted where `w` is given.
 
     Raises:
-        UnirenderError: if shapes differ, or the weights sum to 0.
+        UnirenderError: if shapes differ, there are several pictures, or the weights sum to 0.
     """
+    if p.ndim != 3:
+        raise UnirenderError(f"metric: got shape {p.shape}, expected one picture [h, w, c]; take the mean of several")
     if p.shape != t.shape:
         raise UnirenderError(f"metric: got shapes {p.shape} and {t.shape}, expected equal ones; resample one of them")
     error = np.square(p.astype(np.float64) - t.astype(np.float64))
@@ -183,7 +185,13 @@ def psnr(
 
 
 def weighted_mean(x: Float[np.ndarray, "*pixels 1"], w: Float[np.ndarray, "*pixels 1"]) -> float:
-    """sum(w x) / sum(w); raises UnirenderError if the mask is empty."""
+    """sum(w x) / sum(w).
+
+    Raises:
+        UnirenderError: the mask is empty or of another shape: [h w] beside [h w 1] would weight each row by all rows.
+    """
+    if x.shape != w.shape:
+        raise UnirenderError(f"metric: got a mask of shape {w.shape}, expected {x.shape}; take mask[..., None]")
     total = float(w.sum(dtype=np.float64))
     if total <= 0:
         raise UnirenderError("metric: the true mask is empty, expected an object in the picture; drop the sample")

@@ -1,5 +1,6 @@
 """Metrics: against other implementations, in closed form, and with twins that must fail."""
 
+import inspect
 import math
 from typing import Any
 
@@ -110,6 +111,15 @@ def test_an_empty_mask_is_an_error() -> None:
     p, t = images(5)
     with pytest.raises(UnirenderError, match="mask is empty"):
         metrics.mse(p, t, np.zeros((40, 33, 1), np.float32))
+
+
+def test_a_mask_or_several_pictures_that_would_broadcast_are_an_error() -> None:
+    """As another project calls it: a mask [h, w] of a square picture gave a number, and it was a wrong one."""
+    pictures = np.random.default_rng(0).random((2, 16, 16, 3))
+    with pytest.raises(UnirenderError, match=r"got a mask of shape \(16, 16\), expected \(16, 16, 1\)"):
+        inspect.unwrap(metrics.weighted_mean)(pictures[0, ..., :1], np.ones((16, 16)))
+    with pytest.raises(UnirenderError, match=r"got shape \(2, 16, 16, 3\), expected one picture"):
+        inspect.unwrap(metrics.mse)(pictures, pictures)
 
 
 @settings(max_examples=25, deadline=None)

@@ -193,6 +193,17 @@ def test_noise_of_a_row_does_not_depend_on_the_batch() -> None:
     assert torch.equal(one[0], many[0])
 
 
+def test_noise_of_a_seed_does_not_depend_on_the_default_dtype() -> None:
+    """torch draws other numbers in float64; with them mode `mean` answered other maps."""
+    like = torch.zeros(1)
+    usual = draw_noise((2, 3, 4, 4), like, torch.Generator().manual_seed(5))
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert torch.equal(draw_noise((2, 3, 4, 4), like, torch.Generator().manual_seed(5)), usual)
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
 def test_modes() -> None:
     assert (steps_of("mean", None), steps_of("sample", None), steps_of("sample", 4)) == (1, 20, 4)
     assert (steps_of("mean", 1), steps_of("sample", 500)) == (1, 500)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from diffusers.training_utils import EMAModel
 from safetensors.numpy import load_file, save_file
 from tiny_models import MODEL, make_pipeline
 from tiny_stable_diffusion import tiny_vae
@@ -118,6 +119,43 @@ def test_a_config_of_another_network_is_refused(folder: Path) -> None:
     widen(folder / CONFIG)
     with pytest.raises(UnirenderError, match=r"mine: cannot be read as a checkpoint \(.*expected shape"):
         UniRenderPipeline.from_pretrained(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "options", "says"),
+    [
+        (CONFIG, {"lamps": 3}, r"config\.json: options lamps are not known to this DualStreamModel.*update unirender"),
+        ("model_index.json", {"gamma": 2}, r"model_index\.json: options gamma are not known to this UniRenderPipeline"),
+        ("model_index.json", {"material": "both"}, "material: got 'both', expected 'scalar' or 'map'"),
+        (CONFIG, {"hdr_curves": {"specular": [10, 20]}}, "hdr_curves: got specular, expected one of each of: specular"),
+        (CONFIG, {"patch": 4}, "attribute_channels: got 72, expected 288 with this codec, patch"),
+    ],
+)
+def test_a_config_that_would_answer_otherwise_is_refused(
+    folder: Path, file: str, options: dict[str, object], says: str
+) -> None:
+    """An option of a newer version was passed over with a warning, a contradiction failed at the first picture."""
+    path = folder / file
+    path.write_text(json.dumps(json.loads(path.read_text()) | options | {"_mine": 1, "quantization_config": None}))
+    with pytest.raises(UnirenderError, match=says):
+        UniRenderPipeline.from_pretrained(folder)
+
+
+def test_a_network_that_diffusers_averaged_is_read(folder: Path, tmp_path: Path) -> None:
+    pipeline = UniRenderPipeline.from_pretrained(folder)
+    kind = type(pipeline.dual_stream)
+    average = EMAModel(
+        pipeline.dual_stream.parameters(), model_cls=kind, model_config=dict(pipeline.dual_stream.config)
+    )
+    average.save_pretrained(str(tmp_path / "ema"))
+    averaged = kind.from_pretrained(tmp_path / "ema")
+    UniRenderPipeline(averaged, pipeline.scheduler).save_pretrained(tmp_path / "whole")
+    UniRenderPipeline.from_pretrained(tmp_path / "whole")
+
+
+def test_a_pipeline_without_its_network_is_refused(folder: Path) -> None:
+    with pytest.raises(UnirenderError, match="dual_stream: got None, expected a DualStreamModel"):
+        UniRenderPipeline.from_pretrained(folder, dual_stream=None)
 
 
 def test_a_mistake_of_the_caller_is_not_one_of_the_files(folder: Path) -> None:

@@ -19,6 +19,7 @@ from PIL import Image, ImageOps
 from tiny_models import SIZE, make_pipeline
 
 from unirender.camera import Camera
+from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.inputs import as_list, as_picture
@@ -214,6 +215,15 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
             "got a DPMSolverMultistepScheduler with another noise schedule",  # that of DDPM
         ),
         (
+            # betas of all 1000 timesteps are kept, of which 500 are taken
+            lambda config: DDIMScheduler.from_config(config, num_train_timesteps=500),
+            "got a DDIMScheduler with num_train_timesteps=500, expected 1000",
+        ),
+        (
+            lambda config: make_scheduler(500),
+            "got a DDIMScheduler with num_train_timesteps=500, expected 1000",
+        ),
+        (
             lambda config: UniPCMultistepScheduler.from_config(config, solver_type="bh1"),
             "got a UniPCMultistepScheduler with solver_type='bh1', expected 'bh2': .*answers NaN",
         ),
@@ -228,6 +238,17 @@ def test_a_scheduler_that_would_give_wrong_maps_is_refused(made: Callable[[Any],
     pipeline.scheduler = made(pipeline.scheduler.config)
     with pytest.raises(UnirenderError, match=f"scheduler: {words}"):
         pipeline.decompose(*picture(), mode="sample", num_inference_steps=3, num_samples=1)
+
+
+def test_one_step_asks_for_the_network_s_timesteps_too() -> None:
+    """The network knows pure noise by its timestep, 999: told 499, it answered other maps without a word."""
+    pipeline: Any = make_pipeline()
+    own = pipeline.scheduler.config
+    pipeline.scheduler = DDIMScheduler.from_config(own, num_train_timesteps=500)
+    with pytest.raises(UnirenderError, match="num_train_timesteps=500, expected 1000"):
+        pipeline.decompose(*picture())
+    pipeline.scheduler = EulerDiscreteScheduler.from_config(own)
+    pipeline.decompose(*picture(), closed=False)  # takes no part in one step
 
 
 def test_a_network_that_answers_nan_is_refused_in_both_directions() -> None:

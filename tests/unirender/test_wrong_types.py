@@ -106,7 +106,7 @@ CASES = {
     "maps.require('light')": "intrinsics: there is no map 'light', expected some of albedo,",
     "Camera.parse(None)": "camera: got None, expected a text like",
     "pipeline.render(decomposition.intrinsics, derived=('shadow',))": "derived: got shadow, expected names out of",
-    "pipeline.relight(image, 'sky.exr', mask)": "environment: got str 'sky.exr', expected numbers",
+    "pipeline.relight(image, 'sky.exr', mask)": "environment: got the path 'sky.exr', expected radiance [eh ew 3]",
     "pipeline.relight(image, photograph, mask)": "environment: got Image of uint8 values, expected linear radiance as",
     "pipeline.relight(image, bytes_8, mask)": "environment: got ndarray of uint8 values, expected linear radiance as",
     "Intrinsics(environment=photograph)": "environment: got Image of uint8 values, expected linear radiance as floats;",

@@ -1,7 +1,8 @@
 """Both directions of a trained network: p(attributes | image) and p(image | attributes).
 
 The stream that is given is clean and is encoded once; the other one is sampled (`unirender.diffusion.sampling`), in one
-step or in many.
+step or in many. Gradients flow through both, to what is given and to the weights; who needs none calls under
+`torch.no_grad()`.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import Generators, Progress, denoise, draw_noise
+from unirender.diffusion.sampling import Generators, Progress, StepEnd, denoise, draw_noise
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, Encoded
 from unirender.models.packing import TRIPLETS
@@ -21,7 +22,6 @@ from unirender.models.priors import Maps
 Cameras = Camera | Sequence[Camera] | None
 
 
-@torch.no_grad()
 def infer_attributes(
     model: DualStreamModel,
     conditioning: Conditioning,
@@ -33,6 +33,7 @@ def infer_attributes(
     generator: Generators = None,
     camera: Cameras = None,
     progress: Progress = iter,
+    step_end: StepEnd | None = None,
 ) -> Maps:
     """Inverse rendering: p(attributes | image).
 
@@ -46,6 +47,7 @@ def infer_attributes(
         generator: of the noise; see `draw_noise`.
         camera: of all rows, or one for each.
         progress: wraps the iteration over timesteps.
+        step_end: as for `denoise`.
 
     Returns:
         Maps as `Packing.unpack` gives them: float32, in physical units.
@@ -72,10 +74,9 @@ def infer_attributes(
         return output.attributes.to(x_t)
 
     noise = draw_noise((len(image), conditioning.attribute_channels, *image.shape[-2:]), image_linear, generator)
-    return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress).float())
+    return conditioning.decode_attributes(denoise(predict, noise, scheduler, steps, progress, step_end).float())
 
 
-@torch.no_grad()
 def infer_image(
     model: DualStreamModel,
     conditioning: Conditioning,
@@ -88,6 +89,7 @@ def infer_image(
     camera: Cameras = None,
     progress: Progress = iter,
     derived: Bool[Tensor, "b 6"] | None = None,
+    step_end: StepEnd | None = None,
 ) -> Float[Tensor, "b 3 H W"]:
     """Rendering: p(image | attributes).
 
@@ -102,6 +104,7 @@ def infer_image(
         camera: of all rows, or one for each.
         progress: wraps the iteration over timesteps.
         derived: which of them were derived from a light, without shadows; None: none.
+        step_end: as for `denoise`.
 
     Returns:
         Premultiplied linear image in [0, 1].
@@ -133,7 +136,7 @@ def infer_image(
         condition = output.encoded_attributes  # the same at every step
         return output.image.to(x_t)
 
-    return conditioning.decode_image(denoise(predict, x_T, scheduler, steps, progress).float())
+    return conditioning.decode_image(denoise(predict, x_T, scheduler, steps, progress, step_end).float())
 
 
 def extras_by_camera(

@@ -22,7 +22,7 @@ from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unirender.diffusion.schedule import last_timestep, make_scheduler
+from unirender.diffusion.schedule import NUM_TIMESTEPS, last_timestep, make_scheduler
 from unirender.errors import UnirenderError
 
 SAMPLE_STEPS = 20  # the paper's
@@ -48,6 +48,7 @@ Generators = torch.Generator | Sequence[torch.Generator] | None
 
 Predict = Callable[[Float[Tensor, "b c h w"], Int[Tensor, " b"]], Float[Tensor, "b c h w"]]
 Progress = Callable[[Iterable[Any]], Iterable[Any]]
+StepEnd = Callable[[int, int, Float[Tensor, "b c h w"]], Float[Tensor, "b c h w"]]
 
 
 def steps_of(mode: str, num_inference_steps: int | None) -> int:
@@ -99,8 +100,9 @@ def check_scheduler(scheduler: Any) -> None:
 
     Raises:
         UnirenderError: it takes what the network predicts, x0, for something else, or changes it; its noise schedule is
-            not the network's, which ends in noise alone; it would divide by zero there, or where all is clean; or it is
-            of another kind, which may draw noise of its own, that no seed would fix, or want its input scaled.
+            not the network's, which ends in noise alone, or has other timesteps; it would divide by zero there, or
+            where all is clean; or it is of another kind, which may draw noise of its own, that no seed would fix, or
+            want its input scaled.
     """
     name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
     kinds = {base.__name__ for base in type(scheduler).__mro__}
@@ -109,6 +111,7 @@ def check_scheduler(scheduler: Any) -> None:
             f"scheduler: got {name}, expected one of {', '.join(SCHEDULERS)} (not of sde): others draw noise of their "
             "own or scale their input"
         )
+    check_timesteps(scheduler)
     advice = f"make it by {name}.from_config of the config of the checkpoint's own"
     if config.get("prediction_type") != PREDICTION_TYPE:
         raise UnirenderError(
@@ -121,7 +124,7 @@ def check_scheduler(scheduler: Any) -> None:
     if wrong:
         got = ", ".join(f"{key}={config.get(key)!r}" for key in wrong)
         raise UnirenderError(f"scheduler: got a {name} with {got}, unlike what the network was trained with; {advice}")
-    apart = float((scheduler.alphas_cumprod.sqrt().cpu() - _signal(len(scheduler.alphas_cumprod))).abs().max())
+    apart = float((scheduler.alphas_cumprod.sqrt().cpu() - _signal()).abs().max())
     if apart > SAME_SIGNAL:
         raise UnirenderError(
             f"scheduler: got a {name} with another noise schedule than the network's: its signal, sqrt(alpha_bar), is "
@@ -138,10 +141,27 @@ def check_scheduler(scheduler: Any) -> None:
             )
 
 
+def check_timesteps(scheduler: Any) -> None:
+    """Looks whether a scheduler counts its timesteps as the network does, which knows pure noise by the last one: in
+    one step, too, it would be told of another amount of noise than it sees.
+
+    Raises:
+        UnirenderError: it has another number of them.
+    """
+    name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
+    got = {config.get("num_train_timesteps"), len(getattr(scheduler, "alphas_cumprod", range(NUM_TIMESTEPS)))}
+    if got != {NUM_TIMESTEPS}:
+        raise UnirenderError(
+            f"scheduler: got a {name} with num_train_timesteps={config.get('num_train_timesteps')!r}, expected "
+            f"{NUM_TIMESTEPS}, with which the network was trained; make it by {name}.from_config of the config of the "
+            "checkpoint's own"
+        )
+
+
 @functools.cache
-def _signal(num_timesteps: int) -> Float[Tensor, " t"]:
+def _signal() -> Float[Tensor, " t"]:
     """sqrt(alpha_bar) of the noise schedule that all networks are trained with."""
-    return make_scheduler(num_timesteps).alphas_cumprod.sqrt()
+    return make_scheduler().alphas_cumprod.sqrt()
 
 
 def sampler_name(scheduler: Any) -> str:
@@ -156,6 +176,7 @@ def denoise(
     scheduler: Any,
     steps: int,
     progress: Progress = iter,
+    step_end: StepEnd | None = None,
 ) -> Float[Tensor, "b c h w"]:
     """Runs `steps` scheduler steps from T down to clean.
 
@@ -166,20 +187,24 @@ def denoise(
             here.
         steps: 1 returns the prediction at T itself.
         progress: wraps the iteration over timesteps.
+        step_end: (index of the step, its timestep, what came out) -> what the next step begins with.
     """
     if steps == 1:
-        t = torch.full((len(noise),), last_timestep(scheduler), device=noise.device)
-        return predict(noise, t)
+        last = last_timestep(scheduler)
+        x_0 = predict(noise, torch.full((len(noise),), last, device=noise.device))
+        return x_0 if step_end is None else step_end(0, last, x_0)
     set_timesteps(scheduler, steps, noise.device)
     x_t = noise * scheduler.init_noise_sigma
     uneven = _strides_unevenly(scheduler, steps)
     following = [*scheduler.timesteps[1:], None]
-    for t, next_t in zip(progress(scheduler.timesteps), following, strict=True):
+    for step, (t, next_t) in enumerate(zip(progress(scheduler.timesteps), following, strict=True)):
         x_0 = predict(x_t, t.expand(len(x_t)))
         if uneven:
             x_t = _ddim_step(scheduler, x_0, x_t, t, next_t)
         else:
             x_t = scheduler.step(x_0, t, x_t, return_dict=False)[0]
+        if step_end is not None:
+            x_t = step_end(step, int(t), x_t)
     return x_t
 
 
@@ -218,8 +243,8 @@ def _ddim_step(
 
 
 def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = None) -> Float[Tensor, "b c h w"]:
-    """Gaussian noise of dtype and device of `like`, drawn on the generator's device (CPU without one), row by row:
-    a row's noise does not depend on how many follow it.
+    """Gaussian noise of dtype and device of `like`, drawn in float32 on the generator's device (CPU without one), row
+    by row: a row's noise does not depend on how many follow it, nor on torch's default dtype.
 
     Args:
         shape: of the noise; its first number is that of rows.
@@ -233,7 +258,7 @@ def draw_noise(shape: tuple[int, ...], like: Tensor, generator: Generators = Non
     if not generators or shape[0] % len(generators):
         raise ValueError(f"{len(generators)} generators for {shape[0]} rows, expected the same number of rows for each")
     rows = [
-        torch.randn(shape[1:], generator=own, device=own.device if own is not None else "cpu")
+        torch.randn(shape[1:], generator=own, device=own.device if own is not None else "cpu", dtype=torch.float32)
         for own in generators
         for _ in range(shape[0] // len(generators))
     ]

@@ -7,6 +7,7 @@ to the first step). The network predicts x_0; sampling spaces its steps from T d
 """
 
 import torch
+from diffusers.configuration_utils import ConfigMixin
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -37,8 +38,8 @@ def make_scheduler(num_timesteps: int = NUM_TIMESTEPS) -> DDIMScheduler:
     )
 
 
-def last_timestep(scheduler: DDIMScheduler) -> int:
-    """T."""
+def last_timestep(scheduler: ConfigMixin) -> int:
+    """T, of any scheduler of diffusers."""
     return int(scheduler.config["num_train_timesteps"]) - 1
 
 

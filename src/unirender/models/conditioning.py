@@ -84,8 +84,11 @@ class Conditioning:
         """The conditioning that a model's config describes.
 
         Raises:
-            UnirenderError: an unknown physics prior, or way of the light.
+            UnirenderError: an unknown physics prior, or way of the light, or other maps with a tone curve.
         """
+        if set(config["hdr_curves"] or HDR_CURVES) != set(HDR_CURVES):
+            got = ", ".join(config["hdr_curves"])
+            raise UnirenderError(f"hdr_curves: got {got}, expected one of each of: {', '.join(HDR_CURVES)}")
         curves = {name: HdrCurve(*value) for name, value in (config["hdr_curves"] or HDR_CURVES).items()}
         packing = Packing(curves, tuple(config["environment_size"]))
         name = config["physics_prior"]
@@ -104,6 +107,21 @@ class Conditioning:
         """Extra channels of the attribute and of the image stream."""
         common = len(TRIPLETS) + self.codec.factor**2 + 2
         return common, common + (self.codec.channels + 1 if self.physics_prior else 0)
+
+    def check_channels(self, config: dict) -> None:
+        """Looks whether a network's channels are those of what it is shown.
+
+        Raises:
+            UnirenderError: others.
+        """
+        names = ("attribute_channels", "image_channels", "attribute_extra_channels", "image_extra_channels")
+        shown = (self.attribute_channels, self.codec.channels, *self.extra_channels)
+        for name, expected in zip(names, shown, strict=True):
+            if config[name] != expected:
+                raise UnirenderError(
+                    f"{name}: got {config[name]}, expected {expected} with this codec, patch and physics_prior; change "
+                    "the network's configuration"
+                )
 
     def encode_attributes(self, maps: Maps) -> Float[Tensor, "b nc h w"]:
         """Maps -> latents of the attribute stream."""

@@ -17,14 +17,23 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
-from unirender.diffusion.sampling import check_scheduler, make_sampler
+from unirender.diffusion.sampling import check_scheduler, check_timesteps, make_sampler
 from unirender.errors import UnirenderError
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.calibration import Lines, check_lines
-from unirender.pipelines.loading import check_complete, copy_weights, find_pipeline, forget_place, reading
+from unirender.pipelines.loading import (
+    INDEX_FILE,
+    check_complete,
+    check_options,
+    copy_weights,
+    find_pipeline,
+    forget_place,
+    reading,
+)
 from unirender.pipelines.network import Network, Overflow
+from unirender.pipelines.settings import check_material
 
 P = TypeVar("P", bound="DualStreamPipeline")
 
@@ -40,6 +49,9 @@ class DualStreamPipeline(DiffusionPipeline):
         vae: for models with the KL codec.
         material: whether metallic and roughness are one number per object or maps, as the checkpoint was trained.
         calibration: lines by which predicted roughness and metallic are read (`unirender.pipelines.calibration`).
+
+    Raises:
+        UnirenderError: the network's configuration contradicts itself, or a setting is none.
     """
 
     model_cpu_offload_seq = "dual_stream->vae"
@@ -54,6 +66,7 @@ class DualStreamPipeline(DiffusionPipeline):
         calibration: Lines | None = None,
     ) -> None:
         super().__init__()
+        check_material(material)
         for part in (dual_stream, vae):
             forget_place(part)
         self.register_modules(dual_stream=dual_stream, scheduler=scheduler, vae=vae)
@@ -62,6 +75,7 @@ class DualStreamPipeline(DiffusionPipeline):
         self.scheduler: SchedulerMixin
         codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
         self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
+        self.conditioning.check_channels(dict(dual_stream.config))
         self.size = dual_stream.config["sample_size"] * codec.factor
         self._reported: set[str] = set()  # maps whose overflow was logged
 
@@ -76,11 +90,15 @@ class DualStreamPipeline(DiffusionPipeline):
             UnirenderError: no such folder, no pipeline in it, or it cannot be read.
         """
         path = find_pipeline(pretrained_model_name_or_path)
+        if kwargs.get("dual_stream", path) is None:  # so diffusers leaves a part out
+            raise UnirenderError("dual_stream: got None, expected a DualStreamModel; leave the argument out")
         old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
         with reading(path):
             pipeline = super().from_pretrained(str(path), **kwargs)
+            check_options(pipeline, path / INDEX_FILE)
             if "dual_stream" not in kwargs:
+                check_options(pipeline.dual_stream, path / "dual_stream" / "config.json")
                 check_complete(pipeline.dual_stream, path / "dual_stream")
         forget_place(pipeline)
         for name, part in pipeline.components.items():
@@ -120,8 +138,8 @@ class DualStreamPipeline(DiffusionPipeline):
             self.check_size(size)
         # A scheduler remembers its steps: each call has its own, so that calls at the same time do not share them.
         scheduler = copy.deepcopy(self.scheduler) if sampler is None else make_sampler(sampler, self.scheduler)
-        if mode == "sample":
-            check_scheduler(scheduler)
+        check = check_scheduler if mode == "sample" else check_timesteps
+        check(scheduler)
         # Weights that accelerate offloads lie elsewhere than they compute; of others the model knows, with one search.
         device = self._execution_device if hasattr(self.dual_stream, "_hf_hook") else self.dual_stream.device
         return Network(self.dual_stream, self.conditioning, scheduler, size or self.size, device, self._progress)

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,8 +113,13 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     """Radiance of a lat-long map.
 
     Raises:
-        UnirenderError: as `unirender.lighting.as_light`; or it is black.
+        UnirenderError: as `unirender.lighting.as_light`; or it is the path of a file, or black.
     """
+    if isinstance(environment, str | Path):
+        raise UnirenderError(
+            f"environment: got the path {str(environment)!r:.60}, expected radiance [eh ew 3]; read a light file with "
+            "unirender_reference.lights.load_light(path).environment"
+        )
     light = as_light(environment)
     if light.max() <= 0:
         raise UnirenderError("environment: the light is black, expected some radiance")

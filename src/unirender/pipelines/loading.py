@@ -1,6 +1,7 @@
 """A pipeline folder is read whole, or refused in one sentence that names it."""
 
 import contextlib
+import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,8 @@ from unirender.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
 PLACE = "_name_or_path"  # in the configuration of what diffusers has read
+OF_AVERAGE = ("decay", "min_decay", "optimization_step", "update_after_step", "use_ema_warmup", "inv_gamma", "power")
+OF_DIFFUSERS = {"quantization_config", *OF_AVERAGE}  # what it adds to a network's configuration, by its EMAModel, too
 OF_FILES = (OSError, SafetensorError)
 
 
@@ -37,7 +40,7 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
             raise UnirenderError(f"{path}: is the folder of a training run; its pipeline is {inside}")
         raise UnirenderError(
             f"{path}: no pipeline folder ({INDEX_FILE} is missing), expected one written by `unirender train`, "
-            f"or one of the names {', '.join(shipped_names())}"
+            f"or one of the names {', '.join(shipped_names())}; of a hub, download the folder first"
         )
     return path
 
@@ -79,6 +82,26 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
     if missing:
         raise UnirenderError(
             f"{folder}: {len(missing)} weights are missing, the first is {missing[0]}; copy the folder again"
+        )
+
+
+def check_options(part: ConfigMixin, file: Path) -> None:
+    """Of options that a class does not know diffusers only warns, and answers as if they were not there. They are a
+    newer version's, or misspelt.
+
+    Args:
+        part: as it was read.
+        file: its configuration.
+
+    Raises:
+        UnirenderError: there are such options.
+    """
+    known = OF_DIFFUSERS | inspect.signature(type(part).__init__).parameters.keys()
+    unknown = sorted(name for name in json.loads(file.read_text(encoding="utf-8")).keys() - known if name[0] != "_")
+    if unknown:
+        raise UnirenderError(
+            f"{file}: options {', '.join(unknown)} are not known to this {type(part).__name__}, whose answers may "
+            "depend on them; update unirender, or take them out if they are misspelt"
         )
 
 

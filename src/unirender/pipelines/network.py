@@ -59,6 +59,7 @@ class Network:
     device: torch.device
     progress: Callable[[Iterable[Any]], Iterable[Any]]
 
+    @torch.no_grad()
     def attributes(
         self,
         images: Sequence[Float[np.ndarray, "s s 3"]],
@@ -84,6 +85,7 @@ class Network:
             generator=how.generators(len(images)),
             camera=_repeat([look.camera(camera) for camera in cameras for look in looks], how.count),
             progress=self.progress,
+            step_end=how.step_end,
         )
         arrays = {name: value.permute(0, 2, 3, 1).float().cpu().numpy() for name, value in maps.items()}
         rows = [{name: value[i] for name, value in arrays.items()} for i in range(len(seen) * how.count)]
@@ -91,6 +93,7 @@ class Network:
         found = [rows[i * each : (i + 1) * each] for i in range(len(images))]
         return found if how.looks == 1 else [[mean_of_looks(own, self.conditioning.packing)] for own in found]
 
+    @torch.no_grad()
     def images(
         self, scenes: Sequence[Intrinsics], how: Sampling, derived: Sequence[Collection[str]] | None = None
     ) -> list[Float[np.ndarray, "s s 3"]]:
@@ -116,6 +119,7 @@ class Network:
             camera=_repeat([scene.camera for scene in scenes], how.count),
             progress=self.progress,
             derived=torch.tensor(_repeat(flags, how.count), device=self.device),
+            step_end=how.step_end,
         )
         means = image.unflatten(0, (len(scenes), how.count)).mean(dim=1)
         pictures = means.permute(0, 2, 3, 1).float().cpu().numpy()

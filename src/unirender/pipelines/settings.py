@@ -6,15 +6,18 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import NUM_SAMPLES, Generators, is_whole, steps_of
+from unirender.diffusion.sampling import NUM_SAMPLES, Generators, StepEnd, is_whole, steps_of
 from unirender.errors import UnirenderError
 from unirender.pipelines.looks import check_looks
 
 # of `decompose`: how a picture is taken apart, and its default; and all
 TAKING_APART = {"looks": 1, "tile": False, "material": None, "closed": True, "flat": False}
-SETTINGS = ("camera", "mode", "num_inference_steps", "num_samples", "generator", "sampler", "size", *TAKING_APART)
+NOISE = ("mode", "num_inference_steps", "num_samples", "generator", "sampler", "callback_on_step_end")
+SETTINGS = ("camera", *NOISE, "size", *TAKING_APART)
+MATERIALS = ("scalar", "map")  # one number per object, or maps
 FIXED_SEED = 0  # of the noise in mode `mean`: an expectation depends on no draw
 
 
@@ -29,6 +32,7 @@ class Sampling:
         generator: of the noise, on the CPU: one, or one for each picture of a batch. None: a fixed noise in mode
             `mean`, torch's global state in mode `sample`.
         looks: at each picture that is taken apart (`unirender.pipelines.looks`); 1 in mode `sample`.
+        step_end: is told of every step, and may change what the next one begins with; None: nothing is.
     """
 
     mode: str
@@ -36,6 +40,7 @@ class Sampling:
     count: int
     generator: Generators
     looks: int = 1
+    step_end: StepEnd | None = None
 
     @classmethod
     def of(
@@ -45,6 +50,7 @@ class Sampling:
         num_samples: int | None = None,
         generator: Generators = None,
         looks: int = 1,
+        step_end: StepEnd | None = None,
     ) -> "Sampling":
         """Resolves the arguments of a call.
 
@@ -53,7 +59,7 @@ class Sampling:
         """
         _check_generators(generator)
         steps, count = steps_of(mode, num_inference_steps), _sample_count(mode, num_samples)
-        return cls(mode, steps, count, generator, check_looks(looks, mode))
+        return cls(mode, steps, count, generator, check_looks(looks, mode), step_end)
 
     def generators(self, pictures: int) -> Generators:
         """The noise of a batch: a picture with a generator of its own, or in mode `mean` without any, gets in it what
@@ -79,6 +85,43 @@ class Sampling:
         own = self.generators(1)
         own = own[0] if isinstance(own, Sequence) else own
         return int(torch.randint(0, 2**62, (), generator=own, device=own.device if own is not None else "cpu"))
+
+
+def step_end_of(pipeline: Any, callback: Any) -> StepEnd | None:
+    """What is done at the end of each step, by diffusers' `callback_on_step_end`.
+
+    Args:
+        pipeline: which the callback is told.
+        callback: (pipeline, index of the step, timestep, {"latents": tensor}) -> the same dictionary, whose latents
+            count from then on, or None; None: there is no callback.
+
+    Raises:
+        UnirenderError: it cannot be called; or, at a step, it returns something else, or latents of another kind.
+    """
+    if callback is None:
+        return None
+    if not callable(callback):
+        raise UnirenderError(
+            f"callback_on_step_end: got {callback!r:.60}, expected a function (pipeline, step, timestep, "
+            "callback_kwargs) that returns callback_kwargs"
+        )
+
+    def step_end(step: int, timestep: int, latents: Float[torch.Tensor, "b c h w"]) -> Float[torch.Tensor, "b c h w"]:
+        answer = callback(pipeline, step, timestep, {"latents": latents})
+        if answer is None:
+            return latents
+        if not isinstance(answer, Mapping) or set(answer) - {"latents"}:
+            got = sorted(map(str, answer)) if isinstance(answer, Mapping) else repr(answer)
+            raise UnirenderError(f"callback_on_step_end: returned {got!s:.60}, expected a dictionary of latents alone")
+        changed = answer.get("latents", latents)
+        if not isinstance(changed, torch.Tensor) or changed.shape != latents.shape:
+            got = list(changed.shape) if isinstance(changed, torch.Tensor) else type(changed).__name__
+            raise UnirenderError(
+                f"callback_on_step_end: returned latents {got}, expected a tensor {list(latents.shape)} as it was given"
+            )
+        return changed.to(latents)
+
+    return step_end
 
 
 def list_cameras(cameras: Any, count: int) -> list[Camera]:
@@ -123,6 +166,17 @@ def check_switches(**switches: Any) -> None:
     for name, value in switches.items():
         if not isinstance(value, bool | np.bool_):
             raise UnirenderError(f"{name}: got {value!r:.60}, expected True or False")
+
+
+def check_material(material: Any) -> str:
+    """What roughness and metallic are, as it was given.
+
+    Raises:
+        UnirenderError: neither one number per object nor maps.
+    """
+    if material not in MATERIALS:
+        raise UnirenderError(f"material: got {material!r:.60}, expected 'scalar' or 'map'")
+    return material
 
 
 def same_noise(seed: int, count: int) -> list[torch.Generator]:

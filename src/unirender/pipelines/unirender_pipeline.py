@@ -6,7 +6,7 @@ image* that comes back is premultiplied. Any size: pictures are brought to the m
 of tiles (`unirender.pipelines.tiling`). The sampler is the `scheduler` component, or named in a call.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, overload
 
@@ -38,11 +38,20 @@ from unirender.pipelines.inputs import (
 from unirender.pipelines.network import Overflow
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
-from unirender.pipelines.settings import Sampling, check_settings, check_switches, list_cameras, same_noise
+from unirender.pipelines.settings import (
+    Sampling,
+    check_material,
+    check_settings,
+    check_switches,
+    list_cameras,
+    same_noise,
+    step_end_of,
+)
 
 # Shapes and ranges are checked in `unirender.pipelines.inputs`.
 Picture = np.ndarray | Image.Image
 Material = np.ndarray | np.floating | float
+Callback = Callable[[Any, int, int, dict[str, Any]], Mapping[str, Any] | None]
 
 
 class UniRenderPipeline(DualStreamPipeline):
@@ -74,6 +83,7 @@ class UniRenderPipeline(DualStreamPipeline):
         generator: torch.Generator | None = None,
         sampler: str | None = None,
         size: int | None = None,
+        callback_on_step_end: Callback | None = None,
         looks: int = 1,
         tile: bool = False,
         material: str | None = None,
@@ -94,6 +104,10 @@ class UniRenderPipeline(DualStreamPipeline):
                 on it: roughness and metallic by some 0.01), torch's global state in mode `sample`.
             sampler: of `sample`: `ddim` or `unipc`; None: the pipeline's scheduler.
             size: side of the square at which the network runs, a multiple of `size_multiple`; None: the model's own.
+            callback_on_step_end: as in diffusers: is called after each step as (pipeline, step, timestep, {"latents":
+                tensor [b c h w]}), b the samples or looks of each picture in a row, and returns that dictionary, whose
+                latents count from then on (None: as they were). Also of each batch of tiles; not of closing. What it
+                raises ends the call.
             looks: at the picture, of mode `mean`, 1 to 12: mirrored, and with its colour channels exchanged. Their mean
                 is better and takes longer (`unirender.pipelines.looks`); 6 give most of it.
             tile: add the detail of tiles to albedo and normal where the picture is larger than that square.
@@ -120,6 +134,7 @@ class UniRenderPipeline(DualStreamPipeline):
             generator=generator,
             sampler=sampler,
             size=size,
+            callback_on_step_end=callback_on_step_end,
             looks=looks,
             tile=tile,
             material=material,
@@ -140,6 +155,7 @@ class UniRenderPipeline(DualStreamPipeline):
         generator: Generators = None,
         sampler: str | None = None,
         size: int | None = None,
+        callback_on_step_end: Callback | None = None,
         looks: int = 1,
         tile: bool = False,
         material: str | None = None,
@@ -159,6 +175,7 @@ class UniRenderPipeline(DualStreamPipeline):
                 turn; None: as for `decompose`.
             sampler: of `sample`.
             size: side of the network's square.
+            callback_on_step_end: of all pictures at once.
             looks: at each picture.
             tile: add the detail of tiles.
             material: one number per object or maps.
@@ -180,10 +197,9 @@ class UniRenderPipeline(DualStreamPipeline):
                 f"decompose: got {len(images_srgb)} pictures, {len(masks)} masks and {len(cameras)} cameras, expected "
                 "at least one picture, and one of each for every picture"
             )
-        material = self.config["material"] if material is None else material
-        if material not in ("scalar", "map"):
-            raise UnirenderError(f"material: got {material!r}, expected 'scalar' or 'map'")
-        how = Sampling.of(mode, num_inference_steps, num_samples, generator, looks)
+        material = check_material(self.config["material"] if material is None else material)
+        step_end = step_end_of(self, callback_on_step_end)
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator, looks, step_end)
         network = self._network(mode, sampler, size)
         views, thumbnails = [], []
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
@@ -211,6 +227,7 @@ class UniRenderPipeline(DualStreamPipeline):
         generator: torch.Generator | None = None,
         sampler: str | None = None,
         size: int | None = None,
+        callback_on_step_end: Callback | None = None,
         derived: str | Collection[str] = (),
         shadows: bool = True,
     ) -> Float[np.ndarray, "h w 3"]:
@@ -226,6 +243,7 @@ class UniRenderPipeline(DualStreamPipeline):
             generator: of the noise.
             sampler: of `sample`.
             size: side of the network's square.
+            callback_on_step_end: of the noise's steps.
             derived: which of the intrinsics' specular and diffuse lack shadows, since they were derived from a light:
                 by `unirender.pipelines.editing.under_light` both, or with its `shadows` d alone.
             shadows: whether s and d that are derived here have the shadows that the surfaces of the picture cast on one
@@ -241,7 +259,8 @@ class UniRenderPipeline(DualStreamPipeline):
         derived = (derived,) if isinstance(derived, str) else derived
         check_rendered(intrinsics, derived)
         check_switches(shadows=shadows)
-        how = Sampling.of(mode, num_inference_steps, num_samples, generator)
+        step_end = step_end_of(self, callback_on_step_end)
+        how = Sampling.of(mode, num_inference_steps, num_samples, generator, step_end=step_end)
         network = self._network(mode, sampler, size)
         (image,) = render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)
         self.maybe_free_model_hooks()
@@ -283,8 +302,8 @@ class UniRenderPipeline(DualStreamPipeline):
             anchored: the change is applied to the input (`unirender.pipelines.editing.anchor`); else the plain render.
             decomposition: of this picture with this mask, if it is at hand: taken as it is, so that camera, looks,
                 tile, material, closed and flat are its own; others are refused.
-            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, looks, tile, material,
-                closed and flat, as for `decompose`.
+            **sampling: camera, mode, num_inference_steps, num_samples, generator, sampler, size, callback_on_step_end
+                (of all passes, one after another), looks, tile, material, closed and flat, as for `decompose`.
 
         Returns:
             The edited picture (premultiplied and linear), its maps, and the decomposition.
@@ -393,6 +412,7 @@ class UniRenderPipeline(DualStreamPipeline):
     ) -> Float[np.ndarray, "h w 3"]:
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
+        settings["step_end"] = step_end_of(self, sampling.get("callback_on_step_end"))
         network = self._network(sampling.get("mode", "mean"), sampling.get("sampler"), sampling.get("size"))
         # Both renders see the same noise, so that it cancels in what changes.
         seed = Sampling.of(**settings, generator=sampling.get("generator")).draw_seed()
