@@ -76,7 +76,11 @@ def solve_appearance(
         texture_size: texels along each side.
         light_rows: even; the light has twice as many columns.
         seed: equal seeds draw equal samples.
+
+    Raises:
+        UsageError: the configuration has a value outside its range.
     """
+    config.check()
     if not config.enabled:
         return start_solution(views, obj, texture_size, light_rows)
     work = _Work(views, obj, config, on_step or (lambda step: True), texture_size, light_rows, seed)
