@@ -18,7 +18,9 @@ class Decompositions(Generic[Found]):
     def __init__(self) -> None:
         self._found: dict[str, tuple[Found, float]] = {}
 
-    def of(self, image_srgb: Image, mask: Mask, camera: Camera, decompose: Callable[[], Found]) -> tuple[Found, float]:
+    def of(
+        self, image_srgb: Image, mask: Mask, camera: Camera, decompose: Callable[[], Found], told: bytes = b""
+    ) -> tuple[Found, float]:
         """The decomposition of a picture, and the seconds that it took before this call: 0 where it is made now.
 
         Args:
@@ -26,8 +28,9 @@ class Decompositions(Generic[Found]):
             mask: its alpha.
             camera: of the picture.
             decompose: makes what is not there. What it raises is not kept.
+            told: whatever else the answer depends on.
         """
-        shown = f"{image_srgb.shape} {camera}".encode() + image_srgb.tobytes() + mask.tobytes()
+        shown = f"{image_srgb.shape} {camera}".encode() + image_srgb.tobytes() + mask.tobytes() + told
         key = hashlib.sha256(shown).hexdigest()
         if key in self._found:
             return self._found[key]

@@ -4,9 +4,9 @@ The optimiser (`unirender_reference.optimize.single_view`) finds albedo, roughne
 renders the edited and the relit surface (`unirender_reference.shade`).
 """
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.methods import Image, Mask
 from unirender_reference.shapes import MeshObject
 
@@ -40,7 +41,7 @@ class OptimizedMethod:
 
         self.name, self.base = name, base
         self.settings = SingleConfig() if config is None else config
-        self._found: dict[str, Intrinsics] = {}
+        self._found = Decompositions[Intrinsics]()
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -51,11 +52,9 @@ class OptimizedMethod:
         self, image_srgb: Image, mask: Mask, camera: Camera, geometry: MeshObject | None = None
     ) -> Intrinsics:
         """The maps and the light of a picture; found once, since edits and relighting ask again."""
-        shape = b"" if geometry is None else geometry.vertices.tobytes()
-        digest = hashlib.sha256(image_srgb.tobytes() + mask.tobytes() + repr(camera).encode() + shape).hexdigest()
-        if digest not in self._found:
-            self._found[digest] = self._optimize(image_srgb, mask, camera, geometry)
-        return self._found[digest]
+        mesh = b"" if geometry is None else geometry.vertices.tobytes() + geometry.faces.tobytes()
+        make = partial(self._optimize, image_srgb, mask, camera, geometry)
+        return self._found.of(image_srgb, mask, camera, make, told=mesh)[0]
 
     def _optimize(self, image_srgb: Image, mask: Mask, camera: Camera, geometry: MeshObject | None) -> Intrinsics:
         from unirender_reference.optimize.single_view import optimize_image

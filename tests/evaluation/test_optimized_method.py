@@ -11,6 +11,7 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.decompositions import KEPT
 from unirender_evaluation.engine import answer
 from unirender_evaluation.methods import quantise, seen_linear
 from unirender_evaluation.metrics import psnr
@@ -66,8 +67,24 @@ def test_a_picture_is_optimised_once(method: OptimizedMethod, seen: dict[str, An
     found = method.decompose(**seen)
     assert {"albedo", "roughness", "metallic", "normal", "specular", "diffuse", "environment"} <= set(found.present)
     assert method.decompose(**seen) is found
-    darker = {**seen, "image_srgb": 0.5 * seen["image_srgb"]}
-    assert method.decompose(**darker) is not found
+
+
+def test_of_many_pictures_the_last_are_kept(seen: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """By picture and mesh; what was found in thousands of photographs would not fit into memory."""
+    method, asked, mesh = OptimizedMethod("optimiser"), [], sphere(subdivisions=1)
+    monkeypatch.setattr(
+        method, "_optimize", lambda *given: asked.append(given[-1] is None) or Intrinsics(mask=seen["mask"])
+    )
+    others = [{**seen, "image_srgb": seen["image_srgb"] / (2 + index)} for index in range(KEPT)]
+    first = method.decompose(**seen)
+    assert method.decompose(**seen) is first
+    assert method.decompose(**seen, geometry=mesh) is not first
+    assert len({id(method.decompose(**other)) for other in others}) == KEPT
+    assert asked == [True, False] + [True] * KEPT
+    assert method.decompose(**others[0]) is method.decompose(**others[0])
+    assert len(asked) == KEPT + 2
+    method.decompose(**seen)
+    assert len(asked) == KEPT + 3
 
 
 def test_what_it_finds_looks_like_the_picture_and_edits_do_not(method: OptimizedMethod, seen: dict[str, Any]) -> None:

@@ -15,16 +15,14 @@ the noise-free picture; the others are biased, most where x is noisiest. `slope`
 A display value of 1 says that the radiance was 1 *or more*. `one_sided`: there, an x above t is no error.
 """
 
-from typing import Literal
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.color import display_slope, srgb_encode
+from unirender_reference.optimize.refine_config import LossKind
 from unirender_reference.optimize.robust import cauchy
 from unirender_reference.optimize.views import View, Views
 
-LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
 EPSILON = 0.01  # of the relative loss
 LEAST_ERROR = 0.002  # display values: half a step of 8 bits; of the scale of errors
 

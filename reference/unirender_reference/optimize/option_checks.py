@@ -1,7 +1,7 @@
 """Ranges of options, with one sentence for a value outside. Light to import."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from unirender.errors import UsageError
@@ -28,3 +28,21 @@ def require_least(options: Any, group: str, least: Mapping[str, float], above: b
             shown = f"{value:g}" if isinstance(value, float) else str(value)
             prefix = f"{group}." if group else ""
             raise UsageError(f"--{prefix}{name.replace('_', '-')} {shown}: expected {wanted}")
+
+
+def require_one_of(options: Any, group: str, choices: Mapping[str, Collection[str]]) -> None:
+    """Looks at some fields of a group of options that name one of a few things.
+
+    Args:
+        options: a dataclass.
+        group: its name on the command line.
+        choices: by field, the names that serve.
+
+    Raises:
+        UsageError: one is another name.
+    """
+    for name, names in choices.items():
+        value = getattr(options, name)
+        if value not in names:
+            option = f"--{group}.{name.replace('_', '-')}"
+            raise UsageError(f"{option} {value!s:.40}: expected one of {', '.join(names)}")

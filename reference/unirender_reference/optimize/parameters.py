@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.color import display_slope, srgb_decode, srgb_encode
+from unirender_reference.optimize.refine_config import Space
 from unirender_reference.shader import MOST_METALLIC
 
 Name = Literal["albedo", "roughness", "metallic", "environment"]
 NAMES: tuple[Name, ...] = ("albedo", "roughness", "metallic", "environment")
-Space = Literal["perceptual", "linear"]
 
 LEAST_ALBEDO = 1e-3
 LEAST_ROUGHNESS = 0.03  # below, highlights are as rare among samples as a mirror's

@@ -47,7 +47,11 @@ def refine(
 
     Returns:
         The start's mesh with new textures and light.
+
+    Raises:
+        UsageError: the configuration has a value outside its range.
     """
+    config.check()
     if not config.enabled:
         return start
     state = RefineState.begin(start, config) if state is None else state

@@ -1,12 +1,15 @@
 """What the refinement is made of: every ingredient is a field, every field can be switched off."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from unirender.errors import UsageError
-from unirender_reference.optimize.option_checks import require_least
+from unirender_reference.optimize.option_checks import require_least, require_one_of
 
 LEAST_LIGHT_ROWS = 4
+
+LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
+Space = Literal["perceptual", "linear"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,7 @@ class RefineConfig:
     """Off: the start is returned as it is."""
     iterations: int = 40
     """Steps of Adam."""
-    loss: Literal["log", "srgb", "linear", "relative", "slope"] = "slope"
+    loss: LossKind = "slope"
     """How pictures are compared; `losses` has the equations. "log" is NvDiffRec's."""
     one_sided: bool = True
     """More light than a display shows is no error where the picture is saturated."""
@@ -33,7 +36,7 @@ class RefineConfig:
     """Picture and derivative draw different samples; off: the same, with a biased gradient."""
     common_random_numbers: bool = False
     """Every iteration draws the same samples."""
-    parametrisation: Literal["perceptual", "linear"] = "perceptual"
+    parametrisation: Space = "perceptual"
     """Steps in display values of albedo and logarithms of light, or in the linear values themselves."""
     albedo_rate: float = 0.01
     """Learning rate of the albedo, in display values or linear ones."""
@@ -96,6 +99,7 @@ class RefineConfig:
             *("light_anchor", "material_anchor", "albedo_anchor", "demodulated"),
         )
         require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))
+        require_one_of(self, "refine", {"loss": get_args(LossKind), "parametrisation": get_args(Space)})
         require_least(self, "refine", {"decay": 0}, above=True)
         require_least(self, "refine", {"beta_2": 0})
         if self.beta_2 >= 1:

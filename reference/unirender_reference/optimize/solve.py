@@ -1,6 +1,6 @@
 """The global start: light, base colour, roughness and metallic from pictures of a known mesh, in a few dozen steps.
 
-    1. transport matrices of the pixels that the views show                                (`transport`)
+    1. transport matrices of the pixels that the views show, large ones reduced            (`transport`)
     2. from several materials, on a coarse light: light and one material                   (`light_solve`)
     3. the best of them on the full light, and, where lobes are narrower than its cells, on a finer one; then, if asked
        for, materials of every patch                                                       (`material_search`)
@@ -12,6 +12,7 @@ Descent by gradients (`refine`) goes on from there, and stalls where it starts f
 """
 
 import itertools
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from unirender_reference.optimize.folder import reduced
 from unirender_reference.optimize.light_grid import LightGrid, interpolated_light
 from unirender_reference.optimize.light_solve import LightPrior, Solved, solve_light
 from unirender_reference.optimize.material_search import search_materials
@@ -41,6 +43,10 @@ LATER_ITERATIONS = 3  # after a correction
 FINE = LightGrid(24, 48)  # what mirrors need
 LEAST_SCALE = 0.2  # of the residuals under Cauchy's loss, in units of SIGMA
 LEAST_SHARE = 1.5  # pixels for each of its texels
+LEAST_FACTOR, LEAST_SIDE = (
+    3,
+    64,
+)  # by which pictures are reduced, and their pixels then: small ones do not tell metallic
 
 OnStep = Callable[[Step], bool]
 
@@ -76,7 +82,11 @@ def solve_appearance(
         texture_size: texels along each side.
         light_rows: even; the light has twice as many columns.
         seed: equal seeds draw equal samples.
+
+    Raises:
+        UsageError: the configuration has a value outside its range.
     """
+    config.check()
     if not config.enabled:
         return start_solution(views, obj, texture_size, light_rows)
     work = _Work(views, obj, config, on_step or (lambda step: True), texture_size, light_rows, seed)
@@ -96,12 +106,13 @@ class _Work:
         light_rows: int,
         seed: int,
     ) -> None:
-        self.views, self.obj, self.config, self.size, self.seed = views, obj, config, texture_size, seed
+        self.views = shrunk(views, config.pixels)
+        self.obj, self.config, self.size, self.seed = obj, config, texture_size, seed
         self._on_step, self._began, self._steps = on_step, time.perf_counter(), 0
         self.prior = LightPrior(config.smooth_light, config.neutral_light)
         self.scene = blocker(obj)
         self.grid = LightGrid(light_rows, 2 * light_rows)
-        self._look(trace_points(self.scene, views.seen, POINTS, seed, config.pixels))
+        self._look(trace_points(self.scene, self.views.seen, POINTS, seed, config.pixels))
 
     def _look(self, points: SurfacePoints, fine: bool = False) -> None:
         """What is known of some pixels: matrices and what they show."""
@@ -211,6 +222,24 @@ class _Work:
             "metallic": float(appearance.metallic.mean()),
         }
         return self._on_step(Step("transport", self._steps, time.perf_counter() - self._began, values))
+
+
+def shrunk(views: Views, pixels: int) -> Views:
+    """Views reduced by a whole factor, so that about `pixels` of theirs show the object; others as they are.
+
+    Of pixels drawn at random from large pictures hardly two show the same place of the surface. Each would have a base
+    colour of its own, and nothing but the light's smoothness would tell that from the light.
+
+    Args:
+        views: the pictures.
+        pixels: that are wanted of all seen views together; more are left where the factor or the size would be less
+            than `LEAST_FACTOR` and `LEAST_SIDE`.
+    """
+    covered, side = sum(int((view.mask > 0).sum()) for view in views.seen), max(views.height, views.width)
+    factor = min(math.isqrt(covered // pixels), side // LEAST_SIDE)
+    if factor < LEAST_FACTOR:
+        return views
+    return replace(views, seen=tuple(reduced(view, side // factor, views.hdr) for view in views.seen), held_out=())
 
 
 def _brightness(views: Views) -> float:

@@ -1,12 +1,14 @@
 """Settings of the start by light transport. Light to import."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.optimize.option_checks import require_least
+from unirender_reference.optimize.option_checks import require_least, require_one_of
 
 LEAST_PIXELS = 16
+
+Materials = Literal["one", "maps"]
 
 
 @dataclass(frozen=True)
@@ -15,10 +17,11 @@ class TransportConfig:
 
     enabled: bool = True
     """Solve for a start; off: grey, roughness and metallic 0.5, a constant light."""
-    materials: Literal["one", "maps"] = "maps"
+    materials: Materials = "maps"
     """One roughness and metallic for the object, or maps of them, where the pictures speak for more than one."""
     pixels: int = 9000
-    """At most so many pixels of all views, drawn at random; memory and time grow with it."""
+    """At most so many pixels of all views; memory and time grow with it. Larger pictures (from 192 pixels) are
+    reduced by a whole factor, to no less than 64; of what is left pixels are drawn at random."""
     fine_below: float = 0.25
     """Below this roughness the light is solved for on 24 x 48 texels, if the views have pixels enough for it."""
     fine_pixels: int = 6000
@@ -49,6 +52,7 @@ class TransportConfig:
         counts = {"pixels": LEAST_PIXELS, "fine_pixels": LEAST_PIXELS, "iterations": 0, "rounds": 0}
         weights = {"fine_below": 0, "smooth_light": 0, "neutral_light": 0, "smooth_albedo": 0}
         require_least(self, "transport", counts | weights)
+        require_one_of(self, "transport", {"materials": get_args(Materials)})
         try:
             pass_count(self.correction_spp, 1, SAMPLES_PER_PASS)
         except UnirenderError as error:

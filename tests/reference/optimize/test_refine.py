@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ import refine_problems as problems
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference import backend
+from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.light_grid import interpolated_light
 from unirender_reference.optimize.parameters import Name
 from unirender_reference.optimize.refine import Fit, RefineConfig, RefineState, refine
 from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.solve import solve_appearance
 from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.optimize.transport_config import TransportConfig
 from unirender_reference.optimize.views import Step, Views
 
 FAST = RefineConfig(iterations=6, spp=4, spp_gradient=4, depth=2)
@@ -204,6 +208,32 @@ def test_a_light_is_interpolated_as_the_renderer_does(truth: Solution) -> None:
     one = TexturedScene(truth, views).image(maps, 256, 0)[..., :3].mean()
     assert TexturedScene(other, views).image(maps_of(other), 256, 0)[..., :3].mean() == pytest.approx(one, rel=0.03)
     np.testing.assert_allclose(finer[::2].mean(1), truth.environment.mean(1), rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("loss", "l1", r"--refine\.loss l1: expected one of log, srgb, linear, relative, slope"),
+        ("parametrisation", "log", r"--refine\.parametrisation log: expected one of perceptual, linear"),
+        ("spp", 0, r"--refine\.spp 0: expected 1 or more"),
+    ],
+)
+def test_a_misspelled_ingredient_is_refused_before_any_work(
+    truth: Solution, name: str, value: Any, message: str
+) -> None:
+    """Another loss ended a run after its start, another space was taken for the linear one."""
+    config = RefineConfig()
+    object.__setattr__(config, name, value)  # past the types, which are looked at in tests alone
+    for call in (OptimizeConfig(refine=config).check, lambda: refine(Views(problems.blank_views(1)), truth, config)):
+        with pytest.raises(UsageError, match=message):
+            call()
+
+
+def test_a_misspelled_choice_of_materials_is_refused(truth: Solution) -> None:
+    config = TransportConfig()
+    object.__setattr__(config, "materials", "map")
+    with pytest.raises(UsageError, match=r"--transport\.materials map: expected one of one, maps"):
+        solve_appearance(Views(problems.blank_views(1)), truth.obj, config)
 
 
 def test_the_plain_loop_has_no_ingredient() -> None:

@@ -6,8 +6,21 @@ import appearance_cases as cases
 import numpy as np
 import pytest
 
+from unirender.camera import Camera
+from unirender_reference.multiview import orbit
+from unirender_reference.optimize.pixel_fit import patches
 from unirender_reference.optimize.solution_scene import solution_images
-from unirender_reference.optimize.solve import FINE, STARTS, solve_appearance, start_solution
+from unirender_reference.optimize.solve import (
+    FINE,
+    LEAST_SIDE,
+    STARTS,
+    _footprint_edge,
+    _Work,
+    shrunk,
+    solve_appearance,
+    start_solution,
+)
+from unirender_reference.optimize.surface_points import blocker, trace_points
 from unirender_reference.optimize.transport_config import TransportConfig
 from unirender_reference.optimize.transport_progress import solve_shares
 from unirender_reference.optimize.views import View, Views
@@ -99,6 +112,44 @@ def test_switched_off_it_is_a_flat_start(views) -> None:
     shown = np.sum([image.sum() for image in solution_images(solution, views.seen, 16, 0)[..., :3]])
     seen = np.sum([views.linear(view).sum() for view in views.seen])
     assert shown == pytest.approx(seen, rel=0.5)
+
+
+def blank(size: int, count: int) -> Views:
+    """Views of a disc that fills half of the picture."""
+    rows, columns = np.mgrid[:size, :size] + 0.5
+    mask = (np.hypot(rows - size / 2, columns - size / 2) < size * 0.4)[..., None].astype(np.float32)
+    image = mask * np.full(3, 0.5, np.float32)
+    return Views(tuple(View(image, mask, Camera(), pose) for pose in orbit(count, Camera())))
+
+
+def test_pixels_of_large_pictures_still_share_places_of_the_surface() -> None:
+    """Drawn from all of them, each would show a place of its own, of which any base colour is right."""
+    large, most, shared = blank(192, 8), 9000, []
+    for views in (shrunk(large, most), large):
+        points = trace_points(blocker(cases.bare()), views.seen, 1, 0, most)
+        patch = patches(points.mean_position(), _footprint_edge(views))
+        seen_by = np.bincount(np.unique(np.stack([patch, points.view]), axis=1)[0])
+        shared.append(float((seen_by[patch] > 1).mean()))
+    assert shared[0] > 0.5
+    assert shared[1] < 0.3, f"the twin: {shared[1]:.0%} of the large pictures' pixels show what another view does"
+
+
+def test_pictures_with_few_pixels_or_small_sides_stay_as_they_are() -> None:
+    standard = blank(128, 4)
+    assert shrunk(standard, 100) is standard  # 64 pixels tell metallic, a few do not
+    large = blank(256, 4)
+    covered = sum(int((view.mask > 0).sum()) for view in large.seen)
+    assert shrunk(large, covered // 9 + 1) is large  # less than three times as many along a side
+    assert shrunk(large, covered // 9).height == 85
+    assert shrunk(large, 100).height == LEAST_SIDE
+
+
+def test_large_pictures_are_solved_at_a_smaller_size() -> None:
+    large, config = blank(192, 2), replace(CONFIG, pixels=100)
+    work = _Work(large, cases.bare(), config, lambda step: True, TEXELS, ROWS, seed=0)
+    small = shrunk(large, config.pixels)
+    assert len(work.points) == config.pixels
+    np.testing.assert_array_equal(work.shown, work.points.of([small.linear(view) for view in small.seen]))
 
 
 def test_it_stops_when_told(views) -> None:
