@@ -43,10 +43,7 @@ LATER_ITERATIONS = 3  # after a correction
 FINE = LightGrid(24, 48)  # what mirrors need
 LEAST_SCALE = 0.2  # of the residuals under Cauchy's loss, in units of SIGMA
 LEAST_SHARE = 1.5  # pixels for each of its texels
-LEAST_FACTOR, LEAST_SIDE = (
-    3,
-    64,
-)  # by which pictures are reduced, and their pixels then: small ones do not tell metallic
+LEAST_SIDE = 64  # pixels of a reduced picture: fewer do not tell metallic
 
 OnStep = Callable[[Step], bool]
 
@@ -232,12 +229,12 @@ def shrunk(views: Views, pixels: int) -> Views:
 
     Args:
         views: the pictures.
-        pixels: that are wanted of all seen views together; more are left where the factor or the size would be less
-            than `LEAST_FACTOR` and `LEAST_SIDE`.
+        pixels: that are wanted of all seen views together; more are left where a side would have less than
+            `LEAST_SIDE`.
     """
     covered, side = sum(int((view.mask > 0).sum()) for view in views.seen), max(views.height, views.width)
     factor = min(math.isqrt(covered // pixels), side // LEAST_SIDE)
-    if factor < LEAST_FACTOR:
+    if factor < 2:
         return views
     return replace(views, seen=tuple(reduced(view, side // factor, views.hdr) for view in views.seen), held_out=())
 
