@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from unirender.color import unpremultiply
+from unirender.color import image_srgb, unpremultiply
 from unirender.files import map_picture
 from unirender_evaluation.figures.grid import Grid, Line, Tile, draw, over_white
 from unirender_evaluation.gallery import Picture
@@ -35,7 +35,7 @@ def camera_panels(scene: MultiviewScene, looks: Looks, camera: int) -> dict[str,
     panels = {}
     for name, lit in (("image", looks.novel), ("relit", looks.relit)):
         mask = np.asarray(lit.mask(camera), np.float32)
-        panels[name] = over_white(map_picture("image", unpremultiply(lit.rgb(camera), mask)), mask)
+        panels[name] = over_white(image_srgb(unpremultiply(lit.rgb(camera), mask)), mask)
     size = scene.resolution
     first = (len(scene.seen_poses) + camera) * size
     maps = looks.buffers.require("mask", *MAPS)
