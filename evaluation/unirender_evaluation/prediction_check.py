@@ -131,7 +131,9 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
         )
     twins = [name for name in asked if name.casefold() == path.name.casefold()]
     close = twins or difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
-    both = f"; {close[0]} is there, too: keep one of them" if twins and path.with_name(close[0]).is_dir() else ""
+    there = path.with_name(close[0])  # on a file system without case it may be this very folder
+    other = bool(twins) and there.is_dir() and not there.samefile(path)
+    both = f"; {close[0]} is there, too: keep one of them" if other else ""
     return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}{both}"
 
 

@@ -73,7 +73,10 @@ def run_check(
         return stored
     if not scenes_here(here.suite):
         reason = f"its meshes are not in {where_meshes_belong(here.suite)}"
-        say(f"No truth check: {reason}. Rows that need the true shape cannot run; of Mitsuba's, what is stored counts.")
+        say(
+            f"No truth check: {reason}. Of Mitsuba's rows what is stored counts. Rows that are told the true shape, as "
+            "some of the group optimisation are, end the run: leave them out with --methods."
+        )
         return {"passed": None, "reason": reason, "seed": request.seed or 0, "checked_scenes": []}
     seed = draw_seed(here.suite, request.scenes, here.scenes) if request.seed is None else request.seed
     outcome = _render(here.suite, request.scenes, seed, progress)

@@ -75,7 +75,7 @@ def unpremultiply(
         UnirenderError: one of them is of whole numbers, or the mask has not one channel.
     """
     image_linear, mask = as_floats(image_linear, "image"), as_floats(mask, "mask")
-    if mask.ndim != image_linear.ndim or mask.shape[-1] != 1:
+    if mask.shape[-1:] != (1,) or mask.ndim < min(image_linear.ndim, 3):  # one mask may be that of several pictures
         raise UnirenderError(
             f"mask: got shape {mask.shape} for an image of {image_linear.shape}, expected [height, width, 1]"
         )

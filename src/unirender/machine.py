@@ -7,9 +7,8 @@ GIB = 2**30
 
 def memory_bytes() -> float:
     """Of the machine; infinite where the system does not tell."""
-    if "SC_PHYS_PAGES" not in getattr(os, "sysconf_names", {}):
-        return float("inf")
-    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    pages = os.sysconf("SC_PHYS_PAGES") if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}) else -1
+    return float(pages * os.sysconf("SC_PAGE_SIZE")) if pages > 0 else float("inf")
 
 
 def in_gib(count: float) -> str:

@@ -51,8 +51,15 @@ def cached_folder(folder: Path) -> Iterator[Path]:
 
 
 def forget_half_made(parent: Path, names: Collection[str]) -> None:
-    """Deletes the temporary folders of `files.new_folder(parent / name)` that a killed process left, after a day."""
-    for path in parent.iterdir():
+    """Deletes the temporary folders of `files.new_folder(parent / name)` that a killed process left, after a day.
+
+    Nothing in a folder that may be written to but not listed, as one is that others hand in to.
+    """
+    try:
+        beside = list(parent.iterdir())
+    except OSError:
+        return
+    for path in beside:
         found = HALF_WRITTEN.fullmatch(path.name)
         if found is not None and found[1] in names and not path.is_symlink():
             _forget(path)

@@ -526,8 +526,11 @@ def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -
     assert len(problems) == 8, problems
     assert any(problem.startswith(f"{pipe}: a pipe, a socket or a device, expected a file; ") for problem in problems)
     assert f"{loop}: a link to {loop.name}, which is not there; copy the file, or remove the link" in problems
-    expected = f"expected names like {task.folder}; {task.folder} is there, too: keep one of them"
-    assert f"{twin}: the suite {suite.spec.name!r} has no such picture, {expected}" in problems
+    expected = f"the suite {suite.spec.name!r} has no such picture, expected names like {task.folder}"
+    assert f"{twin}: {expected}; {task.folder} is there, too: keep one of them" in problems
+    twin.rmdir()
+    twin.symlink_to(task.folder)  # as on a file system without case, where it is that folder
+    assert f"{twin}: {expected}" in problems_of(suite, tmp_path)
     for path in (folder / "out.exr", folder / "deeper"):
         assert f"{path}: lies in a folder where no answer is looked for, expected {folder}.exr or .png" in problems
     for link in links:

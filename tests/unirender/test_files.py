@@ -151,6 +151,17 @@ def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"a", ".a.fedcba987654", ".b.0123456789ab", ".a.old.x1"}
 
 
+def test_a_folder_that_may_not_be_listed_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(folder: Path) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+
+    with monkeypatch.context() as patch:  # root may list any
+        patch.setattr(Path, "iterdir", refused)
+        with new_folder(tmp_path / "a") as folder:
+            (folder / "meta.json").touch()
+    assert (tmp_path / "a" / "meta.json").is_file()
+
+
 @pytest.mark.parametrize("given", [".", "..", "inside/.."])
 def test_the_working_directory_is_not_replaced(given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "work").mkdir()

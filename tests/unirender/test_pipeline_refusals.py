@@ -220,6 +220,10 @@ def test_a_mask_that_nothing_is_lit_by_is_refused() -> None:
             "got a DDIMScheduler with num_train_timesteps=500, expected 1000",
         ),
         (
+            lambda config: DDIMScheduler.from_config(config, trained_betas=config["trained_betas"][:500]),
+            "got a DDIMScheduler with 500 betas, expected 1000",
+        ),
+        (
             lambda config: make_scheduler(500),
             "got a DDIMScheduler with num_train_timesteps=500, expected 1000",
         ),

@@ -169,6 +169,7 @@ FINE = (
     "pipeline.edit(image, mask, metallic=np.array([0.2]), decomposition=decomposition)",
     "pipeline.decompose_batch(np.stack([image, image]), np.stack([mask, mask]))",
     "pipeline.decompose_batch(iter([image, image]), iter([mask, mask]))",
+    "unpremultiply(np.stack([image, image]), mask)",
 )
 
 

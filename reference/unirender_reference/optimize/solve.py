@@ -229,14 +229,15 @@ def shrunk(views: Views, pixels: int) -> Views:
 
     Args:
         views: the pictures.
-        pixels: that are wanted of all seen views together; more are left where a side would have less than
+        pixels: that are wanted of all seen views together; more are left where the shorter side would have less than
             `LEAST_SIDE`.
     """
-    covered, side = sum(int((view.mask > 0).sum()) for view in views.seen), max(views.height, views.width)
-    factor = min(math.isqrt(covered // pixels), side // LEAST_SIDE)
+    covered = sum(int((view.mask > 0).sum()) for view in views.seen)
+    shorter, longer = sorted((views.height, views.width))
+    factor = min(math.isqrt(covered // pixels), shorter // LEAST_SIDE)
     if factor < 2:
         return views
-    return replace(views, seen=tuple(reduced(view, side // factor, views.hdr) for view in views.seen), held_out=())
+    return replace(views, seen=tuple(reduced(view, longer // factor, views.hdr) for view in views.seen), held_out=())
 
 
 def _brightness(views: Views) -> float:

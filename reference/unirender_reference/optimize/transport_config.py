@@ -20,8 +20,8 @@ class TransportConfig:
     materials: Materials = "maps"
     """One roughness and metallic for the object, or maps of them, where the pictures speak for more than one."""
     pixels: int = 9000
-    """At most so many pixels of all views; memory and time grow with it. Larger pictures (from 128 pixels) are
-    reduced by a whole factor, to no less than 64; of what is left pixels are drawn at random."""
+    """At most so many pixels of all views; memory and time grow with it. Larger pictures (from 128 pixels along
+    the shorter side) are reduced by a whole factor, to no less than 64; of what is left pixels are drawn at random."""
     fine_below: float = 0.25
     """Below this roughness the light is solved for on 24 x 48 texels, if the views have pixels enough for it."""
     fine_pixels: int = 6000

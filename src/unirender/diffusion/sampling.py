@@ -149,12 +149,12 @@ def check_timesteps(scheduler: Any) -> None:
         UnirenderError: it has another number of them.
     """
     name, config = type(scheduler).__name__, getattr(scheduler, "config", {})
-    got = {config.get("num_train_timesteps"), len(getattr(scheduler, "alphas_cumprod", range(NUM_TIMESTEPS)))}
-    if got != {NUM_TIMESTEPS}:
+    count, betas = config.get("num_train_timesteps"), len(getattr(scheduler, "alphas_cumprod", range(NUM_TIMESTEPS)))
+    if {count, betas} != {NUM_TIMESTEPS}:
+        got = f"{betas} betas" if count == NUM_TIMESTEPS else f"num_train_timesteps={count!r}"
         raise UnirenderError(
-            f"scheduler: got a {name} with num_train_timesteps={config.get('num_train_timesteps')!r}, expected "
-            f"{NUM_TIMESTEPS}, with which the network was trained; make it by {name}.from_config of the config of the "
-            "checkpoint's own"
+            f"scheduler: got a {name} with {got}, expected {NUM_TIMESTEPS}, with which the network was trained; make "
+            f"it by {name}.from_config of the config of the checkpoint's own"
         )
 
 

@@ -114,10 +114,11 @@ def test_switched_off_it_is_a_flat_start(views) -> None:
     assert shown == pytest.approx(seen, rel=0.5)
 
 
-def blank(size: int, count: int) -> Views:
-    """Views of a disc that fills half of the picture."""
-    rows, columns = np.mgrid[:size, :size] + 0.5
-    mask = (np.hypot(rows - size / 2, columns - size / 2) < size * 0.4)[..., None].astype(np.float32)
+def blank(size: int, count: int, width: int | None = None) -> Views:
+    """Views of a disc that fills half of a square, which lies in the middle of a picture."""
+    width = size if width is None else width
+    rows, columns = np.mgrid[:size, :width] + 0.5
+    mask = (np.hypot(rows - size / 2, columns - width / 2) < size * 0.4)[..., None].astype(np.float32)
     image = mask * np.full(3, 0.5, np.float32)
     return Views(tuple(View(image, mask, Camera(), pose) for pose in orbit(count, Camera())))
 
@@ -143,6 +144,10 @@ def test_pictures_with_few_pixels_or_small_sides_stay_as_they_are() -> None:
     assert shrunk(large, covered // 4).height == 128
     assert shrunk(large, covered // 9).height == 85
     assert shrunk(large, 100).height == LEAST_SIDE
+    wide = shrunk(blank(128, 4, width=512), 100)
+    assert (wide.height, wide.width) == (LEAST_SIDE, 4 * LEAST_SIDE), "the shorter side, in which the object lies"
+    low = blank(96, 4, width=512)
+    assert shrunk(low, 100) is low
 
 
 def test_large_pictures_are_solved_at_a_smaller_size() -> None:
