@@ -1,5 +1,6 @@
 """Pictures and masks from files: what the pixels become, and which files are refused."""
 
+import math
 import struct
 import zlib
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
+from unirender.machine import memory_bytes
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -418,6 +420,12 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     monkeypatch.setattr("unirender.input_picture.memory_bytes", lambda: needed - 1)
     with pytest.raises(UnirenderError, match=r"a\.png: a picture of 0 megapixels.* and this machine has 0 GiB; scale"):
         read_input(tmp_path / "a.png", None)
+
+
+def test_a_machine_that_does_not_count_its_memory_has_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert memory_bytes() > 2**28
+    monkeypatch.setattr("os.sysconf", lambda name: -1 if name == "SC_PHYS_PAGES" else 4096)
+    assert memory_bytes() == math.inf
 
 
 def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:
