@@ -19,6 +19,8 @@ from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant
 from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
 from unirender_evaluation.results_data import Results
+from unirender_evaluation.statistics import mean_estimate
+from unirender_evaluation.table_formats import estimate_text
 from unirender_evaluation.table_text import markdown_row
 
 NOT_RUN = "not run"
@@ -59,11 +61,11 @@ def answers(results: Results, questions: Sequence[Question]) -> str:
     """A table with a line for each question: both means, their difference with its interval, and the verdict."""
     lines = [_answer(results, question) for question in questions]
     head = ["", "A", "B", "A", "B", "A - B", "", "pairs (objects)"]
-    return _table(head, lines, left=3)
+    return markdown_table(head, lines, left=3)
 
 
 def _answer(results: Results, question: Question) -> list[str]:
-    labels = [_label(results, key) for key in (question.a, question.b)]
+    labels = [label_of(results, key) for key in (question.a, question.b)]
     records = Selection(question.table, question.protocol).of(results.records)
     a, b = (values_of(records, key, question.key) for key in (question.a, question.b))
     shared = sorted(a.keys() & b.keys())
@@ -99,7 +101,9 @@ def against_trivial(results: Results, questions: Sequence[Question]) -> str:
     lines = [line for question in questions if (line := _against_trivial(results, question))]
     if not lines:
         raise UnirenderError("against trivial rows: no question has answers of our row and of a trivial one; run both")
-    return _table(["", _label(results, questions[0].a), "without a model", "difference [95 %]", "perfect"], lines)
+    return markdown_table(
+        ["", label_of(results, questions[0].a), "without a model", "difference [95 %]", "perfect"], lines
+    )
 
 
 def _against_trivial(results: Results, question: Question) -> list[str] | None:
@@ -121,7 +125,7 @@ def _against_trivial(results: Results, question: Question) -> list[str] | None:
     return [
         f"{question.text}, {metric.label}{unit} {metric.arrow}",
         f"{ours:.{metric.decimals}f}",
-        f"{trivial[best]:.{metric.decimals}f} ({_label(results, best)})",
+        f"{trivial[best]:.{metric.decimals}f} ({label_of(results, best)})",
         _difference(found, metric),
         "∞" if math.isinf(perfect) else f"{perfect:.{metric.decimals}f}",
     ]
@@ -150,7 +154,7 @@ def together(runs: Mapping[str, Results]) -> Results:
 
 
 def by_material(results: Results, method: str, numbers: Sequence[tuple[str, str]]) -> str:
-    """Means of a row of the inverse table by the true material.
+    """Means of a row of the inverse table by the true material, ± half of their intervals over objects.
 
     Args:
         results: a run's.
@@ -167,7 +171,7 @@ def by_material(results: Results, method: str, numbers: Sequence[tuple[str, str]
     own = [record for record in records if material_of(record) is None]
     if own:
         lines.append(["with maps of their own", *_means(own, numbers)])
-    return _table(["true material", "pictures", *map(_column, numbers)], lines)
+    return markdown_table(["true material", "pictures", *map(_column, numbers)], lines)
 
 
 def material_of(record: Record) -> tuple[float, float] | None:
@@ -185,7 +189,7 @@ def by_object(results: Results, method: str, numbers: Sequence[tuple[str, str]],
     means = {o: float(np.mean([r.values[key] for r in records if r.object == o and key in r.values])) for o in objects}
     worst = sorted(objects, key=lambda o: means[o] if metric.higher_is_better else -means[o])[:count]
     lines = [[o, *_means([r for r in records if r.object == o], numbers)] for o in worst]
-    return _table(["object", "pictures", *map(_column, numbers)], lines)
+    return markdown_table(["object", "pictures", *map(_column, numbers)], lines)
 
 
 def by_scale(results: Results, methods: Sequence[str]) -> str:
@@ -201,8 +205,8 @@ def by_scale(results: Results, methods: Sequence[str]) -> str:
     for method, found in rows.items():
         values = [[found[sample].values[key] for sample in shared] if found else [] for key in keys]
         means = [f"{np.mean(own):.2f}" if own else NOT_RUN for own in values]
-        lines.append([_label(results, method), *means, str(len(values[0]))])
-    return _table(["", "as it is", "one factor", "one a channel", "pictures"], lines)
+        lines.append([label_of(results, method), *means, str(len(values[0]))])
+    return markdown_table(["", "as it is", "one factor", "one a channel", "pictures"], lines)
 
 
 def published_against_constant(results: Results) -> str:
@@ -217,8 +221,8 @@ def published_against_constant(results: Results) -> str:
     for method in ("constant-0-5", "ours-mean"):
         found = [values_of(records, method, key) for key in keys]
         shown = [f"{np.mean(list(values.values())):.4f}" if values else NOT_RUN for values in found]
-        lines.append([f"{_label(results, method)} (measured here)", *shown])
-    return _table(["", "metallic MSE", "roughness MSE"], lines)
+        lines.append([f"{label_of(results, method)} (measured here)", *shown])
+    return markdown_table(["", "metallic MSE", "roughness MSE"], lines)
 
 
 def seconds(results: Results, rows: Sequence[tuple[str, str, str]]) -> str:
@@ -228,16 +232,17 @@ def seconds(results: Results, rows: Sequence[tuple[str, str, str]]) -> str:
         records = Selection(table, protocol).of(results.records)
         times = [r.seconds for r in records if r.method == method and r.seconds is not None]
         shown = f"{np.median(times):.2f}" if times else NOT_RUN
-        lines.append([_label(results, method), f"{table}, {protocol}", shown, str(len(times))])
-    return _table(["", "question", "seconds", "answers"], lines, left=2)
+        lines.append([label_of(results, method), f"{table}, {protocol}", shown, str(len(times))])
+    return markdown_table(["", "question", "seconds", "answers"], lines, left=2)
 
 
 def _means(records: Sequence[Record], numbers: Sequence[tuple[str, str]]) -> list[str]:
     cells = [str(len(records))]
     for quantity, name in numbers:
         key = metric_key(quantity, METRICS[name], MASKED)
-        values = [record.values[key] for record in records if key in record.values]
-        cells.append(f"{np.mean(values):.{METRICS[name].decimals}f}" if values else "-")
+        own = [record for record in records if key in record.values]
+        found = mean_estimate([r.values[key] for r in own], [r.object for r in own]) if own else None
+        cells.append(estimate_text(found, METRICS[name].decimals))
     return cells
 
 
@@ -245,7 +250,7 @@ def _between(low: float, high: float, which: int) -> Callable[[float, float], bo
     return lambda *material: low <= material[which] < high
 
 
-def _label(results: Results, key: str) -> str:
+def label_of(results: Results, key: str) -> str:
     found = [info.label for info in results.run.methods if info.key == key]
     return found[0] if found else key
 
@@ -255,7 +260,7 @@ def _column(number: tuple[str, str]) -> str:
     return f"{quantity}, {metric.label} ({metric.unit})" if metric.unit else f"{quantity}, {metric.label}"
 
 
-def _table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:
+def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:
     if any(len(line) != len(head) for line in lines):
         raise UnirenderError(f"table: got lines of {sorted({len(line) for line in lines})} cells, expected {len(head)}")
     rule = [":--" if i < left else "--:" for i in range(len(head))]

@@ -11,6 +11,9 @@ as often as of many, by being 12.7 standard errors wide to each side: paired tes
 reader nothing, so that a ± is printed from `FEWEST_PRINTED` objects on (`Estimate.printed_half_width`).
 
 "A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
+
+All of this is for the lights that the suite has: a light that several objects share is in every draw.
+`crossed_interval` counts lights as drawn, too.
 """
 
 import math
@@ -88,13 +91,11 @@ def mean_estimate(
     labels = list(range(x.size)) if clusters is None else list(clusters)
     if len(labels) != x.size:
         raise UnirenderError(f"mean: got {x.size} values and {len(labels)} cluster labels, expected as many")
-    members: dict[Hashable, int] = {}
-    index = np.array([members.setdefault(label, len(members)) for label in labels])
-    count = len(members)
+    count = len(set(labels))
     mean = float(x.mean())
     if count < 2 or not np.isfinite(x).all():
         return Estimate(mean, math.nan, math.nan, x.size, count)
-    sums, sizes = np.bincount(index, weights=x), np.bincount(index)
+    sums, sizes = _cluster_sums(x, labels)
     if count < FEW:
         half = _student_half_width(sums, sizes, confidence)
         return Estimate(mean, mean - half, mean + half, x.size, count)
@@ -108,10 +109,68 @@ def _student_half_width(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " 
     """Half of Student's interval of sum(sums) / sum(sizes), of independent clusters."""
     from scipy.special import stdtrit
 
+    return float(stdtrit(len(sums) - 1, (1 + confidence) / 2) * math.sqrt(_ratio_variance(sums, sizes)))
+
+
+def _ratio_variance(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"]) -> float:
+    """Variance of sum(sums) / sum(sizes), of independent clusters."""
     count = len(sums)
     residuals = sums - sizes * (sums.sum() / sizes.sum())
-    error = math.sqrt(count / (count - 1) * np.square(residuals).sum()) / sizes.sum()
-    return float(stdtrit(count - 1, (1 + confidence) / 2) * error)
+    return float(count / (count - 1) * np.square(residuals).sum() / sizes.sum() ** 2)
+
+
+def crossed_interval(
+    values: Sequence[float] | Float[np.ndarray, " n"],
+    objects: Sequence[Hashable],
+    lights: Sequence[Hashable],
+    *,
+    confidence: float = CONFIDENCE,
+) -> tuple[float, float]:
+    """Interval of the mean where objects and lights are both draws, and a light is shared by several objects.
+
+    Student's, with one degree of freedom less than the rarer of the two has members. The variance is that over objects
+    plus that over lights less that over pairs of the two, which both have counted (Cameron, Gelbach and Miller 2011);
+    where that is below one of the first two, the larger of them.
+
+    Args:
+        values: one finite number per sample.
+        objects: of each sample.
+        lights: of each sample.
+        confidence: share of the interval.
+
+    Returns:
+        Both ends; NaN with fewer than two objects or lights.
+
+    Raises:
+        UnirenderError: lengths differ, or a value is not finite.
+    """
+    from scipy.special import stdtrit
+
+    x = np.asarray(values, dtype=np.float64)
+    if not len(x) == len(objects) == len(lights) or not np.isfinite(x).all():
+        raise UnirenderError(
+            f"mean over objects and lights: got {len(x)} values, {len(objects)} objects and {len(lights)} lights, "
+            "expected as many of each, and finite values"
+        )
+    pairs = list(zip(objects, lights, strict=True))
+    counts = [len(set(labels)) for labels in (objects, lights)]
+    if min(counts) < 2:
+        return math.nan, math.nan
+    over_objects, over_lights, over_pairs = (
+        _ratio_variance(*_cluster_sums(x, labels)) for labels in (objects, lights, pairs)
+    )
+    variance = max(over_objects + over_lights - over_pairs, over_objects, over_lights)
+    half = float(stdtrit(min(counts) - 1, (1 + confidence) / 2) * math.sqrt(variance))
+    return float(x.mean()) - half, float(x.mean()) + half
+
+
+def _cluster_sums(
+    x: Float[np.ndarray, " n"], labels: Sequence[Hashable]
+) -> tuple[Float[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """Sum and number of the samples of each cluster, in the order of their first samples."""
+    members: dict[Hashable, int] = {}
+    index = np.array([members.setdefault(label, len(members)) for label in labels])
+    return np.bincount(index, weights=x), np.bincount(index)
 
 
 def paired_difference(

@@ -11,6 +11,7 @@ from unirender_evaluation.statistics import (
     FEW,
     UNPRINTED,
     beats,
+    crossed_interval,
     mean_estimate,
     paired_difference,
     unprinted_note,
@@ -56,6 +57,31 @@ def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
     low, high = scipy.stats.t.interval(0.95, 3, loc=np.mean(values), scale=scipy.stats.sem(values))
     assert (estimate.low, estimate.high) == pytest.approx((low, high))
     assert estimate.half_width == pytest.approx(scipy.stats.sem(values) * scipy.stats.t.ppf(0.975, 3))
+
+
+def test_where_lights_are_shared_only_the_crossed_interval_holds_the_mean_as_often_as_it_says() -> None:
+    """48 objects under 2 of 16 lights each, as suites are; lights differ as much as objects."""
+    rng = np.random.default_rng(0)
+    objects = np.repeat(np.arange(48), 2)
+    hits = np.zeros(2)
+    for _ in range(300):
+        lights = np.concatenate([rng.permutation(16) for _ in range(6)])
+        values = 20 + rng.normal(size=48)[objects] + rng.normal(size=16)[lights] + rng.normal(size=96)
+        crossed = crossed_interval(values, objects.tolist(), lights.tolist())
+        alone = mean_estimate(values, objects.tolist(), resamples=400)
+        hits += [low <= 20 <= high for low, high in (crossed, (alone.low, alone.high))]
+    assert 0.92 <= hits[0] / 300 <= 0.985
+    assert hits[1] / 300 < 0.87  # the twin: lights that are in every draw
+
+
+def test_where_no_light_is_shared_the_crossed_interval_is_that_over_objects() -> None:
+    values, objects = [1.0, 2.0, 4.0, 7.0, 3.0, 3.5], ["a", "a", "b", "b", "c", "c"]
+    alone = mean_estimate(values, objects)
+    assert crossed_interval(values, objects, list("stuvwx")) == pytest.approx((alone.low, alone.high))
+    assert all(math.isnan(end) for end in crossed_interval(values, objects, ["s"] * 6))
+    for wrong in (values[:-1], [*values[:-1], math.inf]):
+        with pytest.raises(UnirenderError, match="over objects and lights"):
+            crossed_interval(wrong, objects, list("stuvwx"))
 
 
 def test_of_many_objects_it_is_as_wide_as_their_spread_says() -> None:
