@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from unirender_evaluation.metrics import FACING_AWAY, LPIPS_SCALES, OWN_MASK, TURNED, Variant, metric_key
-from unirender_evaluation.published import not_stated
+from unirender_evaluation.published import taken_how
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import Protocol
 from unirender_evaluation.statistics import CONFIDENCE, METHOD
@@ -78,9 +78,10 @@ def protocol_line(
     run: RunInfo,
     methods: Sequence[MethodInfo],
     records: Sequence[Record],
-    with_published: bool,
+    published_in: str | None,
 ) -> tuple[tuple[str, str], ...]:
-    """(what, value) pairs in the order in which they are printed."""
+    """(what, value) pairs in the order in which they are printed; `published_in`: the table of the paper whose numbers
+    stand beside, None where none do."""
     spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
     frame = [
@@ -100,13 +101,13 @@ def protocol_line(
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
         *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
-        ("interval", f"{CONFIDENCE:.0%} over objects: {METHOD}"),
+        ("interval", f"{CONFIDENCE:.0%} over objects, under these lights: {METHOD}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
         ("code", f"{run.code or '-'}, {run.date or '-'}{f' ({run.carried})' if run.carried else ''}"),
     ]
-    if with_published:
-        items.append(("published", f"as printed in the paper, on its own test set; not stated there: {not_stated()}"))
+    if published_in is not None:
+        items.append(("published", taken_how(published_in)))
     return tuple(items)
 
 

@@ -42,9 +42,13 @@ def published_tables() -> dict[str, tuple[PublishedRow, ...]]:
     }
 
 
-def not_stated() -> str:
-    """What the paper does not say about its own numbers; printed with every published column."""
-    return str(_load()["not_stated"])
+def taken_how(table: str) -> str:
+    """What is known and what is not of how the numbers of one of its tables were taken; printed with them."""
+    everywhere, own = _load(), _load()["tables"][table]
+    return (
+        f"as printed in the paper, of systems and on data that are not those of this table ({everywhere['test_set']}); "
+        f"not stated there: {everywhere['not_stated']}, {own['not_stated']}"
+    )
 
 
 def check_name(name: str) -> None:

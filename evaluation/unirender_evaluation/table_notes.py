@@ -11,6 +11,11 @@ from unirender_evaluation.specs import TableSpec
 from unirender_evaluation.statistics import unprinted_note
 from unirender_evaluation.table_counts import cell_counts, label_n
 
+NAMED = (
+    "[Name]: the system whose values in the paper stand in this row. What is measured is the row that is named before "
+    "it, another implementation, if its note does not say otherwise."
+)
+
 if TYPE_CHECKING:
     from unirender_evaluation.tables import Row
 
@@ -26,13 +31,16 @@ def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"
     """
     notes = [spec.description] if spec.description else []
     notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
+    if any(row.info and row.label != row.info.label for row in rows):
+        notes.append(NAMED)
     fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
     if fewer:
         notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
     notes += unprinted_note(cell.measured for row in rows for cell in row.cells)
     if any(cell.dagger for row in rows for cell in row.cells):
         notes.append(
-            "† The published value is worse than the constant 0.5, measured on materials distributed as in the paper."
+            "† The published value is worse than what the constant 0.5 scores on materials that are spread evenly over "
+            "the paper's grid, as here; how those of its test objects are spread the paper does not say."
         )
     if any(cell.unavailable for row in rows for cell in row.cells):
         notes.append(

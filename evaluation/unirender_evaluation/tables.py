@@ -45,7 +45,7 @@ class Cell:
     unavailable: bool = False  # the metric could not be computed here: "n/a" instead of "-"
     published_rank: int | None = None  # 1 = best, 2 = second, on rounded values
     measured_rank: int | None = None
-    dagger: bool = False  # published value worse than the best trivial row
+    dagger: bool = False  # published value worse than the constant's
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def build_table(
         variant=variant,
         columns=spec.columns,
         rows=tuple(rows),
-        protocol=protocol_line(declared, variant, run, methods, chosen, show_published),
+        protocol=protocol_line(declared, variant, run, methods, chosen, spec.name if show_published else None),
         notes=table_notes(spec, chosen, rows, variant),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
@@ -239,7 +239,7 @@ def _rank(spec: TableSpec, rows: Sequence[Row], variant: Variant) -> list[Row]:
         competing = {r: mean for r, mean in competing.items() if not exact_fit(column.key(variant), mean)}
         published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
         trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
-        grid = column.uniform_grid  # comparable only where the suite's materials are distributed like the paper's
+        grid = column.uniform_grid  # comparable only where the suite's materials are spread over the paper's grid
         trivial = [mean for mean in trivial if grid is not None and abs(mean - grid) <= GRID_TOLERANCE]
         for r, cell in enumerate(cells):
             ranked[r][i] = dataclasses.replace(

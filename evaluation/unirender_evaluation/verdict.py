@@ -114,7 +114,10 @@ def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
 
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     """The verdict section: claims, ceiling, truth check; one line each."""
-    head = "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, each by itself"
+    head = (
+        "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, under these "
+        "lights, each by itself"
+    )
     lines = [f"Verdict on suite {run.suite} ({head})"]
     lines += [f"  {finding}" for finding in findings(records, run_claims(records, run))]
     breaches = ceiling_breaches(records)

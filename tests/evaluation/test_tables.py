@@ -23,6 +23,7 @@ from unirender_evaluation.specs import TABLES, Column, TableSpec
 from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.table_formats import format_number, print_table, to_json, to_markdown
 from unirender_evaluation.table_latex import to_latex
+from unirender_evaluation.table_notes import NAMED
 from unirender_evaluation.table_text import TextTable, markdown_row, plain_paragraph
 from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
 
@@ -257,6 +258,20 @@ def test_the_protocol_is_printed_with_every_format() -> None:
         assert "own mask: Ours (sample)" in text
         assert "8 samples of 4 objects" in text
     assert "published" not in [name for name, _ in table("masked").protocol]
+
+
+def test_what_published_values_are_of_is_said_where_they_stand() -> None:
+    """Another test set, what the paper leaves open of this table, and that the row beside them is no run of theirs."""
+    said = dict(table().protocol)["published"]
+    for text in (
+        "of systems and on data that are not those of this table",
+        "Objaverse",
+        "materials of the test objects",
+    ):
+        assert text in said
+    assert "how s and d of the target were made" not in said  # another table's
+    assert NAMED in table().notes
+    assert NAMED not in table("masked").notes
 
 
 def test_the_protocol_says_which_records_earlier_code_measured() -> None:
