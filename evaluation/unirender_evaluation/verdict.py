@@ -46,9 +46,9 @@ class Finding:
 
 
 def _scale(claim: Claim) -> str:
-    """How a number of the light is aligned; everything else is not."""
-    said = {"aligned": " (aligned)", "raw": " (raw)"}[claim.scale] if "scale" in claim.kind.axes else ""
-    return said if claim.table == LIGHT[0] else ""
+    """How a number is aligned; that it is not is said of the light alone."""
+    unsaid = "scale" not in claim.kind.axes or (claim.scale == "raw" and claim.table != LIGHT[0])
+    return "" if unsaid else f" ({claim.scale})"
 
 
 def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) -> list[Finding]:

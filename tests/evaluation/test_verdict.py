@@ -18,7 +18,7 @@ from unirender_evaluation.claims import (
     stranger_claims,
 )
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.verdict import ceiling_breaches, findings, verdict_text
+from unirender_evaluation.verdict import Finding, ceiling_breaches, findings, verdict_text
 
 CHECK = {
     "passed": True,
@@ -118,7 +118,8 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
 
 
 def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
-    """And what depends on a light's level, on metallic or on closed forms is stated and no claim."""
+    """And what depends on a light's level, on metallic or on closed forms is stated and no claim; so is the albedo but
+    for its level, for rows that do not know it."""
     claims = stranger_claims("theirs")
     assert {c.a for c in claims} == {"theirs"}
     bars = {c.b for c in claims if c.expected == "beats"}
@@ -127,6 +128,12 @@ def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
         *(("normal", bar) for bar in ("mean-normal", "sphere-normal")),
         *((material, "constant-0-5") for material in ("metallic", "roughness")),
     }
+    level_free = [c for c in claims if c.table == "inverse" and c.scale != "raw"]
+    assert [(c.key, c.b, c.expected) for c in level_free] == [
+        ("albedo.psnr@masked-srgb-aligned", "input-as-albedo", "stated")
+    ]
+    said = str(Finding(level_free[0], None, None))
+    assert said == "not run inverse/single-image albedo PSNR (aligned): theirs against input-as-albedo"
     assert {c.protocol for c in claims if c.b == SHADOWED} == {"given-light"}, "elsewhere there is nothing to derive"
     assert {(c.key.partition(".")[2], c.expected) for c in claims if c.table == "light"} == {
         ("log_rmse_scaled", "beats"),
