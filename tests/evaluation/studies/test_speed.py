@@ -23,7 +23,7 @@ from unirender.training.trainer import Trainer
 from unirender_evaluation.studies.speed import network
 from unirender_evaluation.studies.speed.bare import BarePasses, Rows, cut_batch
 from unirender_evaluation.studies.speed.command import BenchSpeed
-from unirender_evaluation.studies.speed.mitsuba import EqualQuality, doubled, equal_quality, mitsuba_table
+from unirender_evaluation.studies.speed.mitsuba import EqualQuality, equal_quality, fewest_samples, mitsuba_table
 from unirender_evaluation.studies.speed.overfit import (
     Point,
     as_intrinsics,
@@ -112,7 +112,7 @@ def test_a_real_pipeline_is_timed(suite: Suite, monkeypatch: pytest.MonkeyPatch)
     assert all(entry["ms_per_picture"] == pytest.approx(500 * entry["median_s"]) for entry in part.data["times"])
 
 
-def test_samples_are_doubled_until_the_picture_is_good_enough() -> None:
+def test_mitsuba_gets_no_more_samples_than_it_needs() -> None:
     """A renderer whose error falls as its samples grow: 20 dB at 1, 3 dB more for each doubling."""
     tried = []
 
@@ -120,10 +120,13 @@ def test_samples_are_doubled_until_the_picture_is_good_enough() -> None:
         tried.append(spp)
         return 20 + 10 * math.log10(spp)
 
-    assert doubled(psnr_at, 31.0, 64) == (16, pytest.approx(32.04, abs=0.01))
-    assert tried == [1, 2, 4, 8, 16]
-    assert doubled(psnr_at, 20.0, 64) == (1, 20.0)
-    assert doubled(psnr_at, 39.0, 64) is None
+    assert fewest_samples(psnr_at, 31.0, 64) == (13, pytest.approx(31.14, abs=0.01))
+    assert tried == [1, 2, 4, 8, 16, 12, 14, 13]
+    spp, reached = fewest_samples(psnr_at, 60.2, 1 << 14) or (0, 0.0)
+    assert 60.2 <= reached < 60.2 + 10 * math.log10(17 / 16)
+    assert 10472 <= spp < 10472 * 17 / 16
+    assert fewest_samples(psnr_at, 20.0, 64) == (1, 20.0)
+    assert fewest_samples(psnr_at, 39.0, 64) is None
 
 
 def test_mitsuba_is_timed_on_the_scene_of_the_suite(suite: Suite) -> None:
