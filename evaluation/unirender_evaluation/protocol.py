@@ -133,7 +133,9 @@ def _lpips_text(variant: Variant, run: RunInfo) -> str:
         return f"not computed of aligned pictures (a {'-'.join(LPIPS_SCALES)} variant has it)"
     if not run.lpips:
         return "n/a (no weights)"
-    return f"v0.1, {' and '.join(run.lpips)}{'' if variant.space == 'srgb' else ', of sRGB pictures as everywhere'}"
+    space = "" if variant.space == "srgb" else ", of sRGB pictures as everywhere"
+    frame = "" if variant.mask == "whole" else ", mean over the whole frame with the true mask pasted on both sides"
+    return f"v0.1, {' and '.join(run.lpips)}{space}{frame}"
 
 
 def _sampling_text(methods: Sequence[MethodInfo]) -> str:

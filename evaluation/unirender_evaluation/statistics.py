@@ -217,3 +217,34 @@ def beats(
     """
     difference = paired_difference(a, b, clusters)
     return difference.low > 0 if higher_is_better else difference.high < 0
+
+
+def paired_p_value(a: Mapping[str, float], b: Mapping[str, float], clusters: Mapping[str, Hashable]) -> float:
+    """Two-sided p of Student's t for no difference of a and b over the samples that both have; 1 with one cluster.
+
+    Args:
+        a: sample -> value.
+        b: sample -> value; differences have to be finite, and one sample shared.
+        clusters: sample -> what is drawn, e.g. its object.
+    """
+    from scipy.special import stdtr
+
+    common = sorted(a.keys() & b.keys())
+    x = np.array([a[sample] - b[sample] for sample in common])
+    sums, sizes = _cluster_sums(x, [clusters[sample] for sample in common])
+    if len(sums) < 2 or not x.any():
+        return 1.0
+    with np.errstate(divide="ignore"):  # differences that are all alike
+        t = np.abs(x.mean()) / np.sqrt(_ratio_variance(sums, sizes))
+    return float(2 * stdtr(len(sums) - 1, -t))
+
+
+def holm(p_values: Sequence[float], level: float = 1 - CONFIDENCE) -> list[bool]:
+    """Which of several hypotheses are refused when the chance of any false refusal is at most `level` (Holm 1979)."""
+    order = np.argsort(p_values, kind="stable")
+    refused = [False] * len(p_values)
+    for rank, index in enumerate(order):
+        if p_values[index] > level / (len(p_values) - rank):
+            break
+        refused[index] = True
+    return refused

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import FEW, paired_difference
+from unirender_evaluation.statistics import FEW, holm, paired_difference, paired_p_value
 from unirender_evaluation.task import LIGHT
 
 
@@ -119,7 +119,9 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
         "lights, each by itself"
     )
     lines = [f"Verdict on suite {run.suite} ({head})"]
-    lines += [f"  {finding}" for finding in findings(records, run_claims(records, run))]
+    found = findings(records, run_claims(records, run))
+    lines += [f"  {finding}" for finding in found]
+    lines += _corrected_lines(records, found)
     breaches = ceiling_breaches(records)
     lines += [f"  FAILS  {breach}" for breach in breaches] or [
         "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
@@ -128,6 +130,31 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def _corrected_lines(records: Sequence[Record], found: Sequence[Finding]) -> list[str]:
+    """How many of the claims that hold would do so if all claims were one question; nothing where none holds."""
+    claimed = [finding for finding in found if finding.holds is not None]
+    sure = holm([_p_value(records, finding.claim) for finding in claimed])
+    holding = [(f.claim, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
+    if not holding:
+        return []
+    unsure = [
+        f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)} of {c.a} against {c.b}"
+        for c, certain in holding
+        if not certain
+    ]
+    but = f"; not {', '.join(unsure)}" if unsure else ""
+    return [
+        f"  (of {len(holding)} claims that hold {len(holding) - len(unsure)} also do after Holm's correction for all "
+        f"{len(claimed)}, by Student's t over objects{but})"
+    ]
+
+
+def _p_value(records: Sequence[Record], claim: Claim) -> float:
+    chosen = Selection(claim.table, claim.protocol).of(records)
+    a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
+    return paired_p_value(a, b, {record.sample: record.object for record in chosen})
 
 
 def _truth_lines(check: dict) -> list[str]:

@@ -12,8 +12,10 @@ from unirender_evaluation.statistics import (
     UNPRINTED,
     beats,
     crossed_interval,
+    holm,
     mean_estimate,
     paired_difference,
+    paired_p_value,
     unprinted_note,
 )
 
@@ -181,3 +183,21 @@ def test_only_common_samples_count() -> None:
 def test_identical_images_have_no_difference_in_db() -> None:
     with pytest.raises(UnirenderError, match=r"on 'y' \(and 0 more\) is not finite.*compare the MSE"):
         paired_difference({"x": 1.0, "y": math.inf}, {"x": 2.0, "y": math.inf})
+
+
+def test_the_p_value_is_that_of_the_paired_t_test() -> None:
+    a, b = paired(0.1)
+    each = {name: name for name in a}
+    known = scipy.stats.ttest_rel(list(a.values()), list(b.values())).pvalue
+    assert paired_p_value(a, b, each) == pytest.approx(known)
+    assert paired_p_value(b, a, each) == pytest.approx(known)
+    assert paired_p_value(a, a, each) == 1
+    assert paired_p_value(a, b, dict.fromkeys(a, "one object")) == 1
+    assert paired_p_value({"x": 2.0, "y": 3.0}, {"x": 1.0, "y": 2.0}, {"x": 0, "y": 1}) == 0
+
+
+def test_holm_asks_more_of_each_claim_the_more_there_are() -> None:
+    assert holm([0.03, 0.01, 0.02]) == [True, True, True]
+    assert holm([0.03, 0.018, 0.02]) == [False, False, False]  # the least is above 0.05 / 3
+    assert holm([0.04, 0.001, 0.03]) == [False, True, False]  # 0.03 is above 0.05 / 2, and ends it
+    assert holm([]) == []

@@ -258,6 +258,8 @@ def test_the_protocol_is_printed_with_every_format() -> None:
         assert "own mask: Ours (sample)" in text
         assert "8 samples of 4 objects" in text
     assert "published" not in [name for name, _ in table("masked").protocol]
+    lpips = [dict(table(mask, replace(RUN, lpips=("vgg",))).protocol)["LPIPS"] for mask in ("masked", "whole")]
+    assert ["over the whole frame" in text for text in lpips] == [True, False]  # it has no map to weight by coverage
 
 
 def test_what_published_values_are_of_is_said_where_they_stand() -> None:

@@ -159,6 +159,26 @@ def test_what_a_row_is_asked_is_what_the_other_answers() -> None:
     assert {b for a, b, _ in theirs if a == OPTIMISED} == bars, "how it stands to the trivial rows"
 
 
+def test_the_verdict_says_which_claims_hold_by_themselves_alone() -> None:
+    """A large gain over one trivial row, and one over another whose interval hardly excludes 0."""
+    rng = np.random.default_rng(0)
+    level, spread = np.linspace(15, 20, 60), np.repeat(rng.normal(size=30), 2)
+    spread = (spread - spread.mean()) / spread.std(ddof=1)
+    records = rows("theirs", ALBEDO, level)
+    records += rows("input-as-albedo", ALBEDO, level - 5 + spread) + rows("mean-albedo", ALBEDO, level - 0.41 + spread)
+    run = run_of(theirs="external", **{"input-as-albedo": "trivial", "mean-albedo": "trivial"})
+    text = verdict_text(records, run, CHECK)
+    assert text.count("HOLDS  inverse/single-image albedo") == 2
+    assert "(of 2 claims that hold 2 also do after Holm's correction for all 2, by Student's t over objects)" in text
+    others = [Record("inverse", "single-image", m, f"s{i}", f"o{i // 2}", {"normal.cosine": 0.5}) for i in range(60)
+              for m in ("theirs", "mean-normal", "sphere-normal")]  # fmt: skip
+    more = verdict_text([*records, *others], run, CHECK)
+    assert (
+        "(of 2 claims that hold 1 also do after Holm's correction for all 4, by Student's t over objects; not "
+        "inverse/single-image albedo PSNR of theirs against mean-albedo)" in more
+    )
+
+
 def test_our_claims_are_made_where_our_rows_ran() -> None:
     records = rows("ours-mean", ALBEDO, np.linspace(15, 20, 4))
     run = run_of(**{"ours-mean": "ours", "theirs": "external"})
