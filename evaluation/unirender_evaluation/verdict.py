@@ -14,12 +14,14 @@ from unirender_evaluation.task import LIGHT
 @dataclass(frozen=True)
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
-    stated, for one object, and where nothing was compared, for the reason `why`."""
+    stated, for one object, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
+    has this number, since a row may answer the easy ones alone."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
     why: str = "not run "
+    asked: int = 0
 
     @property
     def is_open(self) -> bool:
@@ -38,10 +40,11 @@ class Finding:
         remark = f"; {c.remark}" if c.remark else ""
         interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""  # one object has none
         objects = f"{d.clusters} object{'s' * (d.clusters != 1)}"
+        n = f"{d.n} of {self.asked}" if d.n < self.asked else f"{d.n}"
         return (
             f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}: "
             f"{c.a} {self.comparison.verdict} {c.b}, "
-            f"difference {d.mean:+.4g} {interval}{unit} (n {d.n}, {objects}{remark})"
+            f"difference {d.mean:+.4g} {interval}{unit} (n {n}, {objects}{remark})"
         )
 
 
@@ -62,7 +65,8 @@ def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) ->
         if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
             comparison = compare(chosen, claim.kind, claim.key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
-            found.append(Finding(claim, comparison, comparison.a_beats_b if claimed else None))
+            asked = len({record.sample for record in chosen if claim.key in record.values})
+            found.append(Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked))
         else:
             found.append(Finding(claim, None, None, "infinite PSNR, not compared " if common else "not run "))
     return found

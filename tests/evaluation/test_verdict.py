@@ -200,10 +200,12 @@ def test_optimisation_is_compared_where_both_rows_ran() -> None:
     text = verdict_text(records, run, CHECK)
     assert (
         "HOLDS  inverse/single-image albedo PSNR: ours-mean beats nvdiffrec-mitsuba, "
-        "difference +3 [+3, +3] dB (n 4, 2 objects)" in text
+        "difference +3 [+3, +3] dB (n 4 of 6, 2 objects)" in text
     )
     assert "stated inverse/single-image albedo PSNR: nvdiffrec-mitsuba is beaten by mean-albedo, difference -1" in text
     assert "stated inverse/single-image albedo PSNR: ours-mitsuba-refinement beats ours-mean, difference +1" in text
+    asked = [record for record in records if record.sample < "s4"]
+    assert "[+3, +3] dB (n 4, 2 objects)" in verdict_text(asked, run, CHECK)
     without = [record for record in records if record.method != "nvdiffrec-mitsuba"]
     assert "nvdiffrec" not in verdict_text(without, run, CHECK)
 
