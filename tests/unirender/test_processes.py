@@ -58,7 +58,9 @@ def save_state(folder, state):
     return own_save(folder, state)
 
 if os.environ["RANK"] == "0":
-    ShardSource.next, trainer.save_state = next, save_state
+    trainer.save_state = save_state
+else:
+    ShardSource.next = next
 """
 
 
@@ -170,7 +172,7 @@ def test_an_error_of_one_process_ends_all_with_a_line(run: Run, tmp_path: Path) 
 
 @pytest.mark.long
 def test_all_wait_for_the_one_that_saves(run: Run, tmp_path: Path) -> None:
-    """The first process alone is asked to stop; torchrun ends it, too, as soon as another one has ended."""
+    """Another one alone is asked to stop, as where its machine is taken away; torchrun ends all when one has ended."""
     ended = torchrun(run.data, tmp_path / "run", "--steps", "9", script=changed_by(SLOW_SAVE, tmp_path))
     assert ended.returncode == 1
     state = load_state(tmp_path / "run")
@@ -188,6 +190,19 @@ def test_alone_everything_is_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(a is b for a, b in zip(ALONE.sum(tensors), tensors, strict=True))
     ALONE.close()
     assert not Processes(1, 2).is_main
+
+
+def test_one_process_of_a_machine_goes_before_its_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of eight would pack the same shards, and derive the same light, on all cores of the machine."""
+    done: list[str] = []
+    monkeypatch.setattr(Processes, "gather", lambda self, value: done.append("all met"))
+    for local in (0, 1):
+        with Processes(2 + local, 4, local).one_first():
+            done.append(f"process {local} works")
+    assert done == ["process 0 works", "all met", "all met", "process 1 works"]
+    with pytest.raises(UnirenderError, match="disk"), Processes(2, 4, 0).one_first():
+        raise UnirenderError("disk")
+    assert len(done) == 4  # the others are told that it has ended
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,8 @@ def make_source(
         rows=trainer.split.own,
         group_size=config.group_size,
     )
-    packed = source.open()
+    with trainer.processes.one_first():  # shards are packed, and lights derived, on all cores
+        packed = source.open()
     if options.batches == "device" or (options.batches == "auto" and fits(packed, trainer.device, memory)):
         return DeviceSource(source, trainer.device), packed
     return source, packed

@@ -184,7 +184,9 @@ class Trainer:
                 self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 seconds = self.seconds + time.monotonic() - start
-                self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
+                told = self.processes.gather((seconds, due("refresh"), request.signal))
+                self.seconds, refreshing, _ = told[0]
+                stopping = next((number for _, _, number in told if number is not None), None)  # any of them is asked
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     with request.unheard():
                         self._tell_losses(*logged, report)
