@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,8 +22,10 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training import processes
 from unirender.training.checkpoint import load_state
 from unirender.training.command import Train
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes, join_processes
 from unirender.training.run import train
+from unirender.training.state import OF_ALL, check_alike
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")
@@ -203,6 +206,25 @@ def test_one_process_of_a_machine_goes_before_its_others(monkeypatch: pytest.Mon
     with pytest.raises(UnirenderError, match="disk"), Processes(2, 4, 0).one_first():
         raise UnirenderError("disk")
     assert len(done) == 4  # the others are told that it has ended
+
+
+def test_processes_that_were_told_different_things_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Another rate would give each its own weights without a word, another length let one wait for the others."""
+    monkeypatch.setattr(Processes, "gather", lambda self, value: [[], value])
+
+    def check(config: TrainConfig = TRAIN, steps: int = 9) -> None:
+        run = RunConfig(tmp_path, steps=9)
+        first = json.loads(json.dumps(dataclasses.asdict(TRAIN))), {n: getattr(run, n) for n in OF_ALL}
+        monkeypatch.setattr(Processes, "share", lambda self, value: first)
+        told = SimpleNamespace(config=config, run=dataclasses.replace(run, steps=steps), processes=Processes(1, 2))
+        check_alike(told)  # pyright: ignore[reportArgumentType] - all that it looks at
+
+    check()
+    faster = dataclasses.replace(TRAIN.optimizer, learning_rate=1.0)
+    with pytest.raises(UnirenderError, match=r"optimizer.learning_rate 0.002 instead of 1.0, as process 1 has it"):
+        check(dataclasses.replace(TRAIN, optimizer=faster))
+    with pytest.raises(UnirenderError, match="process 0 of 2 was started with steps 9 instead of 7"):
+        check(steps=7)
 
 
 @pytest.mark.parametrize(

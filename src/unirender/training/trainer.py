@@ -41,7 +41,7 @@ from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
-from unirender.training.state import resume, state_of, write_config
+from unirender.training.state import check_alike, resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
@@ -162,8 +162,10 @@ class Trainer:
 
         Raises:
             Ended: it was asked to stop.
+            UnirenderError: it cannot be written, a gradient is not finite, or the processes have different options.
         """
         self.source, main = source, self.processes.is_main
+        check_alike(self)
         validation = Validation(validate, self.run.keep_best) if validate else None
         if main:
             tidy(self.run.out)
@@ -186,7 +188,7 @@ class Trainer:
                 seconds = self.seconds + time.monotonic() - start
                 told = self.processes.gather((seconds, due("refresh"), request.signal))
                 self.seconds, refreshing, _ = told[0]
-                stopping = next((number for _, _, number in told if number is not None), None)  # any of them is asked
+                stopping = _first([signal for _, _, signal in told])
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     with request.unheard():
                         self._tell_losses(*logged, report)
@@ -201,8 +203,10 @@ class Trainer:
                         self._look(self.shown, validation, report)
                     if refreshing:
                         self._refresh(source, report)
-        if main:
-            self.save(source)
+            if main:
+                self.save(source)
+            if (stopping := _first(self.processes.gather(request.signal))) is not None:
+                raise Ended(stopping)
         if self.step > begun or not self._picture_file.exists():  # which a kill after the last save has prevented
             self._look(self.shown, validation, report)
 
@@ -291,3 +295,8 @@ class Trainer:
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
         """As `unirender.training.state.resume`."""
         return resume(self, source, report)
+
+
+def _first(signals: Sequence[int | None]) -> int | None:
+    """Of the signals of all processes, any of which may be asked to stop; None: none was."""
+    return next((number for number in signals if number is not None), None)
