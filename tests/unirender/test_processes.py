@@ -25,7 +25,9 @@ from unirender.training.command import Train
 from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes, join_processes
 from unirender.training.run import train
+from unirender.training.source import ShardSource
 from unirender.training.state import OF_ALL, check_alike
+from unirender.training.trainer import Trainer
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")
@@ -225,6 +227,19 @@ def test_processes_that_were_told_different_things_are_refused(monkeypatch: pyte
         check(dataclasses.replace(TRAIN, optimizer=faster))
     with pytest.raises(UnirenderError, match="process 0 of 2 was started with steps 9 instead of 7"):
         check(steps=7)
+
+
+def test_a_shard_that_one_machine_lacks_is_told_as_such(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It was told of a run that was trained on it, which there was not."""
+    there = ShardSource(write_dataset(tmp_path / "there"), batch_size=2, seed=0)
+    there.open()
+    monkeypatch.setattr(Processes, "share", lambda self, value: there.state_dict())
+    lacking = ShardSource(write_dataset(tmp_path / "lacking", shards=1), batch_size=2, seed=0)
+    with pytest.raises(UnirenderError, match=r"process 1 of 2 does not find the data of process 0.*shard-000001"):
+        Trainer._follow_main(
+            SimpleNamespace(processes=Processes(1, 2)),  # pyright: ignore[reportArgumentType] - all that it looks at
+            lacking,
+        )
 
 
 @pytest.mark.parametrize(

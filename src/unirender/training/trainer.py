@@ -241,10 +241,21 @@ class Trainer:
         self._follow_main(source)
 
     def _follow_main(self, source: BatchSource) -> None:
-        """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it."""
+        """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it.
+
+        Raises:
+            UnirenderError: they are not there.
+        """
         state = self.processes.share(source.state_dict())
-        if not self.processes.is_main:
+        if self.processes.is_main:
+            return
+        try:
             source.load_state_dict(state)
+        except UnirenderError as error:
+            raise UnirenderError(
+                f"process {self.processes.rank} of {self.processes.size} does not find the data of process 0, expected "
+                f"one --data that all machines see ({error})"
+            ) from error
 
     def _refresh(self, source: BatchSource, report: Report) -> None:
         """Takes in new shards; where they cannot be used, the run goes on with those that it has, and says so."""
