@@ -9,16 +9,18 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+import torch
 from accelerate.tracking import GeneralTracker, on_main_process
 from inline_executor import Inline
 from reference_scenes import environment, sphere
 from synthetic_shards import own_picture, write_dataset
-from tiny_models import TRAIN
+from tiny_models import TRAIN, make_pipeline
 from tiny_suites import make_suite
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.exr import image_channels, write_exr
 from unirender.files import write_png
+from unirender.models.dual_stream import DualStreamModel
 from unirender.training.groups import read_groups
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.prediction_check import folder_problems, questions
@@ -174,7 +176,12 @@ def training() -> Names:
     MyTracker.told.clear()
     write_dataset(Path("data"), size=32)
     pictures = {"mug": own_picture(0), "cup": own_picture(1)}
-    return {"pictures": pictures, "MyTracker": MyTracker, "SMALL": dataclasses.replace(TRAIN, batch_size=2)}
+    return {
+        "pictures": pictures,
+        "MyTracker": MyTracker,
+        "SMALL": dataclasses.replace(TRAIN, batch_size=2),
+        "make_pipeline": make_pipeline,
+    }
 
 
 def check_training(names: Names) -> None:
@@ -183,6 +190,9 @@ def check_training(names: Names) -> None:
         assert config["train"]["loss"]["albedo"] == 4.0
         assert Path(run, "pipeline", "model_index.json").is_file()
     assert any("albedo" in values for values in MyTracker.told)
+    assert {"image", "albedo", "cycle"} <= names["terms"].keys()
+    trained, stored = names["network"], DualStreamModel.from_pretrained("mine-pipeline", subfolder="dual_stream")
+    assert all(torch.equal(p, q) for p, q in zip(trained.parameters(), stored.parameters(), strict=True))
 
 
 def optimizer() -> Names:
@@ -240,6 +250,17 @@ EXAMPLES = {
     "score_your_method.md": Example(stranger, check=check_predictions),
     "shade.md": Example(shaded, {"spp=256": "spp=16", "spp=64": "spp=16"}, check_gradients),
     "tour.md": Example(mug, {"resolution=128": "resolution=32", "spp=256": "spp=16"}, check_tour),
-    "training.md": Example(training, {"minutes=30": "steps=1", 'PRESETS["tiny"]': "SMALL"}, check=check_training),
+    "training.md": Example(
+        training,
+        {
+            "minutes=30": "steps=1",
+            'PRESETS["tiny"]': "SMALL",
+            'UniRenderPipeline.from_pretrained("tiny", calibration=None)': "make_pipeline()",
+            'Batches("data", 16)': 'Batches("data", 4)',
+            "10 * len": "len",
+            "num_workers=2": "num_workers=0",
+        },
+        check_training,
+    ),
 }
 """By the page's name. An example that needs nothing is `Example()`."""

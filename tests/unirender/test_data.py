@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import pickle
 import shutil
 import time
 from pathlib import Path
@@ -91,6 +92,13 @@ def test_batches_are_read_ahead_when_that_is_asked_for(folder: Path) -> None:
     reader.close()
     asked = BatchReader(dataset, 2, seed=5, workers=0)
     assert all(torch.equal(a["image"], next(asked)["image"]) for a in (first, second, third))
+
+
+def test_another_process_maps_the_same_files(folder: Path, dataset: GroupDataset) -> None:
+    """Spawned workers of a `DataLoader` are handed the dataset as bytes: all its pictures were among them."""
+    handed = pickle.dumps(dataset)
+    assert len(handed) < dataset.shards[0].pixels.nbytes / 2
+    torch.testing.assert_close(samples(pickle.loads(handed), 3), samples(dataset, 3), rtol=0, atol=0)
 
 
 def test_another_seed_gives_another_stream(dataset: GroupDataset) -> None:

@@ -126,8 +126,8 @@ def test_augmentations_do_to_it_what_they_do_to_rendered_light(folder: Path) -> 
     dataset = GroupDataset(folder, derived=True)
     every = [(shard.pixels, np.arange(len(shard.pixels), dtype=np.int32)) for shard in dataset.shards]
     # as if nothing cast a shadow; what is not asked for is nowhere
-    kinds = {False: [DerivedLight(x, 0 * x, rows) for x, rows in every]}
-    kinds[True] = [DerivedLight(0 * x, x, rows) for x, rows in every]
+    kinds = {False: [DerivedLight(Path(), x, 0 * x, rows) for x, rows in every]}
+    kinds[True] = [DerivedLight(Path(), 0 * x, x, rows) for x, rows in every]
     for shadows, stored in kinds.items():
         dataset._derived = stored
         for index in range(24):

@@ -313,6 +313,8 @@ def test_a_gradient_taken_at_a_scale_is_that_of_the_loss() -> None:
 
 def test_cycle_can_be_off() -> None:
     assert "cycle" not in values(loss_function(cycle=0.0), inverse())
+    assert "cycle" not in values(loss_function(cycle_share=0.0), inverse())
+    assert "cycle" in values(loss_function(cycle_share=0.1), inverse())  # of few rows, too: it would never be seen
     waiting = loss_function()
     waiting.cycle_scale = 0.0
     assert "cycle" not in values(waiting, inverse())

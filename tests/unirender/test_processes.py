@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -21,8 +22,12 @@ from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training import processes
 from unirender.training.checkpoint import load_state
 from unirender.training.command import Train
+from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.processes import ALONE, Processes, join_processes
 from unirender.training.run import train
+from unirender.training.source import ShardSource
+from unirender.training.state import OF_ALL, check_alike
+from unirender.training.trainer import Trainer
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")
@@ -58,7 +63,9 @@ def save_state(folder, state):
     return own_save(folder, state)
 
 if os.environ["RANK"] == "0":
-    ShardSource.next, trainer.save_state = next, save_state
+    trainer.save_state = save_state
+else:
+    ShardSource.next = next
 """
 
 
@@ -170,7 +177,7 @@ def test_an_error_of_one_process_ends_all_with_a_line(run: Run, tmp_path: Path) 
 
 @pytest.mark.long
 def test_all_wait_for_the_one_that_saves(run: Run, tmp_path: Path) -> None:
-    """The first process alone is asked to stop; torchrun ends it, too, as soon as another one has ended."""
+    """Another one alone is asked to stop, as where its machine is taken away; torchrun ends all when one has ended."""
     ended = torchrun(run.data, tmp_path / "run", "--steps", "9", script=changed_by(SLOW_SAVE, tmp_path))
     assert ended.returncode == 1
     state = load_state(tmp_path / "run")
@@ -188,6 +195,51 @@ def test_alone_everything_is_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(a is b for a, b in zip(ALONE.sum(tensors), tensors, strict=True))
     ALONE.close()
     assert not Processes(1, 2).is_main
+
+
+def test_one_process_of_a_machine_goes_before_its_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of eight would pack the same shards, and derive the same light, on all cores of the machine."""
+    done: list[str] = []
+    monkeypatch.setattr(Processes, "gather", lambda self, value: done.append("all met"))
+    for local in (0, 1):
+        with Processes(2 + local, 4, local).one_first():
+            done.append(f"process {local} works")
+    assert done == ["process 0 works", "all met", "all met", "process 1 works"]
+    with pytest.raises(UnirenderError, match="disk"), Processes(2, 4, 0).one_first():
+        raise UnirenderError("disk")
+    assert len(done) == 4  # the others are told that it has ended
+
+
+def test_processes_that_were_told_different_things_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Another rate would give each its own weights without a word, another length let one wait for the others."""
+    monkeypatch.setattr(Processes, "gather", lambda self, value: [[], value])
+
+    def check(config: TrainConfig = TRAIN, steps: int = 9) -> None:
+        run = RunConfig(tmp_path, steps=9)
+        first = json.loads(json.dumps(dataclasses.asdict(TRAIN))), {n: getattr(run, n) for n in OF_ALL}
+        monkeypatch.setattr(Processes, "share", lambda self, value: first)
+        told = SimpleNamespace(config=config, run=dataclasses.replace(run, steps=steps), processes=Processes(1, 2))
+        check_alike(told)  # pyright: ignore[reportArgumentType] - all that it looks at
+
+    check()
+    faster = dataclasses.replace(TRAIN.optimizer, learning_rate=1.0)
+    with pytest.raises(UnirenderError, match=r"optimizer.learning_rate 0.002 instead of 1.0, as process 1 has it"):
+        check(dataclasses.replace(TRAIN, optimizer=faster))
+    with pytest.raises(UnirenderError, match="process 0 of 2 was started with steps 9 instead of 7"):
+        check(steps=7)
+
+
+def test_a_shard_that_one_machine_lacks_is_told_as_such(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It was told of a run that was trained on it, which there was not."""
+    there = ShardSource(write_dataset(tmp_path / "there"), batch_size=2, seed=0)
+    there.open()
+    monkeypatch.setattr(Processes, "share", lambda self, value: there.state_dict())
+    lacking = ShardSource(write_dataset(tmp_path / "lacking", shards=1), batch_size=2, seed=0)
+    with pytest.raises(UnirenderError, match=r"process 1 of 2 does not find the data of process 0.*shard-000001"):
+        Trainer._follow_main(
+            SimpleNamespace(processes=Processes(1, 2)),  # pyright: ignore[reportArgumentType] - all that it looks at
+            lacking,
+        )
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,22 @@ def test_the_step_is_ended_and_saved_and_nothing_is_lost(tmp_path: Path) -> None
     assert len(whole) == STEPS
 
 
+def test_the_last_save_is_ended_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped in it, a run that was over lost what came after the save before."""
+
+    def state_dict(source: Source) -> dict[str, Any]:
+        if source.place == STEPS:
+            os.kill(os.getpid(), signal.SIGINT)
+        return {"place": source.place}
+
+    monkeypatch.setattr(Source, "state_dict", state_dict)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tmp_path, Source())
+    state = load_state(tmp_path)
+    assert state is not None
+    assert state["step"] == STEPS
+
+
 @pytest.mark.parametrize("number", SIGNALS)
 def test_the_status_tells_the_signal(number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a shell reports it, and a batch system that starts the run again looks for."""

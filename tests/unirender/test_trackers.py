@@ -131,6 +131,27 @@ def test_trackers_that_were_started_are_finished_where_another_cannot_start(tmp_
     assert [path.parent.name for path in tmp_path.rglob("lines.jsonl")] == ["one"]  # the third never began
 
 
+class LosingTracker(LineTracker):
+    """Its service goes away."""
+
+    def log(self, values: dict[str, Any], step: int | None = None, **options: Any) -> None:
+        raise ConnectionError("server gone")
+
+    def finish(self) -> None:
+        raise ConnectionError
+
+
+def test_a_tracker_that_fails_on_the_way_ends_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trackers = (LosingTracker("one", tmp_path), LineTracker("two", tmp_path))
+    with tracking(trackers, TRAIN) as report:
+        for step in (1, 2):
+            report({"step": step, "image": 0.5})
+    told = [json.loads(line)["event"] for line in trackers[1].path.read_text().splitlines()]
+    assert told == ["start", "parameters", "log", "log", "finish"]
+    said = capsys.readouterr().err.splitlines()
+    assert [line.partition("failed (")[2].partition(")")[0] for line in said] == ["server gone", "ConnectionError"]
+
+
 def test_unknown_trackers_are_refused_with_those_that_accelerate_knows(registered: str) -> None:
     check_trackers([NAME])
     assert NAME in known_trackers()

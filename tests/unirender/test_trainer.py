@@ -43,7 +43,7 @@ from unirender.training.command import Train
 from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
-from unirender.training.live import live_report, standing
+from unirender.training.live import live_report, never_at_peak, standing
 from unirender.training.presets import PRESETS, get_preset
 from unirender.training.reader import BatchReader
 from unirender.training.run import train
@@ -525,6 +525,15 @@ def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> No
     assert "pass --steps (more than 8) and --minutes (more than 5.5)" in both
     assert "pass --steps (more than 3)" in standing(3, 1.0, 2, None), "past the length that is asked for"
     assert "--steps" not in standing(7, 5.5, 8, 5.0)
+
+
+def test_a_run_that_ends_in_its_warm_up_is_told() -> None:
+    """Two minutes of a slow machine are: the loss hardly moves, and nothing said why."""
+    config = OptimizerConfig(learning_rate=5e-4, warmup_steps=100)
+    assert "ended at step 100, and the learning rate rises for 100 steps" in str(never_at_peak(100, config))
+    assert learning_rate(config, 99, 0.0) < 5e-4
+    assert never_at_peak(101, config) is None
+    assert learning_rate(config, 100, 0.0) == 5e-4
 
 
 def test_a_batch_that_cannot_be_made_is_asked_for_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

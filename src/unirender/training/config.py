@@ -26,7 +26,7 @@ class LossConfig:
     colour_floor: float = 0.0  # the same of albedo, s and d, each
     background: float = 0.02  # weight of a pixel outside the mask, beside 1 inside
     cycle: float = 1.0  # weight of the re-rendered image; 0: no cycle pass
-    cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again
+    cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again; 0: none
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
     cycle_steps: int = 1  # 1: what is rendered again is the step's own prediction; more: a sample of so many steps

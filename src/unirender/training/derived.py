@@ -40,11 +40,15 @@ _STORED = ("unshadowed", "shadowed")
 
 @dataclass(frozen=True)
 class DerivedLight:
-    """Of a shard: arrays are read-only memory maps."""
+    """Of a shard: arrays are read-only memory maps of files in `folder`, which other processes map, too."""
 
+    folder: Path
     unshadowed: Float16[np.ndarray, "m 3 h w"]
     shadowed: Float16[np.ndarray, "m 3 h w"]
     rows: Int[np.ndarray, " n"]
+
+    def __reduce__(self) -> tuple[Callable[[Path], "DerivedLight"], tuple[Path]]:
+        return _open, (self.folder,)
 
     def of(self, rows: Sequence[int] | Int[np.ndarray, " l"], shadows: bool) -> Float16[np.ndarray, "l 3 h w"]:
         """What stands in the packed shard's `rows`, all of s or d, derived: with the shadows that are seen, or none."""
@@ -81,7 +85,7 @@ def _folder(shard: Shard) -> Path:
 
 
 def _open(folder: Path) -> DerivedLight:
-    return DerivedLight(*(mapped(folder / f"{name}.npy") for name in (*_STORED, "rows")))
+    return DerivedLight(folder, *(mapped(folder / f"{name}.npy") for name in (*_STORED, "rows")))
 
 
 def one_thread() -> None:

@@ -18,7 +18,7 @@ memory-mapped files under `${UNIRENDER_CACHE}/packed/<sha256 of the shard>`:
 import contextlib
 import json
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -38,14 +38,18 @@ END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends
 
 @dataclass(frozen=True)
 class Shard:
-    """A packed shard: arrays are read-only memory maps."""
+    """A packed shard in its `folder` of the cache: arrays are read-only memory maps, which other processes map, too."""
 
+    folder: Path
     name: str
     sha256: str
     pixels: Float16[np.ndarray, "n 3 h w"]
     shared: Float16[np.ndarray, "g c h w"]
     environment: Float[np.ndarray, "l 4 3 16 32"]
     groups: tuple[Group, ...]
+
+    def __reduce__(self) -> tuple[Callable[..., "Shard"], tuple[Path, str, str]]:
+        return _open, (self.folder, self.name, self.sha256)
 
 
 def list_shards(folder: str | Path) -> dict[Path, str | None]:
@@ -224,6 +228,11 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
                 f"{path}: sha256 is {actual}, the manifest says {sha256}; delete the shard and remake the dataset"
             )
         _pack(path, folder)
+    return _open(folder, name or path.name, known)
+
+
+def _open(folder: Path, name: str, sha256: str) -> Shard:
+    """A packed shard, from its folder of the cache."""
     arrays = {array: mapped(folder / f"{array}.npy") for array in ("pixels", "shared", "environment")}
     try:
         groups = tuple(
@@ -232,7 +241,7 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
         )
     except (OSError, ValueError) as error:
         raise damaged(folder, error) from error
-    return Shard(name=name or path.name, sha256=known, groups=groups, **arrays)
+    return Shard(folder=folder, name=name, sha256=sha256, groups=groups, **arrays)
 
 
 def mapped(path: Path) -> np.ndarray:

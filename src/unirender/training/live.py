@@ -11,6 +11,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from unirender.training.config import OptimizerConfig
+
 Report = Callable[[dict[str, Any]], None]
 
 RATES = ("step", "minutes", "samples_per_s")  # entries of a line of losses; the others are its losses
@@ -68,6 +70,16 @@ def standing(step: int, done_minutes: float, steps: int | None, minutes: float |
     if not reached:
         return f"resumed at {place}"
     return f"finished at {place}: nothing to train; pass {' and '.join(reached)} to go on from there"
+
+
+def never_at_peak(step: int, config: OptimizerConfig) -> str | None:
+    """In words: a run that ended at this step has learned at a small rate only; None: it was past the warm-up."""
+    if step > config.warmup_steps:
+        return None
+    return (
+        f"the run ended at step {step}, and the learning rate rises for {config.warmup_steps} steps: it never reached "
+        f"its peak of {config.learning_rate:g}; pass more --steps or --minutes to go on"
+    )
 
 
 def words(line: dict[str, Any]) -> str:

@@ -172,7 +172,8 @@ class LossFunction:
         terms: LossTerms = {}
         if self.config.composite and len(predicted):
             terms["composite"] = consistency.composite(predicted, image, mask)
-        count = round(self.config.cycle_share * len(predicted))
+        share = self.config.cycle_share
+        count = min(max(1, round(share * len(predicted))), len(predicted)) if share else 0  # one even of few rows
         if self.config.cycle and self.cycle_scale and count:
             terms["cycle"] = consistency.cycle(predicted[:count], truth[:count], mask[:count], generator)
         if output.answers is not None and self.config.answers and len(predicted):

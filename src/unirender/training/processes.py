@@ -32,15 +32,26 @@ class Processes:
     Attributes:
         rank: number of this process, from 0.
         size: how many there are.
+        local: number of this process on its machine, from 0.
     """
 
     rank: int = 0
     size: int = 1
+    local: int = 0
 
     @property
     def is_main(self) -> bool:
         """Whether this is the process that writes and speaks."""
         return self.rank == 0
+
+    @contextlib.contextmanager
+    def one_first(self) -> Iterator[None]:
+        """For a block that makes what the others of a machine then find on its disk: its first process goes before."""
+        if self.local > 0:
+            self.gather(None)
+        yield
+        if self.local == 0:
+            self.gather(None)
 
     def gather(self, value: T) -> list[T]:
         """The value of every process, by rank; plain data."""
@@ -134,7 +145,7 @@ def join_processes(device: torch.device) -> tuple[Processes, torch.device]:
         raise UnirenderError(
             f"process {rank} of {size} cannot reach the others ({error}); start all of them with torchrun"
         ) from error
-    return Processes(rank, size), device
+    return Processes(rank, size, local), device
 
 
 def _variable(name: str) -> int:

@@ -82,7 +82,7 @@ def _train(
     from unirender.training.closed_form_check import doubt
     from unirender.training.export import export_pipeline
     from unirender.training.groups import split_of, unread_shards
-    from unirender.training.live import live_report
+    from unirender.training.live import live_report, never_at_peak
     from unirender.training.memory import training_bytes
     from unirender.training.start import read_start
     from unirender.training.trackers import make_trackers, tracking
@@ -124,6 +124,8 @@ def _train(
             tracking(trackers, config, resumed, show) as report,
         ):
             trainer.fit(source, report, validate, lambda sentence: say(f"{out}: {sentence}"))
+        if short := never_at_peak(trainer.step, config.optimizer):
+            tell(f"{out}: {short}")
         pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
     processes.close()
     return pipeline
@@ -179,7 +181,8 @@ def make_source(
         rows=trainer.split.own,
         group_size=config.group_size,
     )
-    packed = source.open()
+    with trainer.processes.one_first():  # shards are packed, and lights derived, on all cores
+        packed = source.open()
     if options.batches == "device" or (options.batches == "auto" and fits(packed, trainer.device, memory)):
         return DeviceSource(source, trainer.device), packed
     return source, packed

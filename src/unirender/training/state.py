@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
 
 OF_A_STATE = ("config", "step", "seconds", "model", "ema", "optimizer", "generator", "source")  # of every version
+OF_ALL = ("steps", "minutes", "log_every")  # entries of the run's configuration by which all processes act
 
 
 def state_of(trainer: "Trainer", source: BatchSource) -> dict[str, Any]:
@@ -83,6 +84,26 @@ def resume(trainer: "Trainer", source: BatchSource, report: Report = lambda line
         news = f"{parts} -> {trainer.split.all_parts}: from here on other noise is drawn than without the change"
         trainer.log.tell({"step": trainer.step, "parts": news}, report)
     return True
+
+
+def check_alike(trainer: "Trainer") -> None:
+    """Looks whether all processes were told the same: each of another machine has a command line of its own.
+
+    With another learning rate they would end with other weights, with another length one would wait for ever.
+
+    Raises:
+        UnirenderError: they were not.
+    """
+    own = {name: getattr(trainer.run, name) for name in OF_ALL}
+    config, run = trainer.processes.share((plain(trainer.config), own))
+    other = differences(config, trainer.config)
+    other += [f"{name} {run[name]!r} instead of {value!r}" for name, value in own.items() if value != run[name]]
+    for rank, found in enumerate(trainer.processes.gather(other)):
+        if found:
+            raise UnirenderError(
+                f"process 0 of {trainer.processes.size} was started with {', '.join(found)}, as process {rank} has it; "
+                "start all of them with the same options"
+            )
 
 
 def write_config(trainer: "Trainer") -> None:

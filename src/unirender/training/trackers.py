@@ -9,6 +9,7 @@ after `accelerate.tracking.register_tracker_class`.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 from accelerate.tracking import LOGGER_TYPE_TO_CLASS, GeneralTracker, get_available_trackers
 
 from unirender.errors import UsageError
+from unirender.notices import notice
 from unirender.training.config import TrainConfig
 from unirender.training.live import Report
 
@@ -81,16 +83,19 @@ def tracking(
 ) -> Iterator[Report]:
     """Starts the trackers, gives the function that sends them a line of the log, and finishes them.
 
+    One that fails later, as where its server is gone, ends no training: that is said, and it is told nothing more.
+
     Args:
         trackers: not started yet.
         config: stored as the run's parameters.
         resumed: the run's parameters are stored already.
         show: is told every line, too.
     """
+    working = list(trackers)
     with contextlib.ExitStack() as stack:
         for tracker in trackers:
             tracker.start()
-            stack.callback(tracker.finish)
+            stack.callback(_told, tracker, tracker.finish)
             if not resumed:
                 tracker.store_init_configuration(parameters(dataclasses.asdict(config)))
 
@@ -100,10 +105,21 @@ def tracking(
             step = int(values.pop("step"))
             if not values:
                 return
-            for tracker in trackers:
-                tracker.log(values, step=step)
+            working[:] = [each for each in working if _told(each, functools.partial(each.log, values, step=step))]
 
         yield report
+
+
+def _told(tracker: GeneralTracker, tell: Callable[[], object]) -> bool:
+    """Whether a tracker took what it is told; if not, that is said."""
+    try:
+        tell()
+    except Exception as error:  # of any library
+        reason = " ".join(str(error).split()) or type(error).__name__
+        name = getattr(tracker, "name", type(tracker).__name__)
+        notice(f"--track {name}: failed ({reason}); the training goes on without it, and log.jsonl has all")
+        return False
+    return True
 
 
 def numbers(line: Mapping[str, Any], prefix: str = "") -> dict[str, float]:

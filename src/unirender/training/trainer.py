@@ -41,7 +41,7 @@ from unirender.training.pictures import SHEET_ROWS, save_sheet, training_sheet
 from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
-from unirender.training.state import resume, state_of, write_config
+from unirender.training.state import check_alike, resume, state_of, write_config
 from unirender.training.stopping import stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
@@ -162,8 +162,10 @@ class Trainer:
 
         Raises:
             Ended: it was asked to stop.
+            UnirenderError: it cannot be written, a gradient is not finite, or the processes have different options.
         """
         self.source, main = source, self.processes.is_main
+        check_alike(self)
         validation = Validation(validate, self.run.keep_best) if validate else None
         if main:
             tidy(self.run.out)
@@ -184,7 +186,9 @@ class Trainer:
                 self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
                 self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
                 seconds = self.seconds + time.monotonic() - start
-                self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
+                told = self.processes.gather((seconds, due("refresh"), request.signal))
+                self.seconds, refreshing, _ = told[0]
+                stopping = _first([signal for _, _, signal in told])
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     with request.unheard():
                         self._tell_losses(*logged, report)
@@ -199,8 +203,10 @@ class Trainer:
                         self._look(self.shown, validation, report)
                     if refreshing:
                         self._refresh(source, report)
-        if main:
-            self.save(source)
+            if main:
+                self.save(source)
+            if (stopping := _first(self.processes.gather(request.signal))) is not None:
+                raise Ended(stopping)
         if self.step > begun or not self._picture_file.exists():  # which a kill after the last save has prevented
             self._look(self.shown, validation, report)
 
@@ -235,10 +241,21 @@ class Trainer:
         self._follow_main(source)
 
     def _follow_main(self, source: BatchSource) -> None:
-        """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it."""
+        """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it.
+
+        Raises:
+            UnirenderError: they are not there.
+        """
         state = self.processes.share(source.state_dict())
-        if not self.processes.is_main:
+        if self.processes.is_main:
+            return
+        try:
             source.load_state_dict(state)
+        except UnirenderError as error:
+            raise UnirenderError(
+                f"process {self.processes.rank} of {self.processes.size} does not find the data of process 0, expected "
+                f"one --data that all machines see ({error})"
+            ) from error
 
     def _refresh(self, source: BatchSource, report: Report) -> None:
         """Takes in new shards; where they cannot be used, the run goes on with those that it has, and says so."""
@@ -289,3 +306,8 @@ class Trainer:
     def resume(self, source: BatchSource, report: Report = lambda line: None) -> bool:
         """As `unirender.training.state.resume`."""
         return resume(self, source, report)
+
+
+def _first(signals: Sequence[int | None]) -> int | None:
+    """Of the signals of all processes, any of which may be asked to stop; None: none was."""
+    return next((number for number in signals if number is not None), None)
