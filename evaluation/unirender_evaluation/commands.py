@@ -20,7 +20,6 @@ from unirender_evaluation.studies.speed.command import BenchSpeed
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
 from unirender_evaluation.studies.warm_start.command import BenchWarmStart
-from unirender_evaluation.throughput_command import BenchThroughput
 from unirender_evaluation.truth_commands import BenchCheck, BenchTruth
 
 
@@ -96,7 +95,6 @@ class Bench:
             | Annotated[BenchTables, tyro.conf.subcommand("tables")]
             | Annotated[BenchValidate, tyro.conf.subcommand("validate")]
             | Annotated[BenchCrosscheck, tyro.conf.subcommand("crosscheck")]
-            | Annotated[BenchThroughput, tyro.conf.subcommand("throughput")]
             | Annotated[BenchDerivedLight, tyro.conf.subcommand("derived-light")]
             | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]
             | Annotated[BenchRace, tyro.conf.subcommand("race")]

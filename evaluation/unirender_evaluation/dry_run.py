@@ -2,7 +2,7 @@
 written.
 
 The only estimate is one that was measured: where the folder holds records of a row, the mean seconds of its answers,
-times those that are missing. It leaves scoring out (`unirender bench throughput`), and so it is said.
+times those that are missing. It leaves scoring out, and so it is said.
 """
 
 import itertools

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from unirender.color import image_srgb, srgb_decode, unpremultiply
+from unirender.color import eight_bits, image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.records import RunInfo
@@ -124,7 +124,7 @@ def flip_map(prediction: Picture, truth: Picture, mask: Float[np.ndarray, "h w 1
 def data_uri(picture: Picture, mask: Float[np.ndarray, "h w 1"] | None = None) -> str:
     """PNG data URI; the mask becomes the alpha channel."""
     channels = [picture] if mask is None else [picture, mask]
-    levels = np.round(np.clip(np.concatenate(channels, axis=-1), 0, 1) * 255).astype(np.uint8)
+    levels = eight_bits(np.concatenate(channels, axis=-1))
     buffer = io.BytesIO()
     Image.fromarray(levels).save(buffer, format="PNG")
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from PIL import Image as PngImage
 from PIL.PngImagePlugin import PngInfo
 
-from unirender.color import image_srgb
+from unirender.color import eight_bits, image_srgb
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import sample_environment
 from unirender.whole_files import replace_file
@@ -251,7 +251,7 @@ def sheet_key(path: Path) -> str | None:
 def write_sheet(path: Path, pictures: dict[str, Picture], key: str) -> None:
     """Writes display pictures of one size side by side, with their names and a content key in the PNG's text; makes
     the folder."""
-    levels = [np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8) for picture in pictures.values()]
+    levels = [eight_bits(picture) for picture in pictures.values()]
     sheet = np.concatenate(levels, axis=1) if levels else np.zeros((1, 1, 3), np.uint8)
     text = PngInfo()
     text.add_text("key", key)

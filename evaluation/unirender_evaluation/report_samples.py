@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.color import eight_bits
 from unirender_evaluation.gallery import GalleryItem, Mask, Picture, picture_size, shrink_covered
 from unirender_evaluation.metrics import DEFAULT_VARIANT, Variant
 from unirender_evaluation.records import Record, RunInfo
@@ -177,7 +178,7 @@ def _sheet(item: GalleryItem) -> Sheet:
         cover[1][0] = np.zeros_like(cover[1][0])  # nothing below the input
     sheet = np.concatenate([np.concatenate(line, axis=1) for line in cover], axis=0)
     buffer = io.BytesIO()
-    levels = np.round(np.clip(sheet, 0, 1) * 255).astype(np.uint8)
+    levels = eight_bits(sheet)
     Image.fromarray(levels).save(buffer, format="WEBP", quality=SHEET_QUALITY, method=4)
     uri = "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
     caption = " · ".join(text for text in (item.question, item.caption) if text)

@@ -7,7 +7,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from unirender_evaluation.results_compare import ColumnComparison, PairComparison, Rank
-from unirender_evaluation.table_formats import MISSING, format_number, header
+from unirender_evaluation.table_formats import MISSING, format_number, header, signed
 
 TITLES = ("A\n(rank)", "B\n(rank)", "A - B\n95 % interval", "n\n(obj.)")
 
@@ -31,9 +31,9 @@ def _cells(found: ColumnComparison) -> tuple[str, ...]:
     difference, n = MISSING, MISSING
     if found.comparison is not None:
         d = found.comparison.difference
-        difference, n = _signed(d.mean, digits), f"{d.n}\n({d.clusters})"
+        difference, n = signed(d.mean, digits), f"{d.n}\n({d.clusters})"
         if math.isfinite(d.low):
-            difference += f"\n[{_signed(d.low, digits)}, {_signed(d.high, digits)}]"
+            difference += f"\n[{signed(d.low, digits)}, {signed(d.high, digits)}]"
     alone = ", ".join(f"{count} only in {name}" for name, count in (("A", found.only_a), ("B", found.only_b)) if count)
     return (
         f"{found.column.group} {header(found.column)}",
@@ -47,7 +47,3 @@ def _cells(found: ColumnComparison) -> tuple[str, ...]:
 
 def _mean(value: float, digits: int, rank: Rank | None) -> str:
     return format_number(value, digits) + (f"\n({rank})" if rank else "")
-
-
-def _signed(value: float, digits: int) -> str:
-    return f"{value:+.{digits}f}"

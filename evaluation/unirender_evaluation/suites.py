@@ -18,20 +18,12 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exr import Channels, channels_rgb, read_exr_bytes
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.stratification import (
-    Material,
-    constant_mse,
-    level_counts,
-    material_key,
-    roughness_key,
-    stratified_materials,
-)
+from unirender_evaluation.stratification import Material, material_key
 from unirender_evaluation.suite_definition import check_definition
 from unirender_evaluation.suite_home import found_spec, truth_command
-from unirender_evaluation.suite_spec import SuiteSpec, read_spec, suite_path
+from unirender_evaluation.suite_spec import SuiteSpec
 from unirender_evaluation.truth_file import (
     CEILING,
-    STD_FLOOR,
     diffuse_member,
     estimate_mean,
     estimate_variance,
@@ -45,21 +37,7 @@ from unirender_evaluation.truth_file import (
 
 CACHE_BYTES = 512 * 2**20  # of decoded members that a suite keeps
 
-__all__ = [
-    "STD_FLOOR",
-    "Material",
-    "Scene",
-    "Suite",
-    "SuiteSpec",
-    "constant_mse",
-    "level_counts",
-    "load_suite",
-    "material_key",
-    "read_spec",
-    "roughness_key",
-    "stratified_materials",
-    "suite_path",
-]
+__all__ = ["Material", "Scene", "Suite", "SuiteSpec", "load_suite", "material_key"]
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,16 @@ def to_markdown(table: Table) -> str:
 
 def to_json(tables: Iterable[Table]) -> str:
     """Strict JSON of whole tables; NaN (no interval) becomes null, infinity the string "inf"."""
-    return json.dumps([_plain(table) for table in tables], indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text([_plain(table) for table in tables])
+
+
+def json_text(content: Any) -> str:
+    """Strict JSON for people to read, too.
+
+    Raises:
+        ValueError: a number is NaN or infinite (`json_number`).
+    """
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def print_table(console: Console, table: Table) -> None:
@@ -193,6 +202,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_plain(item) for item in value]
     return json_number(value) if isinstance(value, float) else value
+
+
+def signed(value: float, digits: int) -> str:
+    """With its sign, unless it is 0 as printed."""
+    text = f"{value:+.{digits}f}"
+    return text if float(text) else text[1:]
 
 
 def json_number(value: float) -> float | str | None:

@@ -76,7 +76,6 @@ COMMANDS = (
     "suite_definition",
     "suite_home",
     "suite_lights",
-    "throughput*",
     "truth",
     "truth_files",
     "validation",
@@ -122,7 +121,6 @@ ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-i
 MITSUBA_ROW = ("mitsuba_method",)
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
-    "adaptive*",
     "checks/*",
     "cluster",
     "commands",

@@ -13,7 +13,7 @@ method sees a sixth of what the samples that missed have cost. `docs/noise.md` h
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -219,19 +219,6 @@ def render_to_floor(
         more = draw(min(found.spp * growth, max_spp) - found.spp, number)
         found = combined(found, more, judge)
     return found
-
-
-def floor_provenance(found: Mapping[str, FloorEstimate]) -> dict[str, str]:
-    """Header entries of pictures rendered to a floor: what was asked, and for each what was reached with how many
-    samples per pixel; `floor_reached` is "no" where one of them was ended by its limit."""
-    asked = {f"{estimate.asked_db:g}" for estimate in found.values()}
-    entries = {"floor_asked_db": " ".join(sorted(asked))}
-    entries["floor_reached"] = "yes" if all(estimate.reached for estimate in found.values()) else "no"
-    for name, estimate in found.items():
-        entries[f"{name}_floor_db"] = f"{estimate.floor_db:.2f}"
-        entries[f"{name}_sure_db"] = f"{estimate.sure_db:.2f}"
-        entries[f"{name}_spp"] = str(estimate.spp)
-    return entries
 
 
 def decibels(error: float) -> float:

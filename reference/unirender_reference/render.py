@@ -43,7 +43,6 @@ __all__ = [
     "Renderer",
     "Sample",
     "SceneSpec",
-    "assemble_sample",
     "geometry_spp",
     "material_text",
     "render_sample",
@@ -189,16 +188,36 @@ def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer |
     renderer = renderer_of(spec, renderer)
     factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed, f"light {spec.light.name}")
     environment = (spec.light.environment * factor).astype(np.float32)
-    return assemble_sample(
-        spec,
-        renderer,
-        factor,
-        renderer.geometry(geometry_spp(spec.resolution, spp), seed, (spec.roughness, spec.metallic)),
-        image=renderer.image(environment, spec.roughness, spec.metallic, spp, seed),
-        diffuse=renderer.diffuse(environment, spp, seed),
-        specular=renderer.specular(environment, spec.roughness, spp, seed),
-        provenance={"spp": str(spp), "seed": str(seed), "batches": str(TRUTH_BATCHES)},
+    geometry = renderer.geometry(geometry_spp(spec.resolution, spp), seed, (spec.roughness, spec.metallic))
+    estimates = {
+        "image": renderer.image(environment, spec.roughness, spec.metallic, spp, seed),
+        "diffuse": renderer.diffuse(environment, spp, seed),
+        "specular": renderer.specular(environment, spec.roughness, spp, seed),
+    }
+    covered = geometry.require("mask")["mask"] > 0
+    intrinsics = geometry.replace(
+        diffuse=np.where(covered, estimates["diffuse"].mean, 0),
+        specular=np.where(covered, estimates["specular"].mean, 0),
+        environment=environment,
     )
+    header = {
+        **renderer_provenance(renderer),
+        "spp": str(spp),
+        "seed": str(seed),
+        "batches": str(TRUTH_BATCHES),
+        "depth": str(IMAGE_DEPTH),
+        "light": spec.light.name,
+        "roughness": material_text(spec.roughness),
+        "metallic": material_text(spec.metallic),
+        "exposure_seed": str(spec.exposure_seed),
+        "exposure_factor": repr(factor),
+        "nan_pixels": str(sum(estimate.nan_pixels for estimate in estimates.values())),
+        "scene": scene_hash(spec),
+    }
+    variance = {
+        name: estimate.variance[..., :3] for name, estimate in estimates.items() if estimate.variance is not None
+    }
+    return Sample(estimates["image"].mean[..., :3], intrinsics, variance, header)
 
 
 def renderer_of(spec: SceneSpec, renderer: Renderer | None = None) -> Renderer:
@@ -239,54 +258,6 @@ def geometry_spp(resolution: int, spp: int) -> int:
     if resolution <= LARGE:
         return max(GEOMETRY_SPP, spp)
     return GEOMETRY_SPP if spp >= 2 * GEOMETRY_SPP else LARGE_GEOMETRY_SPP
-
-
-def assemble_sample(
-    spec: SceneSpec,
-    renderer: Renderer,
-    factor: float,
-    geometry: Intrinsics,
-    *,
-    image: Estimate,
-    diffuse: Estimate,
-    specular: Estimate,
-    provenance: Mapping[str, str],
-) -> Sample:
-    """The sample that estimates of a scene make.
-
-    Args:
-        spec: the scene.
-        renderer: what rendered it.
-        factor: the exposure that was folded into the light.
-        geometry: albedo, normal, roughness, metallic and mask.
-        image: premultiplied linear RGBA under `spec.light.environment * factor`.
-        diffuse: d under the same light.
-        specular: s under the same light.
-        provenance: how the estimates were made (spp, seed, batches, ...); the scene's own entries are added.
-    """
-    covered = geometry.require("mask")["mask"] > 0
-    intrinsics = geometry.replace(
-        diffuse=np.where(covered, diffuse.mean, 0),
-        specular=np.where(covered, specular.mean, 0),
-        environment=(spec.light.environment * factor).astype(np.float32),
-    )
-    estimates = {"image": image, "diffuse": diffuse, "specular": specular}
-    header = {
-        **renderer_provenance(renderer),
-        **provenance,
-        "depth": str(IMAGE_DEPTH),
-        "light": spec.light.name,
-        "roughness": material_text(spec.roughness),
-        "metallic": material_text(spec.metallic),
-        "exposure_seed": str(spec.exposure_seed),
-        "exposure_factor": repr(factor),
-        "nan_pixels": str(sum(estimate.nan_pixels for estimate in estimates.values())),
-        "scene": scene_hash(spec),
-    }
-    variance = {
-        name: estimate.variance[..., :3] for name, estimate in estimates.items() if estimate.variance is not None
-    }
-    return Sample(image.mean[..., :3], intrinsics, variance, header)
 
 
 def material_text(value: float | None) -> str:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
-from unirender.color import image_srgb, luminance
+from unirender.color import eight_bits, image_srgb, luminance
 
 LINE = 1.35  # height of a line of text, in font sizes
 PREVIEW_PERCENTILE, PREVIEW_LEVEL = 90.0, 0.8
@@ -28,11 +28,6 @@ class Style:
 
 
 LIGHT, DARK = Style(), Style(background=0.11, text=0.9)
-
-
-def pixels(tile_srgb: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Display values in [0, 1] as bytes."""
-    return np.round(np.clip(tile_srgb, 0, 1) * 255).astype(np.uint8)
 
 
 def environment_preview(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
@@ -75,7 +70,7 @@ def table_sheet(
         for j, tile in enumerate(row):
             x = left + j * (width + style.gap)
             corner = (x + (width - tile.shape[1]) // 2, y + (height - tile.shape[0]) // 2)
-            sheet.paste(Image.fromarray(pixels(tile)), corner)
+            sheet.paste(Image.fromarray(eight_bits(tile)), corner)
     return sheet
 
 
@@ -92,7 +87,7 @@ def captioned_sheet(
     sheet, draw = _blank(size, style)
     for k, (tile, lines) in enumerate(zip(tiles, broken, strict=True)):
         x, y = style.gap + (k % columns) * cell[0], style.gap + (k // columns) * cell[1]
-        sheet.paste(Image.fromarray(pixels(tile)), (x, y))
+        sheet.paste(Image.fromarray(eight_bits(tile)), (x, y))
         draw.multiline_text((x, y + height + 2), "\n".join(lines), (round(255 * style.text),) * 3, font)
     return sheet
 

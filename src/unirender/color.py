@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from unirender.arguments import as_floats
 from unirender.blocks import by_rows, by_values
@@ -47,6 +47,11 @@ def image_srgb(image_linear: Float[np.ndarray, "..."]) -> Float[np.ndarray, "...
     """What a display shows at exposure 1: `srgb(clip(image_linear, 0, 1))`, in [0, 1]."""
     values = np.asarray(as_floats(image_linear, "image"), dtype=np.float32)
     return by_values(lambda linear: _encode(np.clip(linear, 0.0, 1.0)), values)
+
+
+def eight_bits(display: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    """Display values as a file of 8 bits has them: [0, 1] as 0 to 255, rounded; what is outside is clipped."""
+    return np.round(np.clip(display, 0, 1) * 255).astype(np.uint8)
 
 
 def display_slope(

@@ -25,7 +25,7 @@ from PIL import Image
 from unirender.arguments import as_floats, as_instance, as_path
 from unirender.blocks import by_rows
 from unirender.camera import DEFAULT_FOV_DEG, Camera
-from unirender.color import image_srgb, unpremultiply
+from unirender.color import eight_bits, image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
     CAMERA_ATTRIBUTE,
@@ -152,11 +152,7 @@ def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
     values = as_floats(values, "picture")
     if values.ndim != 3 or values.shape[-1] not in (1, 3, 4):
         raise UnirenderError(f"picture: got shape {values.shape}, expected (height, width, 1, 3 or 4)")
-    _save_png(as_path(path), by_rows(_eight_bits, values))
-
-
-def _eight_bits(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    _save_png(as_path(path), by_rows(eight_bits, values))
 
 
 def _save_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
@@ -180,7 +176,7 @@ def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarra
 
 def _shown(name: str, value: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
     """The pixels of a map's picture."""
-    return _eight_bits(map_picture(name, value))
+    return eight_bits(map_picture(name, value))
 
 
 def write_result(

@@ -9,14 +9,11 @@ from tiny_suites import make_suite, write_suite
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
+from unirender_evaluation.stratification import constant_mse, level_counts, stratified_materials
+from unirender_evaluation.suite_spec import read_spec, suite_path
 from unirender_evaluation.suites import (
-    constant_mse,
-    level_counts,
     load_suite,
     material_key,
-    read_spec,
-    stratified_materials,
-    suite_path,
 )
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import scene_ids, tasks

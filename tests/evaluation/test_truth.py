@@ -21,7 +21,8 @@ from unirender_evaluation.suite_definition import recorded
 from unirender_evaluation.suite_home import target
 from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
 from unirender_evaluation.suite_objects import scene_object, suite_sources
-from unirender_evaluation.suites import Suite, load_suite, read_spec, suite_path
+from unirender_evaluation.suite_spec import read_spec, suite_path
+from unirender_evaluation.suites import Suite, load_suite
 from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
 from unirender_evaluation.truth_object import ObjectJob, object_hash, render_object

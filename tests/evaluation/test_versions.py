@@ -97,7 +97,7 @@ def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str
     "name",
     [
         *("__init__", "schema", "schema_check", "merge", "score_api", "commands", "results_commands", "results_check"),
-        *("throughput", "throughput_command", "crosscheck", "report_pages"),
+        *("crosscheck", "report_pages"),
         *("table_list", "suite_check", "suite_home", "suite_lights"),
     ],
 )

@@ -15,6 +15,7 @@ from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
 
 SIZE = 24
+POINTS = 8  # along each side of a cell, over which a map is averaged
 
 
 def bare(seed: int = 3, texture_size: int = 32) -> MeshObject:
@@ -39,10 +40,33 @@ def two_colours(obj: MeshObject, texture_size: int = 32) -> MeshObject:
     return replace(obj, albedo=texels.reshape(texture_size, texture_size, 3).astype(np.float32))
 
 
+def averages(grid: LightGrid, environment: np.ndarray) -> np.ndarray:
+    """Mean radiance of an environment map over each cell (midpoint rule, `POINTS` of them along each side)."""
+    height, width = environment.shape[:2]
+    upper, lower = grid.cosines
+    part = (np.arange(POINTS) + 0.5) / POINTS
+    theta = np.arccos(np.clip(upper[:, None] + (lower - upper)[:, None] * part, -1, 1)).ravel()
+    y, x = (
+        theta / np.pi * (height - 1),
+        (np.arange(grid.columns)[:, None] + part).ravel() / grid.columns * width - 0.5,
+    )
+    top, left = np.clip(np.floor(y).astype(int), 0, height - 2), np.floor(x).astype(int)
+    down, right = (y - top)[:, None, None], (x - left)[None, :, None]
+
+    def texels(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+        return environment[row][:, column % width]
+
+    above = texels(top, left) * (1 - right) + texels(top, left + 1) * right
+    below = texels(top + 1, left) * (1 - right) + texels(top + 1, left + 1) * right
+    fine = above * (1 - down) + below * down
+    blocks = fine.reshape(grid.rows, POINTS, grid.columns, POINTS, 3)
+    return blocks.mean(axis=(1, 3)).reshape(-1, 3).astype(np.float32)
+
+
 def coarse_light(seed: int = 0, rows: int = 8) -> np.ndarray:
     """A light that a grid of so many rows holds, as an environment map on it."""
     grid = LightGrid(rows, 2 * rows)
-    cells = grid.averages(make_light(seed, "train").environment)
+    cells = averages(grid, make_light(seed, "train").environment)
     return grid.environment(np.maximum(cells, 0.02))
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unirender.color import eight_bits
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import on_pole_grid, read_exr
 from unirender.lighting import resample_environment
@@ -14,7 +15,7 @@ from unirender_reference import lights
 from unirender_reference.lights.summary import light_row
 from unirender_reference.measure.exposure import Exposure, picture_exposure
 from unirender_reference.measure.lights import THUMBNAIL, Lights
-from unirender_reference.sheets import LIGHT, captioned_sheet, environment_preview, pixels, table_sheet
+from unirender_reference.sheets import LIGHT, captioned_sheet, environment_preview, table_sheet
 
 
 def printed(command: Lights, capsys: pytest.CaptureFixture[str], status: int = 0) -> dict:
@@ -168,7 +169,7 @@ def test_a_sheet_shows_the_lights_asked_for(tmp_path: Path, capsys: pytest.Captu
     capsys.readouterr()
     lines = [line.tobytes() for line in np.asarray(Image.open(tmp_path / "sheet.png"))]
     for light in lights.bundled_lights():
-        middle = pixels(environment_preview(resample_environment(light.environment, THUMBNAIL)))[40].tobytes()
+        middle = eight_bits(environment_preview(resample_environment(light.environment, THUMBNAIL)))[40].tobytes()
         assert any(middle in line for line in lines) == (light.provenance["split"] == "test")
 
 

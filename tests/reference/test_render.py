@@ -13,14 +13,12 @@ from scipy.stats import chi2
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference import backend, materials, passes, scene
-from unirender_reference.adaptive import render_sample_to_floor
 from unirender_reference.lights import Light
 from unirender_reference.multiview import pose_towards
 from unirender_reference.render import (
     DIRECT_DEPTH,
     IMAGE_DEPTH,
     Renderer,
-    Sample,
     SceneSpec,
     render_sample,
     renderer_provenance,
@@ -386,16 +384,11 @@ def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(rend
     assert {"mitsuba", "variant", "spp", "seed", "camera", "nan_pixels"} <= set(sample.provenance)
 
 
-@pytest.mark.parametrize("to_floor", [False, True], ids=["spp", "floor"])
-def test_a_renderer_of_another_scene_is_refused(to_floor: bool) -> None:
+def test_a_renderer_of_another_scene_is_refused() -> None:
     """An object with maps has the name of the one without, and is another object."""
     obj, light = make_object(1, "train"), scenes.light(1)
     renderer = Renderer(obj, resolution=8)
     spec = SceneSpec(obj, light, 0.3, 0.6, resolution=8)
-
-    def render(spec: SceneSpec) -> Sample:
-        return render_sample_to_floor(spec, 20, 0, renderer) if to_floor else render_sample(spec, 16, 0, renderer)
-
     changes: dict[str, dict[str, Any]] = {
         "object": {"obj": make_object(1, "train", maps=True)},
         "camera": {"camera": Camera(20.0)},
@@ -406,9 +399,9 @@ def test_a_renderer_of_another_scene_is_refused(to_floor: bool) -> None:
         assert wrong.obj.name == obj.name
         assert scene_hash(wrong) != scene_hash(spec)
         with pytest.raises(UnirenderError, match=f"another: {other}.*leave `renderer` out"):
-            render(wrong)
+            render_sample(wrong, 16, 0, renderer)
     copied = dataclasses.replace(spec, obj=dataclasses.replace(obj, vertices=obj.vertices.copy()))
-    assert render(copied).provenance["scene"] == scene_hash(spec)
+    assert render_sample(copied, 16, 0, renderer).provenance["scene"] == scene_hash(spec)
 
 
 def test_the_hash_does_not_depend_on_the_type_of_a_number() -> None:

@@ -4,14 +4,8 @@ import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.symmetries import scale_light
-from unirender.training.augment import (
-    from_maps,
-    interpolate_metallic,
-    mix_lights,
-    permute_channels,
-    to_maps,
-)
+from unirender.symmetries import permute_channels, scale_light
+from unirender.training.augment import from_maps, interpolate_metallic, mix_lights, to_maps
 
 
 def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:

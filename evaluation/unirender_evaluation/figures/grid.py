@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image, ImageDraw, ImageFont
 
+from unirender.color import eight_bits
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
 
@@ -136,7 +137,7 @@ def _paste(
     """A picture in the middle of its cell of (width, height) pixels."""
     height, width = tile.picture.shape[:2]
     factor = _factor(tile, cell[0])
-    levels = np.round(np.clip(tile.picture, 0, 1) * 255).astype(np.uint8)
+    levels = eight_bits(tile.picture)
     picture = Image.fromarray(levels).resize((width * factor, height * factor), Image.Resampling.NEAREST)
     x, y = corner[0] + (cell[0] - picture.width) // 2, corner[1] + (cell[1] - picture.height) // 2
     sheet.paste(picture, (x, y))

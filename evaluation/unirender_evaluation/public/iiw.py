@@ -8,7 +8,6 @@ The judgements' layout and the metric are those of the script that the set's aut
 photographs and judgements lie side by side is how others' code reads the release. Checked on made data only.
 """
 
-import json
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.metrics import DELTA, WHDR, Judgement, judgements, whdr
 from unirender_evaluation.public.scenes import Scenes, scene_sample
-from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder
+from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder, parsed_json
 from unirender_evaluation.specs import Column, TableSpec
 
 NAME = "iiw"
@@ -87,14 +86,4 @@ def read_judgements(path: Path) -> list[Judgement]:
     Raises:
         UnirenderError: no readable file, another layout, or a value out of its range (`judgements`).
     """
-    expected = "expected IIW's intrinsic_points and intrinsic_comparisons"
-    try:
-        return judgements(json.loads(path.read_text(encoding="utf-8")))
-    except UnirenderError as error:
-        raise UnirenderError(f"{path}: {error}") from None
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
-    except KeyError as error:
-        raise UnirenderError(f"{path}: {error} is missing, {expected}") from None
-    except (TypeError, ValueError, RecursionError) as error:
-        raise UnirenderError(f"{path}: not readable ({error}), {expected}") from None
+    return parsed_json(path, judgements, "IIW's intrinsic_points and intrinsic_comparisons")

@@ -1,6 +1,5 @@
 """Stanford-ORB's captures: their frames and poses as `transforms_*.json` say, and which photographs share a pose."""
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender_evaluation.public.sets import parsed_json
 
 LDR, HDR, TRUTH = "blender_LDR", "blender_HDR", "ground_truth"
 ROTATION_TOLERANCE = 1e-3
@@ -128,18 +128,12 @@ def read_frames(path: Path, capture: str) -> tuple[Frame, ...]:
     Raises:
         UnirenderError: no readable file, another layout, or a pose that is no rotation and position.
     """
-    expected = "expected frames with file_path and a 4 x 4 transform_matrix, and camera_angle_x in radians"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+
+    def frames(content: Any) -> tuple[Frame, ...]:
         return tuple(_frame(entry, content, capture) for entry in content["frames"])
-    except UnirenderError as error:
-        raise UnirenderError(f"{path}: {error}") from None
-    except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
-    except KeyError as error:
-        raise UnirenderError(f"{path}: {error} is missing, {expected}") from None
-    except (TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise UnirenderError(f"{path}: not readable ({error}), {expected}") from None
+
+    layout = "frames with file_path and a 4 x 4 transform_matrix, and camera_angle_x in radians"
+    return parsed_json(path, frames, layout)
 
 
 def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Frame:

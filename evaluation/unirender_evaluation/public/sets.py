@@ -6,10 +6,11 @@ under another light). Methods are asked with `inputs`; a folder of predictions a
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +24,8 @@ from unirender.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.specs import TableSpec
+
+T = TypeVar("T")
 
 MAPS = "intrinsics"  # the answer to `decompose`, as a folder of predictions has it
 MOST_PROBLEMS = 40  # lines of an error: a folder in another layout has thousands
@@ -146,6 +149,30 @@ def missing_files(paths: Iterable[Path], what: str) -> Iterator[str]:
     for path in paths:
         if not path.is_file():
             yield f"{path}: no such file, expected {what}"
+
+
+def parsed_json(path: Path, parse: Callable[[Any], T], expected: str) -> T:
+    """What `parse` makes of a JSON file.
+
+    Args:
+        path: of the file.
+        parse: of its content; a name that is missing or a value of another kind may fail in it.
+        expected: the layout, for the message.
+
+    Raises:
+        UnirenderError: no readable file, another layout, or what `parse` refuses; the file is named.
+    """
+    expected = f"expected {expected}"
+    try:
+        return parse(json.loads(path.read_text(encoding="utf-8")))
+    except UnirenderError as error:
+        raise UnirenderError(f"{path}: {error}") from None
+    except OSError as error:
+        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), {expected}") from error
+    except KeyError as error:
+        raise UnirenderError(f"{path}: {error} is missing, {expected}") from None
+    except (TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise UnirenderError(f"{path}: not readable ({error}), {expected}") from None
 
 
 def image_size(path: Path) -> tuple[int, int]:

@@ -3,15 +3,15 @@
 import math
 from dataclasses import dataclass
 
-from unirender_evaluation.metrics import METRICS
+from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate
-from unirender_evaluation.table_formats import format_number
+from unirender_evaluation.table_formats import format_number, json_number, signed
 
 
-def study_column(group: str, quantity: str, metric: str) -> Column:
-    """A column of one of the benchmark's metrics; the paper has no number for it."""
-    return Column(group, quantity, METRICS[metric], published=False)
+def study_column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
+    """A column of a metric, or of one of the benchmark's by its name; the paper has no number for it."""
+    return Column(group, quantity, METRICS[metric] if isinstance(metric, str) else metric, overrides, published=False)
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ def cell_text(cell: Cell, decimals: int) -> str:
     return f"{text} (**{change}**)" if cell.decided else f"{text} ({change})"
 
 
-def signed(value: float, decimals: int) -> str:
-    """With its sign, unless it is 0 as printed."""
-    text = f"{value:+.{decimals}f}"
-    return text if float(text) else text[1:]
+def as_json(found: Estimate | None) -> dict[str, float | str | int | None] | None:
+    """An estimate for JSON; None where there is none."""
+    if found is None:
+        return None
+    mean, low, high = map(json_number, (found.mean, found.low, found.high))
+    return {"mean": mean, "low": low, "high": high, "n": found.n, "objects": found.clusters}

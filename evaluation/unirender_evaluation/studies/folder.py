@@ -1,10 +1,14 @@
 """The folder that a study writes to: one run at a time, and no file that is half written."""
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from rich.console import Console
+
 from unirender.whole_files import replace_file
+from unirender_evaluation.studies.about import line
+from unirender_evaluation.table_text import TextTable
 from unirender_reference.folder_lock import locked, made_folder
 
 
@@ -23,3 +27,23 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Writes texts (UTF-8) and pictures, each moved into place when complete."""
     for name, content in files.items():
         replace_file(folder / name, content)
+
+
+def write_study(
+    stem: Path, tables: Sequence[TextTable], below: Mapping[str, object], content: str, counts: str, console: Console
+) -> None:
+    """Writes `.md` (tables, and what one must know below them) and `.json`, and shows the tables.
+
+    Args:
+        stem: of both files' names, in an open folder.
+        tables: of the study.
+        below: (what, value) of the line below them.
+        content: of the JSON.
+        counts: what the last line on the terminal says of the records.
+        console: to show the tables on.
+    """
+    text = "\n".join([*(table.markdown() for table in tables), line(below)])
+    write_files(stem.parent, {f"{stem.name}.md": text, f"{stem.name}.json": content})
+    for table in tables:
+        table.show(console)
+    console.print(f"{counts}; {stem}.md, .json", highlight=False, markup=False)

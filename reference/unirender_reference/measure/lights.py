@@ -191,8 +191,9 @@ def _new_folder(path: Path | None) -> Iterator[Path | None]:
 def _export(folder: Path, light: "Light") -> None:
     from PIL import Image
 
+    from unirender.color import eight_bits
     from unirender.exr import write_environment
-    from unirender_reference.sheets import environment_preview, pixels
+    from unirender_reference.sheets import environment_preview
 
     path = folder / f"{light.name}.exr"
     if path.exists():
@@ -200,7 +201,7 @@ def _export(folder: Path, light: "Light") -> None:
             f"{path.name}: two lights have this name, expected different ones; rename one of the files"
         )
     write_environment(path, light.environment, light.provenance)
-    Image.fromarray(pixels(environment_preview(light.environment))).save(path.with_suffix(".png"))
+    Image.fromarray(eight_bits(environment_preview(light.environment))).save(path.with_suffix(".png"))
 
 
 def _sheet(lights: "list[tuple[Split, Light]]") -> "Image.Image":

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 SHORTFALL_DB = 1.0  # below the floor asked for, in one image, that fails
 BIAS_DB = 0.3  # of the estimate over all images, that fails
 MOST_SKIPPED = 5  # candidates for every image
+MASK_SPP = 1024  # of the coverage, which weights the pixels
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,6 @@ def measure_floor(job: FloorJob) -> FloorRow:
     import numpy as np
 
     from unirender_reference import exposure
-    from unirender_reference.adaptive import MASK_SPP
     from unirender_reference.lights import make_light
     from unirender_reference.noise import FLOOR_BATCHES, full_spp, measured_floor_db, render_to_floor
     from unirender_reference.passes import Estimate, derive_seed

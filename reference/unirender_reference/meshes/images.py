@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
+from unirender.color import eight_bits
 from unirender.errors import UnirenderError
 from unirender.sixteen_bits import BITS_PER_SAMPLE, as_stored, misread, white_is_zero
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
@@ -126,7 +127,7 @@ def _upper_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> UInt8
                 f"texture {name}: got floats from {values.min():.9g} to {values.max():.9g}, expected [0, 1]; export it "
                 "as PNG"
             )
-        return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+        return eight_bits(values)
     # Formats without tags have 16 bits.
     bits, signed = tags.get(BITS_PER_SAMPLE, (16,))[0], tags.get(SAMPLE_FORMAT, (1,))[0] == SIGNED
     if image.mode != "I":

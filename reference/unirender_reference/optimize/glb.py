@@ -11,10 +11,10 @@ import struct
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from PIL import Image
 
-from unirender.color import srgb_encode
+from unirender.color import eight_bits, srgb_encode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.tiles import refined
 from unirender_reference.shapes import MeshObject, Sphere
@@ -137,16 +137,12 @@ def texture_pixels(obj: MeshObject) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
     height, width = np.max([obj.roughness.shape, obj.metallic.shape], axis=0).tolist()
     roughness, metallic = (refined(plane[..., None], height, width) for plane in (obj.roughness, obj.metallic))
     pixels = {
-        "base_color": _bytes(srgb_encode(obj.albedo)),
-        "metallic_roughness": _bytes(np.concatenate([np.zeros_like(roughness), roughness, metallic], axis=-1)),
+        "base_color": eight_bits(srgb_encode(obj.albedo)),
+        "metallic_roughness": eight_bits(np.concatenate([np.zeros_like(roughness), roughness, metallic], axis=-1)),
     }
     if obj.normal_map is not None:
-        pixels["normal"] = _bytes((obj.normal_map + 1) / 2)
+        pixels["normal"] = eight_bits((obj.normal_map + 1) / 2)
     return pixels
-
-
-def _bytes(values: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
 def png_bytes(pixels: UInt8[np.ndarray, "h w *c"]) -> bytes:

@@ -17,7 +17,6 @@ from unirender.errors import UnirenderError
 from unirender_reference.optimize.descent import interpolation
 from unirender_reference.optimize.differences import difference_matrix, side_by_side
 
-POINTS = 8  # along each side of a cell, over which a map is averaged
 LEAST_SINE = 0.15  # of theta, in the weights of differences: columns meet at the poles
 
 
@@ -88,28 +87,6 @@ class LightGrid:
     def environment(self, cells: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "rows columns 3"]:
         """The cells as an environment map on Mitsuba's grid (which interpolates between texels)."""
         return cells.reshape(self.rows, self.columns, 3).astype(np.float32)
-
-    def averages(self, environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "j 3"]:
-        """Mean radiance of an environment map over each cell (midpoint rule, `POINTS` of them along each side)."""
-        height, width = environment.shape[:2]
-        upper, lower = self.cosines
-        part = (np.arange(POINTS) + 0.5) / POINTS
-        theta = np.arccos(np.clip(upper[:, None] + (lower - upper)[:, None] * part, -1, 1)).ravel()
-        y, x = (
-            theta / np.pi * (height - 1),
-            (np.arange(self.columns)[:, None] + part).ravel() / self.columns * width - 0.5,
-        )
-        top, left = np.clip(np.floor(y).astype(int), 0, height - 2), np.floor(x).astype(int)
-        down, right = (y - top)[:, None, None], (x - left)[None, :, None]
-
-        def texels(row: np.ndarray, column: np.ndarray) -> np.ndarray:
-            return environment[row][:, column % width]
-
-        above = texels(top, left) * (1 - right) + texels(top, left + 1) * right
-        below = texels(top + 1, left) * (1 - right) + texels(top + 1, left + 1) * right
-        fine = above * (1 - down) + below * down
-        blocks = fine.reshape(self.rows, POINTS, self.columns, POINTS, 3)
-        return blocks.mean(axis=(1, 3)).reshape(-1, 3).astype(np.float32)
 
 
 def interpolated_light(environment: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarray, "rows columns 3"]:

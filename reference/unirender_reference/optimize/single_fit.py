@@ -55,10 +55,6 @@ class Unknowns:
     metallic: float = 0.0
     roughness: float = 0.0
 
-    @property
-    def theta(self) -> Float[np.ndarray, " t"]:
-        return np.concatenate([self.light, self.gain, [self.metallic, self.roughness]])
-
 
 @dataclass(frozen=True)
 class Model:

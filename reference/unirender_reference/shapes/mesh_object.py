@@ -131,14 +131,10 @@ class MeshObject:
 
         return dataclasses.replace(self, vertices=turn(self.vertices), normals=turn(self.normals))
 
-    @property
-    def signed_volume(self) -> float:
-        """Volume enclosed by the faces; positive when they are oriented outwards."""
-        return signed_volume(self.vertices, self.faces)
-
 
 def signed_volume(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> float:
-    """Sum of the tetrahedra between the origin and each face (divergence theorem); exact for a closed mesh."""
+    """Volume enclosed by the faces, positive when they are oriented outwards: the sum of the tetrahedra between the
+    origin and each face (divergence theorem); exact for a closed mesh."""
     a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
 

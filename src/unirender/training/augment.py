@@ -15,12 +15,7 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exposure import draw_target
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import COLOUR_MAPS as COLOUR_MAPS
 from unirender.symmetries import LIGHT_MAPS, Maps
-from unirender.symmetries import mirror as mirror
-from unirender.symmetries import permute_channels as permute_channels
-from unirender.symmetries import quarter_turn as quarter_turn
-from unirender.symmetries import turn_rotation as turn_rotation
 from unirender.training.config import Augmentation
 from unirender.training.moving import ROLL_DEG, SHIFT, ZOOM, Move
 

@@ -21,17 +21,8 @@ from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import Maps, mirror, quarter_turn, scale_light
-from unirender.training.augment import (
-    DEFAULT_AUGMENTATION,
-    NO_AUGMENTATION,
-    Draw,
-    draw,
-    from_maps,
-    interpolate_metallic,
-    mix_lights,
-    permute_channels,
-)
+from unirender.symmetries import Maps, mirror, permute_channels, quarter_turn, scale_light
+from unirender.training.augment import Draw, draw, from_maps, interpolate_metallic, mix_lights
 from unirender.training.config import Augmentation
 from unirender.training.derived import DerivedLight, open_derived
 from unirender.training.groups import Pair, Shard, list_shards, open_packed, read_environments
@@ -290,4 +281,4 @@ def make_batch(
     return moved(batch, [draw.move for _, _, draw in drawn])
 
 
-__all__ = ["DEFAULT_AUGMENTATION", "NO_AUGMENTATION", "Augmentation", "Batch", "GroupDataset", "make_batch"]
+__all__ = ["Augmentation", "Batch", "GroupDataset", "make_batch"]

@@ -25,8 +25,8 @@ from unirender.color import LUMINANCE_REC709
 from unirender.errors import UnirenderError
 from unirender.exposure import MASK_THRESHOLD, PERCENTILE
 from unirender.models.priors import PRIORS
-from unirender.symmetries import LIGHT_MAPS
-from unirender.training.augment import COLOUR_MAPS, Draw, metallic_weights
+from unirender.symmetries import COLOUR_MAPS, LIGHT_MAPS
+from unirender.training.augment import Draw, metallic_weights
 from unirender.training.data import DERIVED_MAPS, Batch, GroupDataset
 from unirender.training.groups import SCALAR_CHANNELS, Pair
 from unirender.training.moving import moved

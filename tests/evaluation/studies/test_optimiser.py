@@ -21,7 +21,6 @@ from unirender_evaluation.multiview.scoring import score_solution
 from unirender_evaluation.multiview.tables import PROTOCOL
 from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import UNPRINTED
-from unirender_evaluation.studies.cells import signed
 from unirender_evaluation.studies.folder import open_folder
 from unirender_evaluation.studies.optimiser.commands import BenchIngredients
 from unirender_evaluation.studies.optimiser.ingredients import (
@@ -52,6 +51,7 @@ from unirender_evaluation.studies.optimiser.tables import (
     to_json,
     to_markdown,
 )
+from unirender_evaluation.table_formats import signed
 from unirender_evaluation.versions import OPTIMIZER, Versions
 
 OWN = "studies/optimiser/measure"

@@ -1,5 +1,6 @@
 """`unirender bench training`: rows that differ in one thing, trained once, scored in pairs, continued."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from unirender_evaluation.studies.training import run as training_run
 from unirender_evaluation.studies.training.choices import BASE_PRESET, PLAIN, Choice, training_choices
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.training.run import TrainingStudy, run
-from unirender_evaluation.studies.training.tables import COLUMNS, cells, table
+from unirender_evaluation.studies.training.tables import COLUMNS, cells, table, to_json
 
 pytestmark = pytest.mark.long
 
@@ -125,6 +126,20 @@ def test_differences_are_paired_by_scene() -> None:
     text = table(ROWS, made).markdown()
     assert "Chance: another seed" in text
     assert "**+1.00" in text
+
+
+def test_the_file_of_one_object_is_strict_json() -> None:
+    """Two scenes of it have a difference without an interval, which is null; it was NaN, which is no JSON."""
+    keys = [column.key(DEFAULT_VARIANT) for column in COLUMNS]
+    rows = (Choice(PLAIN, "", "Plain", TRAIN), Choice("seed", "seed", "Another seed", TRAIN))
+    made = [
+        Record("t", "validation", row.name, scene, "object", dict.fromkeys(keys, 1.0), f"{row.name}{scene}")
+        for row in rows
+        for scene in "ab"
+    ]
+    content = json.loads(to_json(rows, made, {}), parse_constant=pytest.fail)
+    cell = content["rows"]["seed"]["cells"][keys[0]]
+    assert cell["difference"] == {"mean": 0.0, "low": None, "high": None, "n": 2, "objects": 1}
 
 
 @pytest.mark.parametrize("option", [{"steps": 0}, {"scenes": 0}, {"batch_size": 0}, {"seed": -1}])

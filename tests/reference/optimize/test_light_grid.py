@@ -1,4 +1,4 @@
-"""The light's cells: areas, directions, averages."""
+"""The light's cells: areas, directions, differences."""
 
 import numpy as np
 import pytest
@@ -39,26 +39,6 @@ def test_one_bright_texel_is_one_bright_cell() -> None:
     looking.wi = -towards
     radiance = np.array(light.eval(looking)).T[:, 0]
     assert int(radiance.argmax()) == 3 * GRID.columns + 5
-
-
-def test_averages_keep_the_light() -> None:
-    """The integral over the sphere; a constant light is constant; the twin weights rows evenly and does not."""
-    rng = np.random.default_rng(1)
-    fine = rng.random((64, 128, 3)).astype(np.float32) ** 4
-    theta = np.pi * np.arange(64) / 63
-    weight = np.sin(theta)
-    cells = GRID.averages(fine).reshape(GRID.rows, GRID.columns, 3)
-    mean = (fine.mean(axis=1) * weight[:, None]).sum(axis=0) / weight.sum()
-    ours = (cells.mean(axis=1) * GRID.solid_angles[:, None]).sum(axis=0) / GRID.solid_angles.sum()
-    np.testing.assert_allclose(ours, mean, rtol=0.02)
-    np.testing.assert_allclose(GRID.averages(np.full((16, 32, 3), 0.7, np.float32)), 0.7, rtol=1e-5)
-    slope = np.broadcast_to(np.linspace(0, 1, 64)[:, None, None], (64, 128, 3)).astype(np.float32) ** 4
-    even = GRID.averages(slope).reshape(GRID.rows, -1).mean()
-    weighed = (
-        GRID.averages(slope).reshape(GRID.rows, -1).mean(axis=1) * GRID.solid_angles
-    ).sum() / GRID.solid_angles.sum()
-    truth = (slope[:, 0, 0] * weight).sum() / weight.sum()
-    assert abs(weighed - truth) < 0.01 < abs(even - truth)
 
 
 def test_differences_vanish_for_a_constant_light_only() -> None:

@@ -51,7 +51,7 @@ def problem():
     middle = fit.seen.sums @ position[:, 1] / (fit.seen.sums @ np.ones(len(points), np.float32))
     base = np.where(middle[patch][:, None] > 0, [[0.6, 0.2, 0.1]], [[0.1, 0.3, 0.5]]).astype(np.float32)
     count = len(points)
-    cells = GRID.averages(cases.coarse_light(1)) * 0.6
+    cells = cases.averages(GRID, cases.coarse_light(1)) * 0.6
     truth = Appearance(np.log(cells), np.full(count, 0.35), np.full(count, 0.3))
     return points, made(points, fit, base, truth), truth, base
 

@@ -3,10 +3,10 @@
 from rich.console import Console
 
 from unirender_evaluation.records import Record
-from unirender_evaluation.studies.about import code_digest, line, today
+from unirender_evaluation.studies.about import code_digest, today
 from unirender_evaluation.studies.derived_light.measure import DerivedLight, measure, methods, settings
 from unirender_evaluation.studies.derived_light.tables import table, to_json
-from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.versions import installed_version
 
@@ -31,8 +31,7 @@ def run(what: DerivedLight, console: Console) -> list[Record]:
             "code": code_digest(what.code),
             "date": today(),
         }
-        below = line({name: about[name] for name in ("resolution", "mitsuba", "code", "date")})
-        write_files(what.out, {f"{NAME}.md": f"{made.markdown()}\n{below}", f"{NAME}.json": to_json(records, about)})
-        made.show(console)
-        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        counts = f"{computed} new records of {len(records)}"
+        below = {name: about[name] for name in ("resolution", "mitsuba", "code", "date")}
+        write_study(what.out / NAME, [made], below, to_json(records, about), counts, console)
         return records

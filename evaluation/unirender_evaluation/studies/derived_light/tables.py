@@ -21,6 +21,7 @@ from unirender_evaluation.studies.derived_light.measure import (
     TRUTH,
     roughness_of,
 )
+from unirender_evaluation.table_formats import json_text
 from unirender_evaluation.table_text import TextTable
 
 AIM_DB = 35.0
@@ -113,4 +114,4 @@ def to_json(records: Sequence[Record], about: Mapping[str, object]) -> str:
         for question in dict.fromkeys(record.protocol for record in records)
     }
     content = {"run": dict(about), "median_psnr_db": medians, "records": every}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text(content)

@@ -1,7 +1,6 @@
 """The race as a table, as JSON and as a picture."""
 
 import io
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -9,6 +8,7 @@ from dataclasses import asdict
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.studies.optimiser.curves import Finish, finish, geometric_mean
 from unirender_evaluation.studies.optimiser.race import ObjectRace
+from unirender_evaluation.table_formats import json_text
 from unirender_evaluation.table_text import TextTable
 
 TITLES = (
@@ -84,7 +84,7 @@ def to_json(races: Sequence[ObjectRace], protocol: Sequence[tuple[str, str]]) ->
             for race, end in zip(races, found, strict=True)
         ],
     }
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text(content)
 
 
 def draw(races: Sequence[ObjectRace]) -> bytes:

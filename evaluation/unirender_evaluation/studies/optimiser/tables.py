@@ -1,11 +1,8 @@
 """The table of ingredients: means over objects and paired differences from the full method, as texts and as JSON."""
 
-import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
-from typing import Any
 
 from rich.console import Console
 
@@ -15,10 +12,10 @@ from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
-from unirender_evaluation.statistics import CONFIDENCE, METHOD, Estimate, paired_difference, unprinted_note
-from unirender_evaluation.studies.cells import Cell, cell_text
+from unirender_evaluation.statistics import CONFIDENCE, METHOD, paired_difference, unprinted_note
+from unirender_evaluation.studies.cells import Cell, as_json, cell_text
 from unirender_evaluation.studies.optimiser.ingredients import FULL, GROUPS, Ingredient, changes
-from unirender_evaluation.table_formats import header
+from unirender_evaluation.table_formats import header, json_text
 from unirender_evaluation.table_text import TextTable
 
 LEFT_OUT = ("ssim", "lpips_vgg", "lpips_alex", "peak_deg")  # columns of the multi-view table that the study has not
@@ -146,7 +143,7 @@ def to_json(lines: Sequence[Line], records: Sequence[Record], protocol: Sequence
                 key: {
                     "mean": cell.mean,
                     "n": cell.n,
-                    "difference": _estimate(cell.difference),
+                    "difference": as_json(cell.difference),
                     "objects": {
                         record.object: record.values[key] for record in records if record.method == line.row.name
                     },
@@ -157,10 +154,4 @@ def to_json(lines: Sequence[Line], records: Sequence[Record], protocol: Sequence
         for line in lines
     ]
     content = {"protocol": dict([*protocol, interval()]), "full": asdict(full.row.config), "rows": rows}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _estimate(estimate: Estimate | None) -> dict[str, Any] | None:
-    if estimate is None:
-        return None
-    return {name: None if math.isnan(value) else value for name, value in asdict(estimate).items()}
+    return json_text(content)

@@ -1,7 +1,6 @@
 """The tables of the sampling study: figures by steps and samples, and calibration by map."""
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -9,10 +8,10 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
-from unirender_evaluation.studies.cells import study_column
+from unirender_evaluation.studies.cells import as_json, study_column
 from unirender_evaluation.studies.sampling.calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Setting
-from unirender_evaluation.table_formats import MISSING, estimate_text, format_number, header, json_number
+from unirender_evaluation.table_formats import MISSING, estimate_text, format_number, header, json_number, json_text
 from unirender_evaluation.table_text import TextTable
 
 DIGITS = 3
@@ -142,7 +141,7 @@ def to_json(records: Sequence[Record], settings: Sequence[Setting], protocol: Pr
     """Strict JSON: protocol, means with intervals, calibration of every setting with a spread."""
     quality = {
         setting.key: {
-            column.key(DEFAULT_VARIANT): _plain(estimate(records, setting.key, column.key(DEFAULT_VARIANT)))
+            column.key(DEFAULT_VARIANT): as_json(estimate(records, setting.key, column.key(DEFAULT_VARIANT)))
             for column in COLUMNS
         }
         for setting in settings
@@ -153,7 +152,7 @@ def to_json(records: Sequence[Record], settings: Sequence[Setting], protocol: Pr
         if found:
             calibration[setting.key] = {
                 name: _pooled(pool(one))
-                | {key: _plain(estimate(records, setting.key, f"{name}.spread.{key}")) for key in ("coverage", "rank")}
+                | {key: as_json(estimate(records, setting.key, f"{name}.spread.{key}")) for key in ("coverage", "rank")}
                 for name, one in found.items()
             }
     content = {
@@ -162,7 +161,7 @@ def to_json(records: Sequence[Record], settings: Sequence[Setting], protocol: Pr
         "quality": quality,
         "calibration": calibration,
     }
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text(content)
 
 
 def _scenes(records: Sequence[Record]) -> int:
@@ -171,10 +170,3 @@ def _scenes(records: Sequence[Record]) -> int:
 
 def _pooled(pooled: Pooled) -> dict[str, Any]:
     return asdict(pooled) | {"ratio": json_number(pooled.ratio)}
-
-
-def _plain(found: Estimate | None) -> Mapping[str, float | str | int | None] | None:
-    if found is None:
-        return None
-    values = {"mean": found.mean, "low": found.low, "high": found.high}
-    return {name: json_number(value) for name, value in values.items()} | {"n": found.n, "objects": found.clusters}

@@ -1,6 +1,5 @@
 """A run of `unirender bench speed`: measures part by part, prints each as it is there, writes."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.speed.parts import PartName
 from unirender_evaluation.studies.speed.timing import Part
+from unirender_evaluation.table_formats import json_text
 
 NAME = "speed"
 
@@ -49,4 +49,4 @@ def to_markdown(parts: Sequence[Part], protocol: Sequence[tuple[str, str]]) -> s
 def to_json(parts: Sequence[Part], protocol: Sequence[tuple[str, str]]) -> str:
     """Strict JSON of every part."""
     content = {"protocol": dict(protocol), **{part.name: part.data for part in parts}}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text(content)

@@ -19,8 +19,8 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.store import Store, content_key
-from unirender_evaluation.studies.about import description, line
-from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.about import description
+from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.training import tables
 from unirender_evaluation.studies.training.choices import BASE_PRESET, Choice
 from unirender_evaluation.suites import Scene, Suite
@@ -176,8 +176,7 @@ def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], c
             batch=f"{rows[0].config.batch_size}",
             torch=str(installed_version("torch")),
         )
-        text = f"{table.markdown()}\n{line(about)}"
-        write_files(study.out, {f"{NAME}.md": text, f"{NAME}.json": tables.to_json(rows, records, about)})
-        table.show(console)
-        console.print(f"{computed} new records of {len(records)}; {study.out / NAME}.md, .json", highlight=False)
+        counts = f"{computed} new records of {len(records)}"
+        content = tables.to_json(rows, records, about)
+        write_study(study.out / NAME, [table], about, content, counts, console)
         return records

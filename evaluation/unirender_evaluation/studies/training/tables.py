@@ -10,9 +10,9 @@ from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import INTERVAL, paired_difference, unprinted_note
-from unirender_evaluation.studies.cells import Cell, cell_text, study_column
+from unirender_evaluation.studies.cells import Cell, as_json, cell_text, study_column
 from unirender_evaluation.studies.training.choices import PLAIN, QUESTIONS, Choice
-from unirender_evaluation.table_formats import header
+from unirender_evaluation.table_formats import header, json_text
 from unirender_evaluation.table_text import TextTable
 
 COLUMNS = (
@@ -70,15 +70,11 @@ def to_json(rows: Sequence[Choice], records: Sequence[Record], run: Mapping[str,
             "label": row.label,
             "config": asdict(row.config),
             "cells": {
-                c.key(DEFAULT_VARIANT): {"mean": cell.mean, "n": cell.n, "difference": _estimate(cell)}
+                c.key(DEFAULT_VARIANT): {"mean": cell.mean, "n": cell.n, "difference": as_json(cell.difference)}
                 for c, cell in zip(COLUMNS, cells(records, row.name), strict=True)
             },
         }
         for row in rows
     }
     every = [json.loads(record.to_json()) for record in records]
-    return json.dumps({"run": dict(run), "rows": lines, "records": every}, indent=1, ensure_ascii=False) + "\n"
-
-
-def _estimate(cell: Cell) -> dict[str, float | int] | None:
-    return None if cell.difference is None else asdict(cell.difference)
+    return json_text({"run": dict(run), "rows": lines, "records": every})

@@ -8,8 +8,8 @@ from rich.console import Console
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
 from unirender_evaluation.stratification import Material
-from unirender_evaluation.studies.about import description, line
-from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.about import description
+from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
 from unirender_evaluation.suites import Scene
@@ -44,12 +44,9 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
                 computed += new
         made = tables.tables(records, names, what.settings)
         about = description(what.suite, what.code)
-        lines = [*(table.markdown() for table in made), line(about)]
+        counts = f"{computed} new records of {len(records)}"
         content = tables.to_json(records, names, about)
-        write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
-        for table in made:
-            table.show(console)
-        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        write_study(what.out / NAME, made, about, content, counts, console)
         return records
 
 

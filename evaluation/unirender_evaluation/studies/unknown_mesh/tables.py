@@ -11,8 +11,9 @@ from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
+from unirender_evaluation.studies.cells import as_json
 from unirender_evaluation.studies.unknown_mesh.scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
-from unirender_evaluation.table_formats import estimate_text, format_number, header, json_number
+from unirender_evaluation.table_formats import estimate_text, format_number, header, json_text
 from unirender_evaluation.table_text import TextTable
 from unirender_reference.multiview import ELEVATIONS_DEG
 
@@ -142,14 +143,8 @@ def to_json(records: Sequence[Record], names: Mapping[str, str], run: Mapping[st
         key = column.key(DEFAULT_VARIANT)
         values = [record.values[key] for record in records if key in record.values]
         if values:
-            found = mean_estimate(values)
-            means[key] = {
-                "mean": json_number(found.mean),
-                "low": json_number(found.low),
-                "high": json_number(found.high),
-                "n": found.n,
-            }
+            means[key] = as_json(mean_estimate(values))
     aims = [{"name": aim.name, "key": aim.column.key(DEFAULT_VARIANT), "bound": aim.bound} for aim in AIMS]
     objects = [{"name": names[record.sample], **json.loads(record.to_json())} for record in records]
     content = {"run": dict(run), "aims": aims, "mean": means, "objects": objects}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json_text(content)

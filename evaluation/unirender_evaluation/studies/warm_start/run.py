@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 
 from unirender_evaluation.records import Record
-from unirender_evaluation.studies.about import description, line
-from unirender_evaluation.studies.folder import open_folder, write_files
+from unirender_evaluation.studies.about import description
+from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.studies.warm_start import tables
 from unirender_evaluation.studies.warm_start.measure import WarmStart, measure
@@ -44,10 +44,7 @@ def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Reco
         made = tables.tables(records, what.geometries)
         prediction = f"{what.base.name} {what.base.config.get('weights', '')[:12]}".strip()
         about = description(what.suite, what.code, prediction=prediction)
-        lines = [*(table.markdown() for table in made), line(about)]
+        counts = f"{computed} new records of {len(records)}"
         content = tables.to_json(records, what.geometries, about)
-        write_files(what.out, {f"{NAME}.md": "\n".join(lines), f"{NAME}.json": content})
-        for table in made:
-            table.show(console)
-        console.print(f"{computed} new records of {len(records)}; {what.out / NAME}.md, .json", highlight=False)
+        write_study(what.out / NAME, made, about, content, counts, console)
         return records

@@ -7,13 +7,14 @@ from typing import Any
 
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
-from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, Metric
+from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference
+from unirender_evaluation.studies.cells import as_json, study_column
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, STEPS, WARM
-from unirender_evaluation.table_formats import format_estimate, format_number, header
+from unirender_evaluation.table_formats import format_estimate, header, json_text, signed
 from unirender_evaluation.table_text import TextTable
 
 TITLES = {
@@ -25,23 +26,19 @@ LABELS = {COLD: "cold", WARM: "warm", PREDICTION: "prediction alone"}
 PAIRS = ((WARM, COLD), (WARM, PREDICTION))
 
 
-def _column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
-    return Column(group, quantity, METRICS[metric] if isinstance(metric, str) else metric, overrides, published=False)
-
-
 COLUMNS = (
-    _column("albedo", "albedo", "psnr"),
-    _column("albedo (aligned)", "albedo", "psnr", scale="aligned"),
-    _column("roughness", "roughness", "mse"),
-    _column("metallic", "metallic", "mse"),
-    _column("light", "environment", SCALED_LOG_RMSE),
-    _column("light", "environment", PEAK_ANGLE),
-    _column("normal", "normal", "cosine"),
-    _column("relit", "relit", "psnr"),
-    _column("relit (aligned)", "relit", "psnr", scale="aligned"),
-    _column("fit", "fit", "psnr"),
-    _column("", "time", STEPS),
-    _column("", "time", SECONDS),
+    study_column("albedo", "albedo", "psnr"),
+    study_column("albedo (aligned)", "albedo", "psnr", scale="aligned"),
+    study_column("roughness", "roughness", "mse"),
+    study_column("metallic", "metallic", "mse"),
+    study_column("light", "environment", SCALED_LOG_RMSE),
+    study_column("light", "environment", PEAK_ANGLE),
+    study_column("normal", "normal", "cosine"),
+    study_column("relit", "relit", "psnr"),
+    study_column("relit (aligned)", "relit", "psnr", scale="aligned"),
+    study_column("fit", "fit", "psnr"),
+    study_column("", "time", STEPS),
+    study_column("", "time", SECONDS),
 )
 
 
@@ -102,12 +99,8 @@ def _difference(records: Sequence[Record], a: str, b: str, column: Column) -> st
     found, digits = difference(records, a, b, column), column.metric.decimals
     if found is None:
         return "-"
-    interval = "" if math.isnan(found.low) else f" [{_signed(found.low, digits)}, {_signed(found.high, digits)}]"
-    return f"{_signed(found.mean, digits)}{interval}"
-
-
-def _signed(value: float, digits: int) -> str:
-    return f"{round(value, digits) + 0.0:+.{digits}f}"  # + 0.0: no minus before a rounded 0
+    interval = "" if math.isnan(found.low) else f" [{signed(found.low, digits)}, {signed(found.high, digits)}]"
+    return f"{signed(found.mean, digits)}{interval}"
 
 
 def mean(records: Sequence[Record], method: str, column: Column) -> Estimate | None:
@@ -128,22 +121,11 @@ def to_json(records: Sequence[Record], geometries: Sequence[str], run: Mapping[s
     blocks = {}
     for geometry in geometries:
         own = block(records, geometry)
-        means = {method: {c.key(DEFAULT_VARIANT): _plain(mean(own, method, c)) for c in COLUMNS} for method in LABELS}
+        means = {method: {c.key(DEFAULT_VARIANT): as_json(mean(own, method, c)) for c in COLUMNS} for method in LABELS}
         pairs = {
-            f"{a} - {b}": {c.key(DEFAULT_VARIANT): _plain(difference(own, a, b, c)) for c in COLUMNS} for a, b in PAIRS
+            f"{a} - {b}": {c.key(DEFAULT_VARIANT): as_json(difference(own, a, b, c)) for c in COLUMNS} for a, b in PAIRS
         }
         blocks[geometry] = {"mean": means, "difference": pairs}
     every = [json.loads(record.to_json()) for record in records]
     content = {"run": dict(run), "geometries": blocks, "records": every}
-    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _plain(found: Estimate | None) -> dict[str, float | str | int | None] | None:
-    if found is None:
-        return None
-    values = {"mean": found.mean, "low": found.low, "high": found.high}
-    texts = {
-        name: None if math.isnan(value) else value if math.isfinite(value) else format_number(value, 0)
-        for name, value in values.items()
-    }
-    return {**texts, "n": found.n, "objects": found.clusters}
+    return json_text(content)
