@@ -22,12 +22,12 @@ from unirender.files import (
     META_FILE,
     SUMMARY_FILE,
     new_folder,
-    write_png,
     write_result,
 )
 from unirender.intrinsics import MAPS
 from unirender.paths import forget_half_made
 from unirender.pictures import Picture, checked_file
+from unirender.visualization import write_png
 from unirender.whole_files import replace_file
 
 if TYPE_CHECKING:

@@ -24,8 +24,9 @@ from unirender.color import srgb_decode, srgb_encode, unpremultiply
 from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
-from unirender.files import new_folder, write_png
+from unirender.files import new_folder
 from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
+from unirender.visualization import write_png
 from unirender_reference.meshes.images import area_means
 from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
 from unirender_reference.optimize.views import SATURATED, View, Views

@@ -16,8 +16,8 @@ from rich.console import Console
 from unirender import cli
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
-from unirender.files import write_png
 from unirender.intrinsics import Intrinsics
+from unirender.visualization import write_png
 from unirender_evaluation.methods import InputAsAlbedo
 from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.prediction_check import PredictionError
