@@ -10,7 +10,8 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
-from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.composite_methods import Composite
+from unirender_evaluation.methods import Image
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics.questions import rough_loop, true_maps
