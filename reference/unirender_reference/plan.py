@@ -7,8 +7,8 @@ Roughness and metallic are whole percents, since they stand in member names.
 |---|---|
 | basis | L lights x R roughness values x metallic {0, 50, 100}; every mixture of lights and metallic follows exactly |
 | independent | every pair has its own light and material; with `materials="maps"` its own light |
-| one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's) |
-| paper | 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
+| one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's contribution) |
+| paper | the paper's Sec. 3.3, 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
 | sweep | the same 121 pairs under one light |
 | visibility | no pictures and no lights: which directions the object hides from itself (`visibility`) |
 

@@ -1,6 +1,7 @@
 """The differentiable shader: one surface point per pixel, one bounce of light.
 
 The radiance that leaves pixel x towards the viewer along v, with normal n and the principled BSDF f of the pixel, is
+the rendering equation (paper Eq. 1) under a distant light E:
 
     L(x) = integral of f(l, v) E(l) V(x, l) max(n . l, 0) dl
 
