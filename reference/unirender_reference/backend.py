@@ -8,6 +8,7 @@ AVX-512 machines ("Cannot select fminimum"), so the library is chosen here, befo
 Call `mitsuba()` instead of importing mitsuba.
 """
 
+import contextlib
 import ctypes.util
 import importlib.metadata
 import importlib.util
@@ -193,6 +194,22 @@ def set_threads(count: int) -> None:
     import drjit
 
     drjit.set_thread_count(count)
+
+
+@contextlib.contextmanager
+def renderer_threads(count: int) -> Iterator[None]:
+    """Dr.Jit works with this many threads until the block is left; 0: with as many as before."""
+    mitsuba()
+    import drjit
+
+    before = drjit.thread_count()
+    if count:
+        drjit.set_thread_count(count)
+    try:
+        yield
+    finally:
+        if count:
+            drjit.set_thread_count(before)
 
 
 def doctor() -> list[tuple[str, str, str]]:

@@ -7,13 +7,14 @@ as far as the renderer is: `docs/optimization.md` says how far.
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from unirender.arguments import as_instance, as_path
 from unirender.errors import UnirenderError
 from unirender.whole_files import file_sha256
+from unirender_reference.backend import renderer_threads
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
@@ -115,24 +116,6 @@ def _written(folder: RunFolder, pictures: bool) -> bool:
 def _is(path: Path, sha256: str) -> bool:
     """Whether a file is there with the content of that hash."""
     return path.is_file() and file_sha256(path) == sha256
-
-
-@contextlib.contextmanager
-def renderer_threads(count: int) -> Iterator[None]:
-    """Lets Dr.Jit work with this many threads; 0: as it is."""
-    from unirender_reference.backend import mitsuba
-
-    mitsuba()
-    import drjit as dr
-
-    before = dr.thread_count()
-    if count:
-        dr.set_thread_count(count)
-    try:
-        yield
-    finally:
-        if count:
-            dr.set_thread_count(before)
 
 
 def _plan(obj: MeshObject | None, init: Solution | None, config: OptimizeConfig) -> list[str]:
