@@ -1,7 +1,7 @@
 """The presets: one table, a row per model. Torch-free, so that the command line can show and change them quickly.
 
-`paper` is the recipe of the supplement, "Model Training"; `tiny` trains on two CPU cores. Ablations (paper Sec. 4.3) are
-rows, not forks.
+`paper` is the recipe of the supplement, "Model Training"; `tiny` trains on two CPU cores. Ablations (paper
+Sec. 4.3) are rows, not forks.
 """
 
 import dataclasses
