@@ -79,21 +79,40 @@ class Run:
         return key_of
 
 
+@dataclass(frozen=True)
+class _Setup:
+    """What a process of this machine needs to make a `Run` like the caller's; it pickles.
+
+    Attributes:
+        build: makes the rows, which have to have these `configs`, by their keys.
+        suite: path of its TOML file.
+        scenes: their keys.
+        versions, backbones, pictures, subsets: as in `Run`.
+        known: content keys of records that are there.
+        notes: folder in which each process says what it has under way.
+    """
+
+    build: Callable[[], Sequence[Row]]
+    configs: Mapping[str, Any]
+    suite: Path
+    scenes: tuple[str, ...]
+    versions: Versions
+    backbones: tuple[str, ...]
+    pictures: Path
+    subsets: Subsets
+    known: frozenset[str]
+    notes: Path
+
+    def run(self) -> Run:
+        suite, rows = load_suite(self.suite), same_rows(self.build(), self.configs)
+        scenes = [suite.scene(key) for key in self.scenes]
+        return Run(suite, rows, scenes, self.versions, self.backbones, self.pictures, self.subsets)
+
+
 _here: tuple[Run, frozenset[str], Path] | UnirenderError | None = None  # with the file that says what is under way
 
 
-def _start(
-    build: Callable[[], Sequence[Row]],
-    suite: Path,
-    scenes: list[str],
-    versions: Versions,
-    backbones: tuple[str, ...],
-    pictures: Path,
-    subsets: Subsets,
-    known: frozenset[str],
-    notes: Path,
-    configs: Mapping[str, Any],
-) -> None:
+def _start(setup: _Setup) -> None:
     import threadpoolctl
     import torch
 
@@ -103,13 +122,12 @@ def _start(
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
     set_threads(1)  # nor do renders of 64 px
     try:
-        loaded, rows = load_suite(suite), same_rows(build(), configs)
+        run = setup.run()
     except UnirenderError as error:  # is raised by the first task: a pool says nothing of what its beginning raises
         _here = error
         return
-    run = Run(loaded, rows, [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     threadpoolctl.threadpool_limits(1)  # nor do numpy's products, and those of what a row has imported
-    _here = run, known, notes / str(os.getpid())
+    _here = run, setup.known, setup.notes / str(os.getpid())
 
 
 def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
@@ -160,20 +178,19 @@ def run_in_workers(
         UnirenderError: a worker process died, or could not make the rows; what a row raises comes as it is.
     """
     with tempfile.TemporaryDirectory() as folder:
-        notes = Path(folder)
-        arguments = (
-            build,
-            run.suite.spec.path,
-            [scene.key for scene in run.scenes],
-            run.versions,
-            run.backbones,
-            run.pictures,
-            run.subsets,
-            known,
-            notes,
-            {row.info.key: row.config for row in run.rows},
+        setup = _Setup(
+            build=build,
+            configs={row.info.key: row.config for row in run.rows},
+            suite=run.suite.spec.path,
+            scenes=tuple(scene.key for scene in run.scenes),
+            versions=run.versions,
+            backbones=run.backbones,
+            pictures=run.pictures,
+            subsets=run.subsets,
+            known=known,
+            notes=Path(folder),
         )
-        with WorkerPool(jobs, _start, *arguments) as pool:
+        with WorkerPool(jobs, _start, setup) as pool:
             futures = [pool.submit(_scene, scene.key) for scene in scenes]
             try:
                 for future in as_completed(futures):
@@ -182,12 +199,17 @@ def run_in_workers(
                     if error is not None:
                         raise error
             except BrokenProcessPool as error:
-                said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
-                raise UnirenderError(
-                    "a worker process died: above is why, if it could not start; else perhaps for want of memory"
-                    f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, "
-                    "with fewer --jobs"
-                ) from error
+                raise _died(setup.notes) from error
+
+
+def _died(notes: Path) -> UnirenderError:
+    """What is said of a process that died, with what each had under way."""
+    said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
+    return UnirenderError(
+        "a worker process died: above is why, if it could not start; else perhaps for want of memory"
+        f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, with fewer "
+        "--jobs"
+    )
 
 
 @dataclass(frozen=True)
