@@ -190,7 +190,7 @@ def read_picture_file(path: Path, *, upright: bool = True) -> PictureFile:
     picture = read_picture(path, upright=upright)
     for remark in picture.remarks.values():
         _log.warning("%s: %s", path, remark)
-    return PictureFile(picture.image_srgb, picture.mask, False, picture.camera)
+    return PictureFile(picture.image_srgb, picture.mask, linear=False, camera=picture.camera)
 
 
 def _linear_picture(path: Path) -> PictureFile:
@@ -207,7 +207,8 @@ def _linear_picture(path: Path) -> PictureFile:
         _log.warning("%s: %.1g%% of the radiance is negative and was set to 0", path, 100 * negative)
         rgb = np.maximum(rgb, 0)
     mask = None if alpha is None else check_mask(alpha[..., None], f"{path} ({name})")
-    return PictureFile(rgb if mask is None else unpremultiply(rgb, mask), mask, True, header_camera(attributes))
+    straight = rgb if mask is None else unpremultiply(rgb, mask)
+    return PictureFile(straight, mask, linear=True, camera=header_camera(attributes))
 
 
 def reduced(view: View, longest_side: int, linear: bool) -> View:

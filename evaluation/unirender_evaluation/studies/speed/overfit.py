@@ -155,7 +155,7 @@ def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype:
         def look(pipeline: Any) -> dict[str, Score]:
             found = both_directions(pipeline, pair)
             points.append(Point(trainer.seconds / 60, trainer.step * config.batch_size, found))
-            return {name: Score(value, True) for name, value in found.items()}
+            return {name: Score(value, higher_is_better=True) for name, value in found.items()}
 
         trainer.fit(FixedSource(batch), validate=look)
     return points
