@@ -35,6 +35,7 @@ from unirender_evaluation.metrics import (
 
 Rgb = Float[np.ndarray, "h w 3"]
 Weights = Float[np.ndarray, "h w 1"]
+COLOURS = ("albedo", "specular", "diffuse")
 MATERIALS = ("roughness", "metallic")
 SAME_MASK = 1 / 255  # largest difference of a mask that was stored in 8 bits, whether rounded or cut off
 
@@ -67,11 +68,10 @@ def score_maps(
     values: dict[str, float] = {}
     if own is not w:
         values[OWN_MASK] = float(np.minimum(own, w).sum() / np.maximum(own, w).sum())
-    colours = [
-        (name, p, t) for name in ("albedo", "specular", "diffuse") if (p := getattr(prediction, name)) is not None
-        and (t := getattr(truth, name)) is not None
-    ]  # fmt: skip
-    for name, p, t in colours:
+    for name in COLOURS:
+        p, t = getattr(prediction, name), getattr(truth, name)
+        if p is None or t is None:
+            continue
         _check_shapes(name, p, t)
         values |= score_colour(name, p, t, w, own, SCALES, lpips, lpips_scales)
         for scale in SCALES:

@@ -136,6 +136,7 @@ def plan_groups(config: DatasetConfig) -> Plan:
 
 
 def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lights]]:
+    """The groups of one object: what all pairs of a group share, and its lights with their materials."""
     rng = np.random.default_rng(derive_seed(config.seed, "plan", config.split, config.vary, index))
     if config.materials == "maps":
         lights = [_light(rng, ()) for _ in range(config.pairs)]
