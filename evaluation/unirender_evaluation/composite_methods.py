@@ -12,7 +12,7 @@ from unirender.camera import Camera
 from unirender.composite import composite_image, split_sum_image
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light, specular_light
-from unirender_evaluation.methods import Image, Mask, constant_map, seen_linear
+from unirender_evaluation.methods import Image, Mask, seen_linear, uniform_map
 
 
 def with_derived_light(intrinsics: Intrinsics) -> Intrinsics:
@@ -71,9 +71,9 @@ def set_material(intrinsics: Intrinsics, roughness: float | None, metallic: floa
     mask = intrinsics.require("mask")["mask"]
     edited = intrinsics
     if metallic is not None:
-        edited = edited.replace(metallic=constant_map(mask, metallic))
+        edited = edited.replace(metallic=uniform_map(mask, metallic))
     if roughness is not None:
-        target = constant_map(mask, roughness)
+        target = uniform_map(mask, roughness)
         edited = edited.replace(roughness=target, specular=specular_for_roughness(intrinsics, target)[0])
     return edited
 

@@ -90,6 +90,6 @@ def seen_linear(image_srgb: Image, mask: Mask) -> Image:
     return (srgb_decode(image_srgb) * mask).astype(np.float32)
 
 
-def constant_map(mask: Mask, value: Any) -> Float[np.ndarray, "h w c"]:
+def uniform_map(mask: Mask, value: Any) -> Float[np.ndarray, "h w c"]:
     """The same value in every covered pixel, 0 elsewhere."""
     return ((mask > 0) * np.asarray(value, np.float32)).astype(np.float32)

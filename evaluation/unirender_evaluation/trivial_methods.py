@@ -12,7 +12,7 @@ import numpy as np
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import Image, Mask, constant_map, seen_linear
+from unirender_evaluation.methods import Image, Mask, seen_linear, uniform_map
 from unirender_evaluation.training_statistics import training_statistics
 
 
@@ -50,7 +50,7 @@ class MeanAlbedo:
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
         albedo = srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32))
-        return Intrinsics(albedo=constant_map(mask, albedo), mask=mask, camera=camera)
+        return Intrinsics(albedo=uniform_map(mask, albedo), mask=mask, camera=camera)
 
 
 class MeanNormal:
@@ -63,7 +63,7 @@ class MeanNormal:
         return {"trivial": "mean-normal", "normal": training_statistics()["normal"]}
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
-        return Intrinsics(normal=constant_map(mask, training_statistics()["normal"]), mask=mask, camera=camera)
+        return Intrinsics(normal=uniform_map(mask, training_statistics()["normal"]), mask=mask, camera=camera)
 
 
 class SphereNormal:
@@ -93,5 +93,5 @@ class ConstantMaterial:
     config: Mapping[str, Any] = MappingProxyType({"trivial": "constant", "value": 0.5})
 
     def decompose(self, image_srgb: Image, mask: Mask, camera: Camera) -> Intrinsics:
-        half = constant_map(mask, 0.5)
+        half = uniform_map(mask, 0.5)
         return Intrinsics(metallic=half, roughness=half, mask=mask, camera=camera)

@@ -26,7 +26,7 @@ from unirender_reference.dataset_config import (
     DEFAULT_OBJECTS,
     GRID,
     MAX_LIGHTS,
-    METALLIC_NODES,
+    METALLIC_PERCENTS,
     PERCENTS,
     DatasetConfig,
     basis_shape,
@@ -144,7 +144,7 @@ def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lig
             yield "object material", lights[start : start + MAX_LIGHTS]
     elif config.vary == "basis":
         count, levels = basis_shape(config.pairs)
-        materials = tuple((r, m) for r in _stratified(rng, levels) for m in METALLIC_NODES)
+        materials = tuple((r, m) for r in _stratified(rng, levels) for m in METALLIC_PERCENTS)
         yield "object", [_light(rng, materials) for _ in range(count)]
     elif config.vary == "sweep":
         yield "object light", [_light(rng, tuple((r, m) for m in GRID for r in GRID))]

@@ -18,7 +18,7 @@ from unirender_reference.backend import renderer_threads
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
-from unirender_reference.optimize.report import Progress, Report
+from unirender_reference.optimize.report import OnReport, Report
 from unirender_reference.optimize.result import write_result
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
@@ -39,7 +39,7 @@ def optimize(
     config: OptimizeConfig,
     out: str | Path | None = None,
     init: Solution | None = None,
-    progress: Progress | None = None,
+    progress: OnReport | None = None,
     place: Sphere | None = None,
     pictures: bool = True,
     threads: int = 0,
@@ -143,7 +143,7 @@ class _Run:
         views: Views,
         config: OptimizeConfig,
         folder: RunFolder | None,
-        show: Progress,
+        show: OnReport,
         plan: list[str],
         began: float | None = None,
     ) -> None:
