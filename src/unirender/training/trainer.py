@@ -42,7 +42,7 @@ from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
 from unirender.training.state import resume, state_of, write_config
-from unirender.training.stopping import stopping_gently
+from unirender.training.stopping import StopRequest, stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
 
@@ -179,12 +179,7 @@ class Trainer:
         begun, logged = self.step, (self.step, self.seconds)
         with stopping_gently() as request:
             while self.progress < 1:
-                start = time.monotonic()  # pictures, validation and saves are no training
-                batch = source.next()
-                self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
-                self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-                seconds = self.seconds + time.monotonic() - start
-                self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
+                refreshing, stopping = self._train_next(source, due, request)
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     with request.unheard():
                         self._tell_losses(*logged, report)
@@ -203,6 +198,16 @@ class Trainer:
             self.save(source)
         if self.step > begun or not self._picture_file.exists():  # which a kill after the last save has prevented
             self._look(self.shown, validation, report)
+
+    def _train_next(self, source: BatchSource, due: Due, request: StopRequest) -> tuple[bool, int | None]:
+        """One step and its seconds; whether process 0 has data to refresh, and the signal that asks it to stop."""
+        start = time.monotonic()  # pictures, validation and saves are no training
+        batch = source.next()
+        self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
+        self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
+        seconds = self.seconds + time.monotonic() - start
+        self.seconds, refreshing, stopping = self.processes.share((seconds, due("refresh"), request.signal))
+        return refreshing, stopping
 
     def _tell_losses(self, step: int, seconds: float, report: Report) -> None:
         """Logs the means of the losses, and the speed since a step and its seconds of training."""
