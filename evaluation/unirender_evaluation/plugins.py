@@ -145,8 +145,8 @@ def _needed(found: Any, given: Mapping[str, Any]) -> list[str]:
 def _value(text: str, annotation: Any, what: str) -> Any:
     """A text as the type of an annotation, None apart; as it is where there is no annotation."""
     united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    kinds = [kind for kind in united if kind is not NoneType]
-    kind = str if kinds == [inspect.Parameter.empty] else kinds[0] if len(kinds) == 1 else None
+    kinds = [str if kind is inspect.Parameter.empty else kind for kind in united if kind is not NoneType]
+    kind = kinds[0] if len(kinds) == 1 else None
     if kind is bool and text in BOOLEANS:
         return BOOLEANS[text]
     if kind in (int, float, str, Path):
