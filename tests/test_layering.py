@@ -38,6 +38,7 @@ VOCABULARY = {
         "surface_light",
         "symmetries",
         "vectors",
+        "visualization",
         "whole_files",
         "worker_pool",
         "writing",

@@ -29,6 +29,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from unirender.whole_files import replace_file
 from unirender_evaluation import bounds, subsets
 from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
+from unirender_evaluation.cluster_run import run_on_cluster
 from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.multiview.pictures import MultiviewPictures
 from unirender_evaluation.multiview.rows import multiview_jobs, multiview_rows
@@ -58,7 +59,7 @@ from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth import quality_summary
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import installed_version, versions
-from unirender_evaluation.workers import Run, run_in_workers, run_on_cluster
+from unirender_evaluation.workers import Run, run_in_workers
 from unirender_reference.folder_lock import locked, made_folder
 
 FEW = 100  # records: fewer are not worth starting processes

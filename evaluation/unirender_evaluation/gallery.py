@@ -160,9 +160,8 @@ def shown_width(gallery: Sequence[GalleryItem], limit: int = GALLERY_BYTES) -> i
     if not gallery:
         return SMALLEST
     width = max(item.mask.shape[1] for item in gallery)
-    count = sum(
-        len(item.given) + len(item.truth) + 2 * sum(map(len, item.predictions.values())) for item in gallery
-    )  # each prediction has its FLIP map
+    # Each prediction has its FLIP map.
+    count = sum(len(item.given) + len(item.truth) + 2 * sum(map(len, item.predictions.values())) for item in gallery)
     return min(width, max(SMALLEST, int(math.sqrt(limit / (BYTES_PER_PIXEL * count)))))
 
 

@@ -23,7 +23,7 @@ from unirender.lighting import (
 )
 from unirender_evaluation import metrics
 from unirender_evaluation.light_balls import ball_values
-from unirender_evaluation.metrics import LOG_EPSILON, Metric
+from unirender_evaluation.metrics import LOG_EPSILON, LOWER, Metric
 
 SHAPE = (16, 32)
 CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
@@ -36,7 +36,7 @@ SCALED_LOG_RMSE = Metric(
     "log_rmse_scaled",
     "log-RMSE",
     "",
-    False,
+    LOWER,
     0.0,
     (),
     3,
@@ -47,7 +47,7 @@ PEAK_ANGLE = Metric(
     "peak_deg",
     "angle",
     "deg",
-    False,
+    LOWER,
     0.0,
     (),
     0,

@@ -31,6 +31,7 @@ LPIPS_SCALES: tuple[Scale, ...] = ("raw",)  # those that runs compute: with othe
 
 SSIM_SIGMA, SSIM_TRUNCATE = 1.5, 3.5  # Wang et al. 2004: an 11 x 11 Gaussian window
 SSIM_K1, SSIM_K2 = 0.01, 0.03
+HIGHER, LOWER = True, False  # is better: `Metric.higher_is_better`, as tables of metrics say it
 LOG_EPSILON = 0.01  # added before the logarithm, display units: a hundredth of display white
 
 
@@ -125,21 +126,21 @@ _ALL = ("mask", "space", "scale")
 METRICS: dict[str, Metric] = {
     metric.name: metric
     for metric in (
-        Metric("psnr", "PSNR", "dB", True, math.inf, _ALL, 2, "-10 log10 MSE, peak 1, mean over images"),
-        Metric("ssim", "SSIM", "", True, 1.0, _ALL, 4, "Wang et al. 2004, Gaussian 11 x 11, sigma 1.5"),
-        Metric("lpips_vgg", "LPIPS-VGG", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
-        Metric("lpips_alex", "LPIPS-Alex", "", False, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
-        Metric("iou", "IoU", "", True, 1.0, (), 4, "sum of min(p, t) over sum of max(p, t), of masks"),
-        Metric("mse", "MSE", "", False, 0.0, ("mask",), 4, "mean squared error per pixel"),
-        Metric("mse_object", "MSE (object)", "", False, 0.0, (), 4, "squared difference of the in-mask means"),
-        Metric("cosine", "cos", "", True, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
-        Metric("angle_deg", "angle", "deg", False, 0.0, (), 1, "coverage-weighted mean angle between normals"),
-        Metric("away", "facing away", "", False, 0.0, (), 2, "share of the normals in the mask that face away"),
-        Metric("turned", "turned", "", False, 0.0, (), 2, "mean cosine that normals gain with another sign of x or y"),
-        Metric("decoded", "decoded", "dB", False, 0.0, (), 1, "masked sRGB PSNR that colours gain as display values"),
-        Metric("ciede2000", "CIEDE2000", "", False, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
-        Metric("log_rmse", "log-RMSE", "", False, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
-        Metric("rmse_relative", "error", "", False, 0.0, ("scale",), 3, "RMSE over the truth's mean, in mask, HDR"),
+        Metric("psnr", "PSNR", "dB", HIGHER, math.inf, _ALL, 2, "-10 log10 MSE, peak 1, mean over images"),
+        Metric("ssim", "SSIM", "", HIGHER, 1.0, _ALL, 4, "Wang et al. 2004, Gaussian 11 x 11, sigma 1.5"),
+        Metric("lpips_vgg", "LPIPS-VGG", "", LOWER, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
+        Metric("lpips_alex", "LPIPS-Alex", "", LOWER, 0.0, ("mask", "scale"), 4, "official v0.1; masked: pasted mask"),
+        Metric("iou", "IoU", "", HIGHER, 1.0, (), 4, "sum of min(p, t) over sum of max(p, t), of masks"),
+        Metric("mse", "MSE", "", LOWER, 0.0, ("mask",), 4, "mean squared error per pixel"),
+        Metric("mse_object", "MSE (object)", "", LOWER, 0.0, (), 4, "squared difference of the in-mask means"),
+        Metric("cosine", "cos", "", HIGHER, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
+        Metric("angle_deg", "angle", "deg", LOWER, 0.0, (), 1, "coverage-weighted mean angle between normals"),
+        Metric("away", "facing away", "", LOWER, 0.0, (), 2, "share of the normals in the mask that face away"),
+        Metric("turned", "turned", "", LOWER, 0.0, (), 2, "mean cosine that normals gain with another sign of x or y"),
+        Metric("decoded", "decoded", "dB", LOWER, 0.0, (), 1, "masked sRGB PSNR that colours gain as display values"),
+        Metric("ciede2000", "CIEDE2000", "", LOWER, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
+        Metric("log_rmse", "log-RMSE", "", LOWER, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
+        Metric("rmse_relative", "error", "", LOWER, 0.0, ("scale",), 3, "RMSE over the truth's mean, in mask, HDR"),
     )
 }
 

@@ -16,6 +16,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -27,6 +28,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.methods import CAPABILITIES, capabilities, check_method
 from unirender_evaluation.plugin_source import raised_in, shadowed, source_sha256
+from unirender_reference.backend import choose_llvm
 
 ENTRY_POINT_GROUP = "unirender.methods"
 FORM = "module:Class or path/to/file.py:Class"
@@ -145,8 +147,8 @@ def _needed(found: Any, given: Mapping[str, Any]) -> list[str]:
 def _value(text: str, annotation: Any, what: str) -> Any:
     """A text as the type of an annotation, None apart; as it is where there is no annotation."""
     united = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
-    kinds = [kind for kind in united if kind is not NoneType]
-    kind = str if kinds == [inspect.Parameter.empty] else kinds[0] if len(kinds) == 1 else None
+    kinds = [str if kind is inspect.Parameter.empty else kind for kind in united if kind is not NoneType]
+    kind = kinds[0] if len(kinds) == 1 else None
     if kind is bool and text in BOOLEANS:
         return BOOLEANS[text]
     if kind in (int, float, str, Path):
@@ -206,7 +208,12 @@ def _set_by(module: str) -> OwnDefaults:
 
 
 def _attempt(what: str, task: str, run: Callable[[], Any], defaults: OwnDefaults) -> Any:
-    """Runs foreign code under its own defaults; whatever it raises becomes one clear line."""
+    """Runs foreign code under its own defaults; whatever it raises becomes one clear line.
+
+    It may import Mitsuba before we do: what it loads then is what we render with.
+    """
+    with suppress(UnirenderError):  # without a usable LLVM our own rows say so
+        choose_llvm()
     try:
         with defaults.here():
             return run()

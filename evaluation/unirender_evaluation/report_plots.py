@@ -50,6 +50,7 @@ def strip_plots(specs: Mapping[str, TableSpec], records: Sequence[Record], run: 
 def _strip_plot(
     column: Column, values: Mapping[str, Mapping[str, float]], objects: Mapping[str, str], run: RunInfo
 ) -> dict[str, Any]:
+    """One strip for each row, best first: `values` by row and sample, `objects` by sample."""
     finite = [x for found in values.values() for x in found.values() if math.isfinite(x)] or [0.0]
     low, high = min(finite), max(finite)
     span = (high - low) or 1.0
@@ -127,6 +128,7 @@ class Scale:
 
 
 def _tile(table: Table, column: Column, i: int) -> dict[str, Any] | None:
+    """Where the best row of the leading kind stands in a column, the table's i-th; None without such a row."""
     metric = column.metric
     measured = [(row, cell) for row in table.rows if (cell := row.cells[i].measured) is not None]
     full = max((cell.n for _, cell in measured), default=0)
@@ -141,9 +143,10 @@ def _tile(table: Table, column: Column, i: int) -> dict[str, Any] | None:
         subset = FEW.format(cell.n) if cell.n < full else ""
         return f"{row.label} {format_number(cell.mean, metric.decimals)}{subset}"
 
-    ours, ceiling = next(filter(None, map(best, LEADING)), None), best("ceiling")
+    ours = next((found for kind in LEADING if (found := best(kind)) is not None), None)
     if ours is None:
         return None
+    ceiling = best("ceiling")
     end = metric.perfect if ceiling is None else ceiling[1].mean
     complete = [(row, cell) for row, cell in measured if cell.n == full and math.isfinite(cell.mean)] or [ours]
     lowest = [pair for pair in complete if pair[0].kind == "trivial"] or complete

@@ -11,28 +11,25 @@ import numpy as np
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.composite_methods import Composite, CompositeOf, ShadowedSplitSum, SplitSum
 from unirender_evaluation.decompositions import Decompositions
 from unirender_evaluation.kept_defaults import OwnDefaults
 from unirender_evaluation.light_methods import MeanLight, UniformLight
-from unirender_evaluation.methods import (
-    Composite,
-    CompositeOf,
-    ConstantMaterial,
-    InputAsAlbedo,
-    MeanAlbedo,
-    MeanNormal,
-    ShadowedSplitSum,
-    SphereNormal,
-    SplitSum,
-    UneditedInput,
-    capabilities,
-)
+from unirender_evaluation.methods import capabilities
 from unirender_evaluation.pipeline_method import PipelineMethod
 from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.predictions import PredictionFolder
 from unirender_evaluation.records import MethodInfo, MethodKind
 from unirender_evaluation.suites import Scene, material_key
 from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
+from unirender_evaluation.trivial_methods import (
+    ConstantMaterial,
+    InputAsAlbedo,
+    MeanAlbedo,
+    MeanNormal,
+    SphereNormal,
+    UneditedInput,
+)
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")

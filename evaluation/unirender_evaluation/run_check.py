@@ -89,7 +89,10 @@ def run_check(
     info = reference_row(check, here.scenes)
     records = _records(outcome, info, here)
     for record, scene in records:
-        store.add(record) if scene in here.scenes else store.lay_by(record)
+        if scene in here.scenes:
+            store.add(record)
+        else:
+            store.lay_by(record)
     check["records"] = {record.key: scene.key for record, scene in records}
     replace_file(request.path, json.dumps(check, indent=1) + "\n")
     return check

@@ -52,7 +52,6 @@ def score(
             backbone is unknown, or nothing is left to score; a picture
             or colour map is smaller than SSIM's window (11 pixels a side), or than what LPIPS takes (31).
     """
-    from unirender_evaluation.plausible import range_doubt
     from unirender_evaluation.scoring import score_image, score_maps
 
     variant = Variant.parse(protocol) if isinstance(protocol, str) else protocol
@@ -70,26 +69,33 @@ def score(
             raise UnirenderError("score: got maps and mask=, expected the coverage in the truth's own mask")
         values = score_maps(prediction, truth, **options)
     else:
-        if mask is None:
-            raise UnirenderError(
-                "score: pictures need mask=, the true coverage (h, w, 1); np.ones((h, w, 1)) where all of it counts"
-            )
-        p, t = _picture(prediction, "the prediction"), _picture(truth, "the truth")
-        if p.shape != t.shape:
-            raise UnirenderError(
-                f"score: got pictures of {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
-            )
-        found = _mask(mask, t)
-        usual = max(float(np.median(t[found[..., 0] > 0])), 1.0)
-        doubt = range_doubt(p, found, usual)
-        if doubt is not None and range_doubt(t, found, usual) is None:  # a truth of such values has other units, too
-            raise UnirenderError(f"score: the prediction is in other units than the truth: {doubt}; convert it")
-        values = score_image(p, t, found, quantity=quantity, **options)
+        values = score_image(*_checked_pictures(prediction, truth, mask), quantity=quantity, **options)
     chosen = values if variant is None else {key: value for key, value in values.items() if _is_of(key, variant)}
     if not chosen:
         what = "no map that both sides have" if not values else f"no value under {variant and variant.label}"
         raise UnirenderError(f"score: {what}, expected at least one number")
     return chosen
+
+
+def _checked_pictures(prediction: Any, truth: Any, mask: Any) -> tuple[Picture, Picture, Float[np.ndarray, "h w 1"]]:
+    """The two pictures, of one size and in the same units, and the true coverage."""
+    from unirender_evaluation.plausible import range_doubt
+
+    if mask is None:
+        raise UnirenderError(
+            "score: pictures need mask=, the true coverage (h, w, 1); np.ones((h, w, 1)) where all of it counts"
+        )
+    p, t = _picture(prediction, "the prediction"), _picture(truth, "the truth")
+    if p.shape != t.shape:
+        raise UnirenderError(
+            f"score: got pictures of {p.shape} and {t.shape}, expected the same (h, w, c); resample the prediction"
+        )
+    coverage = _mask(mask, t)
+    usual = max(float(np.median(t[coverage[..., 0] > 0])), 1.0)
+    doubt = range_doubt(p, coverage, usual)
+    if doubt is not None and range_doubt(t, coverage, usual) is None:  # a truth of such values has other units, too
+        raise UnirenderError(f"score: the prediction is in other units than the truth: {doubt}; convert it")
+    return p, t, coverage
 
 
 def _networks(backbones: Sequence[str]) -> "list[Lpips]":

@@ -35,6 +35,7 @@ from unirender_evaluation.metrics import (
 
 Rgb = Float[np.ndarray, "h w 3"]
 Weights = Float[np.ndarray, "h w 1"]
+COLOURS = ("albedo", "specular", "diffuse")
 MATERIALS = ("roughness", "metallic")
 SAME_MASK = 1 / 255  # largest difference of a mask that was stored in 8 bits, whether rounded or cut off
 
@@ -67,11 +68,10 @@ def score_maps(
     values: dict[str, float] = {}
     if own is not w:
         values[OWN_MASK] = float(np.minimum(own, w).sum() / np.maximum(own, w).sum())
-    colours = [
-        (name, p, t) for name in ("albedo", "specular", "diffuse") if (p := getattr(prediction, name)) is not None
-        and (t := getattr(truth, name)) is not None
-    ]  # fmt: skip
-    for name, p, t in colours:
+    for name in COLOURS:
+        p, t = getattr(prediction, name), getattr(truth, name)
+        if p is None or t is None:
+            continue
         _check_shapes(name, p, t)
         values |= score_colour(name, p, t, w, own, SCALES, lpips, lpips_scales)
         for scale in SCALES:
@@ -169,13 +169,23 @@ def score_colour(
             values[metric_key(quantity, "ssim", masked)] = metrics.weighted_mean(similarity_masked, w)
             values[metric_key(quantity, "ssim", whole)] = float(metrics.crop_border(similarity[in_whole]).mean())
         if space == "srgb":
-            chosen = [i for i, (_, scale) in enumerate(names) if scale in lpips_scales]
-            for network in lpips if chosen else ():
-                for i, distance in zip(chosen, network.distance(shown[chosen], shown_truth[None]), strict=True):
-                    for mask in MASKS if own is w else (names[i][0],):
-                        values[metric_key(quantity, network.metric, Variant(mask, space, names[i][1]))] = float(
-                            distance
-                        )
+            compared = {name: picture for name, picture in pictures.items() if name[1] in lpips_scales}
+            values |= _lpips_values(quantity, lpips, compared, shown_truth, pasted=own is w)
+    return values
+
+
+def _lpips_values(
+    quantity: str, networks: Sequence[Lpips], pictures: dict[tuple[Mask, Scale], Rgb], truth: Rgb, *, pasted: bool
+) -> dict[str, float]:
+    """LPIPS of display pictures over white; with the true mask `pasted` each is the masked and the whole one."""
+    values: dict[str, float] = {}
+    if not pictures:
+        return values
+    shown = np.stack(list(pictures.values()))
+    for network in networks:
+        for (own, scale), distance in zip(pictures, network.distance(shown, truth[None]), strict=True):
+            for mask in MASKS if pasted else (own,):
+                values[metric_key(quantity, network.metric, Variant(mask, "srgb", scale))] = float(distance)
     return values
 
 

@@ -16,7 +16,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.training.data import GroupDataset
 from unirender.training.groups import Pair
 from unirender.training.same_objects import object_of
-from unirender_evaluation.methods import ShadowedSplitSum
+from unirender_evaluation.composite_methods import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note

@@ -1,7 +1,8 @@
 """What the tables are: their columns, and the protocols under which a method may be asked.
 
-Names and columns are the paper's. A protocol says what a method is given; only the paper's own carries published values
-(`Protocol.published`), so that a method that was told more can never stand beside them.
+Names and columns are the paper's, whose Tables 1, 2 and 3 are `rendering`, `inverse` and `relighting`. A protocol says
+what a method is given; only the paper's own carries published values (`Protocol.published`), so that a method that was
+told more can never stand beside them.
 """
 
 import dataclasses
@@ -31,16 +32,19 @@ PROTOCOLS: dict[str, Protocol] = {
     protocol.key: protocol
     for protocol in (
         Protocol(
-            "from-image", "from the image", "one image and its mask; the method decomposes it, edits, renders", True
+            "from-image",
+            "from the image",
+            "one image and its mask; the method decomposes it, edits, renders",
+            published=True,
         ),
         Protocol("given", "given", "true maps and the true target light buffers s and d"),
         Protocol("given-light", "given light", "true maps and the HDRI, no light buffers"),
-        Protocol("single-image", "from the image", "one image and its mask", True),
+        Protocol("single-image", "from the image", "one image and its mask", published=True),
         Protocol(
             "from-image-sd",
             "from the image, target s and d given",
             "one image and its mask, and the target's true light buffers s and d",
-            True,
+            published=True,
         ),
         Protocol("from-image-hdri", "from the image, HDRI given", "one image and its mask, and the target's HDRI"),
         Protocol("light-from-image", "from the image", "one image and its mask", framed=False),
@@ -66,9 +70,7 @@ class Column:
     metric: Metric
     overrides: Mapping[str, str] = dataclasses.field(default_factory=dict)  # variant axes that the column pins
     published: bool = True  # whether the paper has this number
-    uniform_grid: float | None = (
-        None  # score of the constant 0.5 on the paper's uniform grid of 11 levels: for the dagger
-    )
+    uniform_grid: float | None = None  # what the constant 0.5 scores on the paper's grid of 11 levels: for the dagger
 
     def key(self, variant: Variant) -> str:
         """The metric key that the column shows under a variant."""

@@ -64,8 +64,9 @@ def _told(suite: "Suite") -> dict[str, Any]:
     spec, made, scene, members = suite.spec, suite.provenance, suite.scenes[0], set(suite.members)
     materials = [m for m in (spec.base, *spec.edits) if image_member(scene.key, m) in members]
     roughness = [r for r in spec.specular_roughness if specular_member(scene.key, r) in members]
-    named = {image_member(scene.key, m) for m in (*materials, *scene.materials)}
-    named |= {specular_member(scene.key, r) for r in (*roughness, *(r for _, r in (*materials, *scene.materials)))}
+    every = (*materials, *scene.materials)
+    named = {image_member(scene.key, m) for m in every}
+    named |= {specular_member(scene.key, r) for r in (*roughness, *(r for _, r in every))}
     others = sorted(name for name in members - named if name.startswith(f"{scene.key}."))
     more = {kind: [name for name in others if member_kind(name) == kind] for kind in ("image", "specular")}
     told = {

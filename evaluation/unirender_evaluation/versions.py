@@ -55,6 +55,7 @@ COMMANDS = (
     "*_commands",
     "bench_config",
     "benchmark",
+    "cluster_run",
     "commands",
     "crosscheck*",
     "dry_run",

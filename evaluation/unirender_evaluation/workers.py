@@ -1,24 +1,19 @@
-"""Runs a suite's scenes one by one, here or in worker processes that each build the rows for themselves.
+"""Runs a suite's scenes one by one, here or in worker processes of this machine, which build the rows for themselves.
 
-The processes are this machine's, or a cluster's (`unirender_reference.cluster`). Those of a cluster write nothing:
-records and pictures travel back, and the process that was started is the only writer.
+Those of a cluster: `cluster_run`.
 """
 
 import os
 import tempfile
-import time
-from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from uuid import uuid4
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
 from unirender.worker_pool import WorkerPool
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
@@ -30,10 +25,7 @@ from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.store import Job, content_key
 from unirender_evaluation.subsets import STANDARD, Subsets
 from unirender_evaluation.suites import Scene, Suite, load_suite
-from unirender_evaluation.versions import Versions, versions
-
-AHEAD = 2  # scenes under way on a cluster for each of its workers
-PAUSE = 0.1  # seconds between two looks at what is under way there; a scene takes many
+from unirender_evaluation.versions import Versions
 
 
 @dataclass
@@ -79,21 +71,40 @@ class Run:
         return key_of
 
 
+@dataclass(frozen=True)
+class _Setup:
+    """What a process of this machine needs to make a `Run` like the caller's; it pickles.
+
+    Attributes:
+        build: makes the rows, which have to have these `configs`, by their keys.
+        suite: path of its TOML file.
+        scenes: their keys.
+        versions, backbones, pictures, subsets: as in `Run`.
+        known: content keys of records that are there.
+        notes: folder in which each process says what it has under way.
+    """
+
+    build: Callable[[], Sequence[Row]]
+    configs: Mapping[str, Any]
+    suite: Path
+    scenes: tuple[str, ...]
+    versions: Versions
+    backbones: tuple[str, ...]
+    pictures: Path
+    subsets: Subsets
+    known: frozenset[str]
+    notes: Path
+
+    def run(self) -> Run:
+        suite, rows = load_suite(self.suite), same_rows(self.build(), self.configs)
+        scenes = [suite.scene(key) for key in self.scenes]
+        return Run(suite, rows, scenes, self.versions, self.backbones, self.pictures, self.subsets)
+
+
 _here: tuple[Run, frozenset[str], Path] | UnirenderError | None = None  # with the file that says what is under way
 
 
-def _start(
-    build: Callable[[], Sequence[Row]],
-    suite: Path,
-    scenes: list[str],
-    versions: Versions,
-    backbones: tuple[str, ...],
-    pictures: Path,
-    subsets: Subsets,
-    known: frozenset[str],
-    notes: Path,
-    configs: Mapping[str, Any],
-) -> None:
+def _start(setup: _Setup) -> None:
     import threadpoolctl
     import torch
 
@@ -103,13 +114,12 @@ def _start(
     torch.set_num_threads(1)  # a 64 px network gains nothing from a second thread, a second process does
     set_threads(1)  # nor do renders of 64 px
     try:
-        loaded, rows = load_suite(suite), same_rows(build(), configs)
+        run = setup.run()
     except UnirenderError as error:  # is raised by the first task: a pool says nothing of what its beginning raises
         _here = error
         return
-    run = Run(loaded, rows, [loaded.scene(key) for key in scenes], versions, backbones, pictures, subsets)
     threadpoolctl.threadpool_limits(1)  # nor do numpy's products, and those of what a row has imported
-    _here = run, known, notes / str(os.getpid())
+    _here = run, setup.known, setup.notes / str(os.getpid())
 
 
 def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
@@ -160,20 +170,19 @@ def run_in_workers(
         UnirenderError: a worker process died, or could not make the rows; what a row raises comes as it is.
     """
     with tempfile.TemporaryDirectory() as folder:
-        notes = Path(folder)
-        arguments = (
-            build,
-            run.suite.spec.path,
-            [scene.key for scene in run.scenes],
-            run.versions,
-            run.backbones,
-            run.pictures,
-            run.subsets,
-            known,
-            notes,
-            {row.info.key: row.config for row in run.rows},
+        setup = _Setup(
+            build=build,
+            configs={row.info.key: row.config for row in run.rows},
+            suite=run.suite.spec.path,
+            scenes=tuple(scene.key for scene in run.scenes),
+            versions=run.versions,
+            backbones=run.backbones,
+            pictures=run.pictures,
+            subsets=run.subsets,
+            known=known,
+            notes=Path(folder),
         )
-        with WorkerPool(jobs, _start, *arguments) as pool:
+        with WorkerPool(jobs, _start, setup) as pool:
             futures = [pool.submit(_scene, scene.key) for scene in scenes]
             try:
                 for future in as_completed(futures):
@@ -182,116 +191,14 @@ def run_in_workers(
                     if error is not None:
                         raise error
             except BrokenProcessPool as error:
-                said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
-                raise UnirenderError(
-                    "a worker process died: above is why, if it could not start; else perhaps for want of memory"
-                    f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, "
-                    "with fewer --jobs"
-                ) from error
+                raise _died(setup.notes) from error
 
 
-@dataclass(frozen=True)
-class Order:
-    """What a cluster's worker needs to make a `Run` like the caller's; it pickles.
-
-    Attributes:
-        name: of the run: a worker that has made it keeps it.
-        build: makes the rows; paths in it are absolute.
-        suite: name of a bundled suite, or absolute path of its TOML file.
-        suite_sha256: of its truth.
-        scenes, versions, backbones, subsets: as in `Run`.
-    """
-
-    name: str
-    build: Callable[[], Sequence[Row]]
-    suite: str
-    suite_sha256: str
-    scenes: tuple[str, ...]
-    versions: Versions
-    backbones: tuple[str, ...]
-    subsets: Subsets
-
-    @classmethod
-    def of(cls, run: Run, build: Callable[[], Sequence[Row]], suite: str) -> "Order":
-        """The order for a run."""
-        keys = tuple(scene.key for scene in run.scenes)
-        return cls(uuid4().hex, build, suite, run.suite.sha256, keys, run.versions, run.backbones, run.subsets)
-
-    def make(self) -> Run:
-        """The run, in a worker; its pictures have no folder yet.
-
-        Raises:
-            UnirenderError: other code or another suite than the caller's, or rows that cannot be made here.
-        """
-        import torch
-
-        if versions(self.backbones) != self.versions:
-            raise UnirenderError("cluster: a worker has other code than this machine; install the same on all machines")
-        suite = load_suite(self.suite)
-        if suite.sha256 != self.suite_sha256:
-            raise UnirenderError(f"cluster: a worker has another truth of {self.suite}; copy the file to all machines")
-        torch.set_num_threads(1)
-        scenes = [suite.scene(key) for key in self.scenes]
-        return Run(suite, self.build(), scenes, self.versions, self.backbones, Path(), self.subsets)
-
-
-_made: dict[str, Run] = {}  # at most one run, by the name of its order
-
-
-def cluster_scene(order: Order, scene: str, wanted: frozenset[str]) -> tuple[list[Record], dict[str, bytes]]:
-    """The records of a scene that have the wanted content keys, and the pictures that belong to them, by file name.
-
-    Raises:
-        UnirenderError: this worker's methods, suite or code are others than those of who asks.
-    """
-    if order.name not in _made:
-        _made.clear()
-        _made[order.name] = order.make()
-    with tempfile.TemporaryDirectory() as folder:
-        run = replace(_made[order.name], pictures=Path(folder))
-        records = [job.make() for job in run.jobs(run.suite.scene(scene)) if job.key in wanted]
-        if missing := len(wanted - {record.key for record in records}):
-            raise UnirenderError(
-                f"cluster: a worker does not know {missing} of the records of {scene}: it has other methods than this "
-                "machine; install the same on all machines, and name files by absolute paths"
-            )
-        return records, {path.name: path.read_bytes() for path in Path(folder).iterdir()}
-
-
-def run_on_cluster(
-    run: Run, build: Callable[[], Sequence[Row]], suite: str, wanted: Mapping[str, frozenset[str]], address: str
-) -> Generator[list[Record], None, None]:
-    """Records of scenes from a cluster's workers, a scene at a time as they come; pictures are written here.
-
-    Args:
-        run: what the run is.
-        build: makes the rows in each worker.
-        suite: see `Order`.
-        wanted: scene -> content keys of its records.
-        address: see `unirender_reference.cluster.connect`.
-
-    Raises:
-        UnirenderError: as `connect`; a worker cannot do it, or several died over a scene.
-    """
-    from unirender_reference.cluster import connect
-
-    order = Order.of(run, build, suite)
-    with connect(address) as executor:
-        under_way: list[Any] = []
-        waiting = deque(wanted.items())
-        while waiting or under_way:
-            while waiting and len(under_way) < AHEAD * max(executor.workers, 1):
-                under_way.append(executor.submit(cluster_scene, order, *waiting.popleft()))
-            records, pictures = _take_done(under_way).result()
-            for name, data in pictures.items():
-                replace_file(run.pictures / name, data)
-            yield records
-
-
-def _take_done(under_way: list[Any]) -> Any:
-    """Removes the first future that is done, after waiting for one: a slow scene holds up no other."""
-    while True:
-        for place, future in enumerate(under_way):
-            if future.done():
-                return under_way.pop(place)
-        time.sleep(PAUSE)
+def _died(notes: Path) -> UnirenderError:
+    """What is said of a process that died, with what each had under way."""
+    said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
+    return UnirenderError(
+        "a worker process died: above is why, if it could not start; else perhaps for want of memory"
+        f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, with fewer "
+        "--jobs"
+    )

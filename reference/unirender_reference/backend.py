@@ -8,6 +8,7 @@ AVX-512 machines ("Cannot select fminimum"), so the library is chosen here, befo
 Call `mitsuba()` instead of importing mitsuba.
 """
 
+import contextlib
 import ctypes.util
 import importlib.metadata
 import importlib.util
@@ -101,6 +102,15 @@ def find_llvm() -> LlvmLibrary:
     )
 
 
+def choose_llvm() -> None:
+    """Has Dr.Jit load the library of `find_llvm`. To be called before anybody imports drjit or mitsuba, which load one.
+
+    Raises:
+        UnirenderError: as `find_llvm`.
+    """
+    os.environ[LLVM_VARIABLE] = str(find_llvm().path)
+
+
 def llvm_major(path: Path) -> int:
     """Major version of a libLLVM: from its name (`libLLVM.so.23.1`, `libLLVM-14.so.1`), or asked of it; 0: unknown."""
     match = re.search(r"libLLVM(?:-(\d+)|\.so\.(\d+)|\.(\d+)\.dylib)", path.resolve().name)
@@ -157,8 +167,8 @@ def mitsuba(variant: str | None = None) -> Any:
         return module
     if importlib.util.find_spec("mitsuba") is None:
         raise UnirenderError("mitsuba: not installed, expected mitsuba >= 3.9; `pip install mitsuba`")
-    try:  # whatever the variant: importing drjit already loads the library
-        os.environ[LLVM_VARIABLE] = str(find_llvm().path)
+    try:  # whatever the variant
+        choose_llvm()
     except UnirenderError:
         if name.startswith("llvm"):
             raise
@@ -193,6 +203,22 @@ def set_threads(count: int) -> None:
     import drjit
 
     drjit.set_thread_count(count)
+
+
+@contextlib.contextmanager
+def renderer_threads(count: int) -> Iterator[None]:
+    """Dr.Jit works with this many threads until the block is left; 0: with as many as before."""
+    mitsuba()
+    import drjit
+
+    before = drjit.thread_count()
+    if count:
+        drjit.set_thread_count(count)
+    try:
+        yield
+    finally:
+        if count:
+            drjit.set_thread_count(before)
 
 
 def doctor() -> list[tuple[str, str, str]]:

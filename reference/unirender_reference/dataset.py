@@ -110,8 +110,7 @@ def _generate(
     start: float,
     verify: bool,
 ) -> GenerateReport:
-    shards = {shard_name(i // SHARD_GROUPS): range(i, i + SHARD_GROUPS) for i in range(0, len(plan), SHARD_GROUPS)}
-    shards = {name: part[: len(plan) - part.start] for name, part in shards.items()}
+    shards = _shards(len(plan))
     header: dict[str, Any] = {"config": content, "versions": versions(config.denoise)}
     if unreadable := _unreadable_folders(plan):
         header["unreadable"] = [{"file": failure.file, "reason": failure.reason} for failure in unreadable]
@@ -157,6 +156,12 @@ def _generate(
         workers=workers,
         manifest_sha256=manifest_sha256,
     )
+
+
+def _shards(groups: int) -> dict[str, range]:
+    """The name of each shard, and the numbers of its groups; the last one may have fewer."""
+    starts = range(0, groups, SHARD_GROUPS)
+    return {shard_name(i // SHARD_GROUPS): range(i, min(i + SHARD_GROUPS, groups)) for i in starts}
 
 
 def _report(

@@ -15,7 +15,7 @@ Vary = Literal["basis", "independent", "one-at-a-time", "paper", "sweep", "visib
 Materials = Literal["scalar", "maps"]
 Split = Literal["train", "test"]
 MAX_LIGHTS = 8
-METALLIC_NODES = (0, 50, 100)
+METALLIC_PERCENTS = (0, 50, 100)
 PERCENTS = 101  # 0 .. 100
 MAX_TILT_DEG = 20.0  # of turned objects
 GRID = tuple(range(0, PERCENTS, 10))
@@ -192,11 +192,11 @@ def basis_shape(pairs: int) -> tuple[int, int]:
     Raises:
         UnirenderError: `pairs` has no such form with at most `MAX_LIGHTS` lights.
     """
-    product = pairs // len(METALLIC_NODES)
+    product = pairs // len(METALLIC_PERCENTS)
     shapes = [
         (lights, product // lights)
         for lights in range(1, MAX_LIGHTS + 1)
-        if pairs % len(METALLIC_NODES) == 0 and product and product % lights == 0 and lights >= product // lights
+        if pairs % len(METALLIC_PERCENTS) == 0 and product and product % lights == 0 and lights >= product // lights
     ]
     if not shapes:
         raise UnirenderError(

@@ -149,7 +149,7 @@ def _direct_samples(scene: Any, sampler: Any, ray: Any, active: Any) -> tuple[An
     hit = active & surface.is_valid()
     bsdf, context, sky = surface.bsdf(ray), mi.BSDFContext(), scene.environment()
 
-    towards, light = scene.sample_emitter_direction(surface, sampler.next_2d(hit), False, hit)
+    towards, light = scene.sample_emitter_direction(surface, sampler.next_2d(hit), test_visibility=False, active=hit)
     lit = hit & (towards.pdf != 0)
     value, density = bsdf.eval_pdf(context, surface, surface.to_local(towards.d), lit)
     by_light = dr.select(lit, value * light * _power_heuristic(towards.pdf, density), 0)

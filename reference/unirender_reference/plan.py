@@ -7,8 +7,8 @@ Roughness and metallic are whole percents, since they stand in member names.
 |---|---|
 | basis | L lights x R roughness values x metallic {0, 50, 100}; every mixture of lights and metallic follows exactly |
 | independent | every pair has its own light and material; with `materials="maps"` its own light |
-| one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's) |
-| paper | 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
+| one-at-a-time | three kinds of groups that share all but one of light, material, object (the paper's contribution) |
+| paper | the paper's Sec. 3.3, 121 pairs: metallic and roughness on the grid {0, 10 .. 100} percent, a light each |
 | sweep | the same 121 pairs under one light |
 | visibility | no pictures and no lights: which directions the object hides from itself (`visibility`) |
 
@@ -26,7 +26,7 @@ from unirender_reference.dataset_config import (
     DEFAULT_OBJECTS,
     GRID,
     MAX_LIGHTS,
-    METALLIC_NODES,
+    METALLIC_PERCENTS,
     PERCENTS,
     DatasetConfig,
     basis_shape,
@@ -136,6 +136,7 @@ def plan_groups(config: DatasetConfig) -> Plan:
 
 
 def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lights]]:
+    """The groups of one object: what all pairs of a group share, and its lights with their materials."""
     rng = np.random.default_rng(derive_seed(config.seed, "plan", config.split, config.vary, index))
     if config.materials == "maps":
         lights = [_light(rng, ()) for _ in range(config.pairs)]
@@ -143,7 +144,7 @@ def _object_groups(config: DatasetConfig, index: int) -> Iterator[tuple[str, Lig
             yield "object material", lights[start : start + MAX_LIGHTS]
     elif config.vary == "basis":
         count, levels = basis_shape(config.pairs)
-        materials = tuple((r, m) for r in _stratified(rng, levels) for m in METALLIC_NODES)
+        materials = tuple((r, m) for r in _stratified(rng, levels) for m in METALLIC_PERCENTS)
         yield "object", [_light(rng, materials) for _ in range(count)]
     elif config.vary == "sweep":
         yield "object light", [_light(rng, tuple((r, m) for m in GRID for r in GRID))]

@@ -5,6 +5,8 @@ variance: `passes`. What belongs to the surface (base colour, normal, ...): `geo
 
     image   path tracing at `depth` (4: three bounces), premultiplied RGBA, the environment hidden behind the object
     s, d    direct light only (depth 2) on the mirror-tinted and on the white Lambertian surface
+
+All are estimates of the rendering equation (paper Eq. 1), of whose bounces `depth` keeps the first ones.
 """
 
 import functools

@@ -39,15 +39,36 @@ def finished_shards(
     """
     for stale in folder.glob(".*.part"):
         stale.unlink(missing_ok=True)
-    path = folder / MANIFEST
-    if not path.exists():
-        there = sorted(tar.name for tar in folder.glob("*.tar"))
-        if there and not (there == [shard_name(0)] and _is_rendered(folder / there[0])):
-            raise UnirenderError(
-                f"{folder}: has {there[0]} and no {MANIFEST}, so that it may be anybody's and is not overwritten; "
-                "choose another --out, or move the .tar files away"
-            )
+    if not (folder / MANIFEST).exists():
+        _check_unlisted(folder)
         return {}, False
+    listed = _listed(folder, header)
+    records = listed | _journal(folder / JOURNAL)
+    _check_surplus(folder, records, sizes, of_files=bool(header["config"].get("meshes")))
+    hashed = set(records if verify else sorted(records)[-HASHED:])
+    finished = {
+        record.name: record
+        for record in records.values()
+        if record.planned == sizes[record.name]
+        and record.is_final
+        and _is_whole(folder / record.name, record, hashed=record.name in hashed)
+    }
+    return finished, any(finished.get(name) != record for name, record in listed.items())
+
+
+def _check_unlisted(folder: Path) -> None:
+    """Refuses shards without a manifest, but for the first one of a run that was killed before it wrote any."""
+    there = sorted(tar.name for tar in folder.glob("*.tar"))
+    if there and not (there == [shard_name(0)] and _is_rendered(folder / there[0])):
+        raise UnirenderError(
+            f"{folder}: has {there[0]} and no {MANIFEST}, so that it may be anybody's and is not overwritten; "
+            "choose another --out, or move the .tar files away"
+        )
+
+
+def _listed(folder: Path, header: Mapping[str, Any]) -> dict[str, ShardRecord]:
+    """The records of the manifest; refuses one of another data set, or made with other versions."""
+    path = folder / MANIFEST
     try:
         content = json.loads(path.read_text())
         listed = {record.name: record for record in map(parse_record, content["shards"])}
@@ -60,9 +81,15 @@ def finished_shards(
         keys = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         differs = ", ".join(f"{key} {found.get(key)!s:.16} instead of {wanted.get(key)!s:.16}" for key in keys)
         raise UnirenderError(f"{folder}: holds a data set with {differs}; choose another --out or delete it")
-    records = listed | _journal(folder / JOURNAL)
+    return listed
+
+
+def _check_surplus(
+    folder: Path, records: Mapping[str, ShardRecord], sizes: Mapping[str, int], *, of_files: bool
+) -> None:
+    """Refuses shards that hold more groups than are asked for; `of_files`: the objects are files of the user's."""
     surplus = sorted(record.name for record in records.values() if record.planned > sizes.get(record.name, 0))
-    if surplus and wanted.get("meshes"):
+    if surplus and of_files:
         raise UnirenderError(
             f"{folder}: {surplus[0]} was made of more mesh files than --meshes has now, expected at least as many: was "
             "one removed, or --objects lowered? Put it back, or choose another --out"
@@ -72,15 +99,6 @@ def finished_shards(
             f"{folder}: already holds more objects ({surplus[0]}), expected at most as many as asked for; "
             "raise --objects or choose another --out"
         )
-    hashed = set(records if verify else sorted(records)[-HASHED:])
-    finished = {
-        record.name: record
-        for record in records.values()
-        if record.planned == sizes[record.name]
-        and record.is_final
-        and _is_whole(folder / record.name, record, hashed=record.name in hashed)
-    }
-    return finished, any(finished.get(name) != record for name, record in listed.items())
 
 
 def _is_rendered(path: Path) -> bool:

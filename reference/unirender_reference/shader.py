@@ -1,6 +1,7 @@
 """The differentiable shader: one surface point per pixel, one bounce of light.
 
 The radiance that leaves pixel x towards the viewer along v, with normal n and the principled BSDF f of the pixel, is
+the rendering equation (paper Eq. 1) under a distant light E:
 
     L(x) = integral of f(l, v) E(l) V(x, l) max(n . l, 0) dl
 
@@ -176,7 +177,7 @@ class Shader:
             corner = mi.Point2f(mi.Float(column), mi.Float(row))
             position = (corner + sampler.next_2d()) / mi.Point2f(self.width, self.height)
             ray, _ = self._scene.sensors()[0].sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
-            hit = self._scene.ray_intersect(ray, mi.RayFlags.Minimal, True)
+            hit = self._scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=True)
             traced = hit.is_valid()
             found = dr.gather(mi.Float, dr.block_sum(mi.Float(traced), spp), index)
             share = dr.select(found > 0, dr.select(traced, dr.rcp(found), 0.0), share)

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from unirender.errors import UnirenderError
 from unirender.whole_files import file_sha256
@@ -142,20 +142,11 @@ def write_shard(path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -
     Raises:
         UnirenderError: a key has a dot (WebDataset cuts there: groups would merge) or occurs twice, or the disk fails.
     """
-    seen: set[str] = set()
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
         try:
             with os.fdopen(handle, "wb") as stream:
-                with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-                    for key, members in groups:
-                        if "." in key or key in seen:
-                            raise UnirenderError(f"{path}: group key {key!r}, expected a new key without dots")
-                        seen.add(key)
-                        for name, data in members.items():
-                            info = tarfile.TarInfo(f"{key}.{name}")
-                            info.size, info.mode, info.mtime = len(data), 0o644, 0
-                            tar.addfile(info, io.BytesIO(data))
+                _write_tar(stream, path, groups)
                 stream.flush()
                 os.fsync(stream.fileno())
             sha256 = file_sha256(Path(temporary))
@@ -170,6 +161,20 @@ def write_shard(path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -
             f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
         ) from error
     return sha256
+
+
+def _write_tar(stream: IO[bytes], path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
+    """The groups as a tar whose bytes depend on nothing else; `path` is for errors."""
+    seen: set[str] = set()
+    with tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for key, members in groups:
+            if "." in key or key in seen:
+                raise UnirenderError(f"{path}: group key {key!r}, expected a new key without dots")
+            seen.add(key)
+            for name, data in members.items():
+                info = tarfile.TarInfo(f"{key}.{name}")
+                info.size, info.mode, info.mtime = len(data), 0o644, 0
+                tar.addfile(info, io.BytesIO(data))
 
 
 def write_manifest(folder: Path, header: Mapping[str, Any], shards: Iterable[ShardRecord], *, complete: bool) -> str:

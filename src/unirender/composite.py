@@ -2,9 +2,10 @@
 
     I = (1 - metallic) * albedo * d + F(albedo, metallic) * s,    F = 0.04 * (1 - metallic) + albedo * metallic
 
-It leaves out interreflection, the angle in the Fresnel term and the retro-reflection of the principled diffuse lobe:
-about 4 % of a pixel's radiance. The functions are plain arithmetic and take numpy arrays and torch tensors alike, as
-long as single-channel maps broadcast against three-channel ones.
+It stands for the rendering equation (paper Eq. 1): d and s are its integral over the light for two surfaces that know
+neither albedo nor metallic, which weigh them here. It leaves out interreflection, the angle in the Fresnel term and the
+retro-reflection of the principled diffuse lobe: about 4 % of a pixel's radiance. The functions are plain arithmetic and
+take numpy arrays and torch tensors alike, as long as single-channel maps broadcast against three-channel ones.
 
 The *split-sum* composite (numpy only) puts the angle back. Schlick's reflectance is F0 + (1 - F0)(1 - v.h)^5; its mean
 over the lobe, by the environment-BRDF terms A and B of Karis ("Real Shading in Unreal Engine 4", 2013), is

@@ -14,18 +14,15 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Float
 
-from unirender.arguments import as_floats, as_instance, as_path
-from unirender.blocks import by_rows
+from unirender.arguments import as_instance, as_path
 from unirender.camera import DEFAULT_FOV_DEG, Camera
-from unirender.color import eight_bits, image_srgb, unpremultiply
+from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
     CAMERA_ATTRIBUTE,
@@ -40,17 +37,16 @@ from unirender.exr import (
     write_environment,
     write_exr,
 )
-from unirender.intrinsics import IMAGE_MAPS, MAPS, Intrinsics
+from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender.paths import forget_half_made
-from unirender.vectors import nonzero
+from unirender.visualization import map_picture as map_picture  # known by this name, too
+from unirender.visualization import write_map_png, write_png
 from unirender.whole_files import move_into_place, naming
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 SUMMARY_FILE = "summary.json"  # of a folder of results
 
 FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
-
-PNG_STRATEGY = 3  # zlib's Z_RLE: a fifth of the time of what Pillow takes; of noisy pictures files up to a fifth larger
 
 LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
 
@@ -143,42 +139,6 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
     yield folder
 
 
-def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
-    """Display values in [0, 1], 1, 3 or 4 channels, as an 8-bit PNG.
-
-    Raises:
-        UnirenderError: no such values, or no path.
-    """
-    values = as_floats(values, "picture")
-    if values.ndim != 3 or values.shape[-1] not in (1, 3, 4):
-        raise UnirenderError(f"picture: got shape {values.shape}, expected (height, width, 1, 3 or 4)")
-    _save_png(as_path(path), by_rows(eight_bits, values))
-
-
-def _save_png(path: str | Path, pixels: UInt8[np.ndarray, "h w c"]) -> None:
-    grey = pixels.shape[-1] == 1
-    Image.fromarray(pixels[..., 0] if grey else pixels).save(path, format="PNG", compress_type=PNG_STRATEGY)
-
-
-def map_picture(name: str, value: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
-    """A map as people look at it: colours and light through sRGB, normals as (n + 1) / 2, the others as they are.
-
-    Raises:
-        UnirenderError: there is no map of that name, or it is of no numbers.
-    """
-    if name not in MAPS:
-        raise UnirenderError(f"map: got {name!r:.60}, expected one of {', '.join(MAPS)}")
-    value = as_floats(value, name)
-    if name == "normal":
-        return np.where(nonzero(value)[..., None], value * 0.5 + 0.5, 0)
-    return value if name in ("roughness", "metallic", "mask") else image_srgb(value)
-
-
-def _shown(name: str, value: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
-    """The pixels of a map's picture."""
-    return eight_bits(map_picture(name, value))
-
-
 def write_result(
     folder: Path,
     intrinsics: Intrinsics | None,
@@ -211,7 +171,7 @@ def write_result(
         if intrinsics.environment is not None:
             write_environment(folder / ENVIRONMENT_FILE, intrinsics.environment, attributes)
         for name, value in intrinsics.maps.items():
-            _save_png(folder / f"{name}.png", by_rows(partial(_shown, name), value))
+            write_map_png(folder / f"{name}.png", name, value)
     if image_linear is not None:
         mask = None if intrinsics is None else intrinsics.mask
         rgba = image_linear if mask is None else np.concatenate([image_linear, mask], axis=-1)

@@ -22,12 +22,12 @@ from unirender.files import (
     META_FILE,
     SUMMARY_FILE,
     new_folder,
-    write_png,
     write_result,
 )
 from unirender.intrinsics import MAPS
 from unirender.paths import forget_half_made
 from unirender.pictures import Picture, checked_file
+from unirender.visualization import write_png
 from unirender.whole_files import replace_file
 
 if TYPE_CHECKING:
@@ -137,17 +137,7 @@ def decompose_folder(
         UsageError: `output` is the folder of the pictures.
         UnirenderError: `output` cannot be made, or is a result itself.
     """
-    if (output / META_FILE).is_file():
-        raise UnirenderError(
-            f"{output}: has a {META_FILE}, so that it is one result, expected a folder for several; choose another"
-        )
-    if any(output.resolve() == path.resolve().parent for path in pictures):
-        raise UsageError(f"{output}: is the folder of the pictures, expected another one for the results")
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
-    forget_half_made(output, {path.name for path in pictures})
+    _make_output(output, pictures)
     done, damaged, mask_of = FolderResult(), set[Path](), mask_finder(masks)
 
     def wanted() -> Iterator[tuple[Path, Picture, dict[str, Any]]]:
@@ -179,6 +169,21 @@ def decompose_folder(
             else:
                 done.figures[path.name] = {name: written[name] for name in FIGURES if name in written}
     return done
+
+
+def _make_output(output: Path, pictures: list[Path]) -> None:
+    """Makes the folder of the results; without what killed processes left there."""
+    if (output / META_FILE).is_file():
+        raise UnirenderError(
+            f"{output}: has a {META_FILE}, so that it is one result, expected a folder for several; choose another"
+        )
+    if any(output.resolve() == path.resolve().parent for path in pictures):
+        raise UsageError(f"{output}: is the folder of the pictures, expected another one for the results")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UnirenderError(f"{output}: cannot be written ({error.strerror}); choose another folder") from error
+    forget_half_made(output, {path.name for path in pictures})
 
 
 def of_picture(picture: Picture) -> dict[str, Any]:

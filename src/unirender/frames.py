@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from unirender.files import map_picture, read_result
+from unirender.files import read_result
 from unirender.intrinsics import MAPS
 from unirender.pictures import read_picture
+from unirender.visualization import map_picture
 
 
 @dataclass(frozen=True)

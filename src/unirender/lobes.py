@@ -69,7 +69,7 @@ def grid_lobes(
         light, energy = np.ascontiguousarray(directions[:, up]), radiance[up]
         step = max(1, _CHUNK // len(energy))
         for part in (group[i : i + step] for i in range(0, len(group), step)):
-            out[part] = _weights(n[:, part], v[:, part], alpha[part, None], light, tails) @ energy
+            out[part] = _weights(n[:, part], v[:, part], alpha[part, None], light, tails=tails) @ energy
     return out
 
 
@@ -84,7 +84,8 @@ def lobe_matrix(
         alpha: roughness squared; the lobe should be wider than a texel.
         shape: rows and columns of the light.
     """
-    return _weights(n, v, alpha[:, None], texel_directions(shape), False) * texel_solid_angles(*shape).reshape(-1)
+    weights = _weights(n, v, alpha[:, None], texel_directions(shape), tails=False)
+    return weights * texel_solid_angles(*shape).reshape(-1)
 
 
 def cosine_matrix(n: Float[np.ndarray, "3 p"], shape: tuple[int, int]) -> Float[np.ndarray, "p m"]:
@@ -110,6 +111,7 @@ def _weights(
     v: Float[np.ndarray, "3 p"],
     alpha: Float[np.ndarray, "p 1"],
     light: Float[np.ndarray, "3 m"],
+    *,
     tails: bool,
 ) -> Float[np.ndarray, "p m"]:
     """f cos in each direction, or the grid's share of it.

@@ -1,5 +1,8 @@
 """The light that a surface receives from an environment, in closed form: d and s without shadows.
 
+    d(n) = 1/pi integral of E(l) max(n . l, 0) dl,    s(n, v) = integral of E(l) f(l, v) max(n . l, 0) dl
+
+with E the map and f the GGX lobe of a reflector of F = 1: the rendering equation (paper Eq. 1) of two fixed surfaces.
 Both follow from normals, roughness and the map alone (`unirender.lighting` fixes its grid); what the ground truth
 renders has shadows besides. `unirender bench derived-light` measures how near they come.
 

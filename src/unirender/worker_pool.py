@@ -61,7 +61,7 @@ class WorkerPool(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
         """As the executor's; a process that it starts is never interrupted."""
-        with interrupts_blocked():
+        with signal_blocked(signal.SIGINT):
             return super().submit(fn, *args, **kwargs)
 
     def end(self) -> None:
@@ -116,12 +116,12 @@ def start_tracker() -> None:
     second one that knows of nothing and prints a `KeyError` for all that it is to forget.
     """
     if hasattr(signal, "pthread_sigmask"):
-        with interrupts_blocked(signal.SIGHUP):
+        with signal_blocked(signal.SIGHUP):
             resource_tracker.ensure_running()
 
 
 @contextlib.contextmanager
-def interrupts_blocked(number: int = signal.SIGINT) -> Iterator[None]:
+def signal_blocked(number: int) -> Iterator[None]:
     """Holds a signal back until the block is left; for good in processes and threads that the block starts."""
     if not hasattr(signal, "pthread_sigmask"):
         yield

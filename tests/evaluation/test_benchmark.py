@@ -26,10 +26,10 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.bench_config import BenchConfig
 from unirender_evaluation.benchmark import _work
+from unirender_evaluation.composite_methods import Composite
 from unirender_evaluation.dry_run import planned
 from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
-from unirender_evaluation.methods import Composite, InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.protocol import doubts, mask_source
@@ -40,6 +40,7 @@ from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
+from unirender_evaluation.trivial_methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_evaluation.workers import Run, run_in_workers

@@ -14,6 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import methods
 from unirender_evaluation.claims import SHADOWED
+from unirender_evaluation.composite_methods import Composite, CompositeOf, SplitSum
 from unirender_evaluation.engine import Prediction, answer, method_jobs, score
 from unirender_evaluation.physics.rows import _record
 from unirender_evaluation.physics.stage import Stage
@@ -23,6 +24,14 @@ from unirender_evaluation.suites import Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.training_statistics import training_statistics
+from unirender_evaluation.trivial_methods import (
+    ConstantMaterial,
+    InputAsAlbedo,
+    MeanAlbedo,
+    MeanNormal,
+    SphereNormal,
+    UneditedInput,
+)
 from unirender_evaluation.versions import LPIPS, Versions
 
 
@@ -35,7 +44,7 @@ def test_constant_half_scores_the_spread_of_the_materials(suite: Suite) -> None:
     values: list[float] = []
     expected: list[float] = []
     for task in tasks(suite, "inverse", "single-image", list(suite.scenes)):
-        maps = methods.ConstantMaterial().decompose(**task.inputs["decompose"])
+        maps = ConstantMaterial().decompose(**task.inputs["decompose"])
         values.append(score(task, Prediction(maps=maps), ())["metallic.mse@masked"])
         metallic = float(task.sample.split("_m")[1][:3]) / 100
         expected.append((metallic - 0.5) ** 2)
@@ -44,7 +53,7 @@ def test_constant_half_scores_the_spread_of_the_materials(suite: Suite) -> None:
 
 def test_unedited_input_is_the_input(suite: Suite) -> None:
     task = next(tasks(suite, "rendering", "from-image", list(suite.scenes)))
-    image = methods.UneditedInput().edit(**task.inputs["edit"])
+    image = UneditedInput().edit(**task.inputs["edit"])
     base = suite.image(task.scene, suite.spec.base)
     np.testing.assert_allclose(image, np.minimum(base, 1), rtol=0, atol=0.01)
     assert score(task, Prediction(image=image), ())["edit_metallic.psnr@masked-srgb-raw"] < 40
@@ -57,8 +66,8 @@ def test_composite_is_exact_where_the_truth_is_a_composite(suite: Suite) -> None
         for task in tasks(suite, "rendering", protocol, list(suite.scenes)[:2]):
             maps = task.inputs["render"]["intrinsics"]
             key = f"{task.quantity}.psnr@masked-srgb-raw"
-            good = score(task, Prediction(image=methods.Composite().render(maps)), ())[key]
-            wrong = methods.Composite().render(maps.replace(albedo=0.9 * maps.albedo))
+            good = score(task, Prediction(image=Composite().render(maps)), ())[key]
+            wrong = Composite().render(maps.replace(albedo=0.9 * maps.albedo))
             assert good > 55
             assert score(task, Prediction(image=wrong), ())[key] < 45
 
@@ -70,7 +79,7 @@ def test_split_sum_adds_the_angle_of_the_fresnel_term(suite: Suite) -> None:
         for task in tasks(suite, "rendering", protocol, [suite.scenes[0]]):
             assert row.answers(task, list(suite.scenes))
             maps = task.inputs["render"]["intrinsics"]
-            split, plain = (method.render(maps) for method in (row.method, methods.Composite()))
+            split, plain = (method.render(maps) for method in (row.method, Composite()))
             assert np.all(split >= plain - 1e-6)
             assert 1.005 < split.sum() / plain.sum() < 1.3
     for table, protocol in (("rendering", "from-image"), ("inverse", "single-image")):
@@ -85,7 +94,7 @@ def test_split_sum_with_seen_shadows(suite: Suite) -> None:
     task = next(tasks(suite, "rendering", "given-light", [suite.scenes[0]]))
     ball = task.inputs["render"]["intrinsics"]
     bowl = ball.replace(normal=ball.normal * np.array([-1, -1, 1], np.float32))
-    shares = [row.method.render(maps).sum() / methods.SplitSum().render(maps).sum() for maps in (ball, bowl)]
+    shares = [row.method.render(maps).sum() / SplitSum().render(maps).sum() for maps in (ball, bowl)]
     assert shares[0] == pytest.approx(1, abs=0.02)
     assert 0.3 < shares[1] < 0.9
 
@@ -93,9 +102,9 @@ def test_split_sum_with_seen_shadows(suite: Suite) -> None:
 def test_input_as_albedo_and_constants(suite: Suite) -> None:
     task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
     inputs = task.inputs["decompose"]
-    albedo = methods.InputAsAlbedo().decompose(**inputs).require("albedo")["albedo"]
+    albedo = InputAsAlbedo().decompose(**inputs).require("albedo")["albedo"]
     np.testing.assert_allclose(albedo, srgb_decode(inputs["image_srgb"]), rtol=0, atol=1e-6)
-    mean = methods.MeanAlbedo().decompose(**inputs).require("albedo")["albedo"]
+    mean = MeanAlbedo().decompose(**inputs).require("albedo")["albedo"]
     inside = task.mask[..., 0] > 0
     np.testing.assert_allclose(
         mean[inside][0], srgb_decode(np.array(training_statistics()["albedo_srgb"], np.float32)), rtol=0, atol=1e-6
@@ -106,8 +115,8 @@ def test_input_as_albedo_and_constants(suite: Suite) -> None:
 
 def test_sphere_normal_is_exact_on_a_sphere(suite: Suite) -> None:
     task = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))
-    sphere = score(task, Prediction(maps=methods.SphereNormal().decompose(**task.inputs["decompose"])), ())
-    flat = score(task, Prediction(maps=methods.MeanNormal().decompose(**task.inputs["decompose"])), ())
+    sphere = score(task, Prediction(maps=SphereNormal().decompose(**task.inputs["decompose"])), ())
+    flat = score(task, Prediction(maps=MeanNormal().decompose(**task.inputs["decompose"])), ())
     assert sphere["normal.cosine"] > 0.99
     assert flat["normal.cosine"] < 0.75
 
@@ -131,9 +140,9 @@ def test_composite_of_a_perfect_decomposition_edits_perfectly(suite: Suite) -> N
     for task in tasks(suite, "rendering", "from-image", [suite.scenes[1]]):
         oracle = TrueMaps(suite.intrinsics(task.scene, suite.spec.base))
         key = f"{task.quantity}.psnr@masked-srgb-raw"
-        unedited = score(task, Prediction(image=methods.UneditedInput().edit(**task.inputs["edit"])), ())[key]
+        unedited = score(task, Prediction(image=UneditedInput().edit(**task.inputs["edit"])), ())[key]
         for anchored in (False, True):
-            image = methods.CompositeOf(oracle, anchored).edit(**task.inputs["edit"])
+            image = CompositeOf(oracle, anchored).edit(**task.inputs["edit"])
             found = score(task, Prediction(image=image), ())[key]
             assert found > max(unedited + 2, 45 if task.quantity == "edit_metallic" else 0)
 
@@ -142,13 +151,13 @@ def test_relighting_with_true_maps(suite: Suite) -> None:
     for protocol in ("from-image-sd", "from-image-hdri"):
         task = next(tasks(suite, "relighting", protocol, [suite.scenes[0]]))
         oracle = TrueMaps(suite.intrinsics(task.scene, suite.spec.base))
-        image = methods.CompositeOf(oracle, anchored=False).relight(**task.inputs["relight"])
+        image = CompositeOf(oracle, anchored=False).relight(**task.inputs["relight"])
         assert score(task, Prediction(image=image), ())["relit.psnr@masked-srgb-raw"] > 55
 
 
 def test_capabilities_are_checked() -> None:
-    assert methods.capabilities(methods.UneditedInput()) == ("edit", "relight")
-    assert methods.capabilities(methods.Composite()) == ("render",)
+    assert methods.capabilities(UneditedInput()) == ("edit", "relight")
+    assert methods.capabilities(Composite()) == ("render",)
 
     class Empty:
         name = "empty"
@@ -178,7 +187,7 @@ def test_arguments_of_other_names_are_refused_before_a_run() -> None:
     with pytest.raises(UnirenderError, match=r"Renamed.render takes \(maps: .*, expected the arguments intrinsics,"):
         methods.check_method(Renamed())
     methods.check_method(Loose())
-    for trivial in (methods.UneditedInput(), methods.InputAsAlbedo(), methods.Composite()):
+    for trivial in (UneditedInput(), InputAsAlbedo(), Composite()):
         methods.check_method(trivial)
 
 
@@ -238,7 +247,7 @@ def test_rows_are_unique_and_named() -> None:
 
 
 def test_answer_asks_only_for_what_a_method_can(suite: Suite) -> None:
-    row = make_row(methods.InputAsAlbedo(), "trivial")
+    row = make_row(InputAsAlbedo(), "trivial")
     edit = next(tasks(suite, "rendering", "from-image", list(suite.scenes)))
     assert not row.answers(edit, list(suite.scenes))
     inverse = next(tasks(suite, "inverse", "single-image", list(suite.scenes)))

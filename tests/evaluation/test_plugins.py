@@ -16,7 +16,7 @@ from unirender_evaluation import engine, kept_defaults
 from unirender_evaluation.plugin_source import source_sha256
 from unirender_evaluation.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
-from unirender_reference.backend import mitsuba
+from unirender_reference.backend import LLVM_VARIABLE, find_llvm, mitsuba
 
 SOURCE = """
 from helper_of_the_method import SHADE
@@ -325,6 +325,18 @@ def test_a_method_finds_its_own_variant_of_mitsuba(tmp_path: Path) -> None:
     for row in (*rows, *rows):
         mitsuba("scalar_spectral")
         engine.ask(row, "render", "x", intrinsics=Intrinsics(albedo=np.zeros((2, 2, 3), np.float32)))
+
+
+def test_a_method_that_imports_mitsuba_before_us_loads_our_llvm(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an older one, which Dr.Jit finds by itself, all rows that render would say that it is too old."""
+    monkeypatch.delenv(LLVM_VARIABLE, raising=False)
+    (tmp_path / "mine.py").write_text(
+        f"import os\nclass Mine:\n    name, config = 'mine', {{'llvm': os.environ.get('{LLVM_VARIABLE}')}}\n"
+        "    def render(self, intrinsics): ..."
+    )
+    assert named_plugin(f"{tmp_path}/mine.py:Mine").method.config["llvm"] == str(find_llvm().path)
 
 
 def test_a_compiled_neighbour_is_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,7 +69,11 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
         ("core", "unirender_evaluation", ("physics/formulas.py", "physics/rows.py", "records.py")),
-        ("core", "unirender_evaluation", ("light_balls.py", "light_methods.py", "light_metrics.py")),
+        (
+            "core",
+            "unirender_evaluation",
+            ("light_balls.py", "light_methods.py", "light_metrics.py", "trivial_methods.py", "composite_methods.py"),
+        ),
         ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
     ],
 )

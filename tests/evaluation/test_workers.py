@@ -22,10 +22,10 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation import workers
 from unirender_evaluation.figures.grid import Grid, Line, Tile, save
-from unirender_evaluation.methods import UneditedInput
 from unirender_evaluation.pictures import write_sheet
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites import load_suite
+from unirender_evaluation.trivial_methods import UneditedInput
 from unirender_evaluation.versions import LPIPS, Versions
 from unirender_evaluation.workers import Run
 

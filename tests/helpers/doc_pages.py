@@ -19,9 +19,9 @@ from tiny_suites import make_suite
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.exr import image_channels, write_exr
-from unirender.files import write_png
 from unirender.models.dual_stream import DualStreamModel
 from unirender.training.groups import read_groups
+from unirender.visualization import write_png
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.prediction_check import folder_problems, questions
 from unirender_evaluation.predictions import PredictionFolder

@@ -18,9 +18,9 @@ from optimizer_runs import rendered_views, truth
 
 from unirender import cli, process_ends
 from unirender.command_line import Ended, causes, interrupted
-from unirender.files import write_png
 from unirender.process_ends import open_streams
 from unirender.system_errors import refused_by_system
+from unirender.visualization import write_png
 from unirender_reference.optimize.export import write_solution
 from unirender_reference.optimize.folder import write_views
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import map_picture, new_folder, write_result
+from unirender.files import new_folder, write_result
 from unirender.folders import (
     AT_ONCE,
     FolderResult,
@@ -28,6 +28,7 @@ from unirender.input_picture import read_input
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
 from unirender.pipelines.results import Decomposition
+from unirender.visualization import map_picture
 
 SETTINGS = {"command": "decompose", "seed": 0}
 

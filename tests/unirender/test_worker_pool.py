@@ -81,16 +81,16 @@ def test_an_unguarded_worker_lives_on(tmp_path: Path) -> None:
 
 def test_a_pool_ends_its_own_workers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another one may begin while it does, in another thread."""
-    one, other, blocked = WorkerPool(1), WorkerPool(1), worker_pool.interrupts_blocked
+    one, other, blocked = WorkerPool(1), WorkerPool(1), worker_pool.signal_blocked
 
     @contextlib.contextmanager
-    def meanwhile() -> Iterator[None]:
-        monkeypatch.setattr(worker_pool, "interrupts_blocked", blocked)
+    def meanwhile(number: int) -> Iterator[None]:
+        monkeypatch.setattr(worker_pool, "signal_blocked", blocked)
         other.submit(os.getpid).result()
-        with blocked():
+        with blocked(number):
             yield
 
-    monkeypatch.setattr(worker_pool, "interrupts_blocked", meanwhile)
+    monkeypatch.setattr(worker_pool, "signal_blocked", meanwhile)
     first = one.submit(os.getpid).result()
     one.end()
     assert ends(first, 10)

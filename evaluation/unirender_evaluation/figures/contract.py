@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from unirender.camera import DEFAULT_FILL, Camera
 from unirender.color import image_srgb
-from unirender.files import map_picture
 from unirender.lighting import environment_directions
+from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import over_white
 from unirender_evaluation.suites import Scene, Suite
 

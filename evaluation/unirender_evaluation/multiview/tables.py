@@ -1,11 +1,11 @@
 """The multi-view table: its columns."""
 
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
-from unirender_evaluation.metrics import METRICS, Metric
+from unirender_evaluation.metrics import LOWER, METRICS, Metric
 from unirender_evaluation.specs import Column, TableSpec
 
 PROTOCOL = "known-mesh"
-SECONDS = Metric("seconds", "time", "s", False, 0.0, (), 1, "wall clock of one object, optimisation only")
+SECONDS = Metric("seconds", "time", "s", LOWER, 0.0, (), 1, "wall clock of one object, optimisation only")
 _IN_MASK = {"mask": "masked"}
 _ALIGNED = {"scale": "aligned"}
 

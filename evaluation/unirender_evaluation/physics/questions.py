@@ -59,8 +59,8 @@ def loss(light: Light, decompose: Decompose, stage: Stage) -> float:
     return loop("shade", light, true_maps, stage) - loop("shade", light, decompose, stage)
 
 
-def rough_loop(rough: bool, decompose: Decompose, stage: Stage) -> float:
-    """Mean dB of Mitsuba's loops under both lights, over the stored pictures whose roughness is (not) >= `ROUGH`."""
+def loop_by_roughness(decompose: Decompose, stage: Stage, *, rough: bool) -> float:
+    """Mean dB of Mitsuba's loops under both lights, over the stored pictures of roughness >= `ROUGH`, or below."""
     materials = [m for m in stage.pictures if (m[1] >= ROUGH) == rough]
     lights: tuple[Light, ...] = ("input", "heldout")
     return float(np.mean([_loop_psnr(decompose, stage, "shade", light, m) for m in materials for light in lights]))
@@ -68,7 +68,7 @@ def rough_loop(rough: bool, decompose: Decompose, stage: Stage) -> float:
 
 def rough_loss(decompose: Decompose, stage: Stage) -> float:
     """dB that the found maps lose against the true ones in the primary closed loop."""
-    return rough_loop(True, true_maps, stage) - rough_loop(True, decompose, stage)
+    return loop_by_roughness(true_maps, stage, rough=True) - loop_by_roughness(decompose, stage, rough=True)
 
 
 def tau(parameter: Literal["metallic", "roughness"], decompose: Decompose, stage: Stage) -> float:

@@ -20,7 +20,8 @@ import numpy as np
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
-from unirender_evaluation.methods import Composite, Image, quantise
+from unirender_evaluation.composite_methods import Composite
+from unirender_evaluation.methods import Image, quantise
 from unirender_evaluation.physics.ambiguity import POSTERIOR, Points, material_point
 from unirender_evaluation.physics.definition import PhysicsTest
 from unirender_evaluation.physics.questions import Posterior, true_maps

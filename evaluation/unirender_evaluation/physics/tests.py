@@ -3,15 +3,15 @@
 from collections.abc import Callable
 from functools import partial
 
-from unirender_evaluation.metrics import METRICS, Metric
+from unirender_evaluation.metrics import HIGHER, LOWER, METRICS, Metric
 from unirender_evaluation.physics import formulas, region, twins
 from unirender_evaluation.physics.ambiguity import EXPLANATIONS, POSTERIOR
 from unirender_evaluation.physics.definition import PhysicsTest
 from unirender_evaluation.physics.questions import (
     loop,
+    loop_by_roughness,
     loss,
     region_volume,
-    rough_loop,
     rough_loss,
     roughness_response,
     share_inside,
@@ -27,12 +27,12 @@ def _metric(name: str, label: str, unit: str, higher: bool, perfect: float, deci
     return Metric(name, label, unit, higher, perfect, (), decimals, formula)
 
 
-RELATIVE = _metric("relative", "rel. error", "", False, 0.0, 4, "sum |difference| / sum radiance, linear light")
-CORRELATION = _metric("correlation", "corr.", "", True, 1.0, 3, "Pearson, masked pixels, linear light")
-LOSS = _metric("loss", "loss", "dB", False, 0.0, 2, "masked sRGB PSNR of the true maps' loop minus that of the row's")
-TAU = _metric("tau", "tau", "", True, 1.0, 3, "Kendall's tau-b over 11 renders")
-SHARE = _metric("share", "share", "", True, region.perfect_share(POSTERIOR), 2, "of what explains the input")
-VOLUME = _metric("volume", "volume", "", False, 0.0, 4, "share of the unit cube (metallic, roughness, luminance)")
+RELATIVE = _metric("relative", "rel. error", "", LOWER, 0.0, 4, "sum |difference| / sum radiance, linear light")
+CORRELATION = _metric("correlation", "corr.", "", HIGHER, 1.0, 3, "Pearson, masked pixels, linear light")
+LOSS = _metric("loss", "loss", "dB", LOWER, 0.0, 2, "masked sRGB PSNR of the true maps' loop minus that of the row's")
+TAU = _metric("tau", "tau", "", HIGHER, 1.0, 3, "Kendall's tau-b over 11 renders")
+SHARE = _metric("share", "share", "", HIGHER, region.perfect_share(POSTERIOR), 2, "of what explains the input")
+VOLUME = _metric("volume", "volume", "", LOWER, 0.0, 4, "share of the unit cube (metallic, roughness, luminance)")
 
 CEILING = "true maps' loop"
 GRADIENT = "a left-to-right gradient on the picture"
@@ -158,7 +158,7 @@ _ROUGH_LOOPS = (
         f"mean of Mitsuba's closed loops over base and edits of roughness >= {ROUGH}, both lights: the primary figure",
         PSNR,
         CEILING,
-        partial(rough_loop, True),
+        partial(loop_by_roughness, rough=True),
         in_run=False,
     ),
     _of_maps(
@@ -176,7 +176,7 @@ _ROUGH_LOOPS = (
         "as the primary figure, over the smoother pictures: one point per pixel is not a render of them",
         PSNR,
         CEILING,
-        partial(rough_loop, False),
+        partial(loop_by_roughness, rough=False),
         in_run=False,
     ),
 )

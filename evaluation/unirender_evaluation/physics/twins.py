@@ -3,7 +3,8 @@
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.composite_methods import Composite
+from unirender_evaluation.methods import Image
 from unirender_evaluation.physics.ambiguity import POSTERIOR, Points
 from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.suites import Material

@@ -23,7 +23,7 @@ from scipy.ndimage import binary_erosion, correlate1d
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000, psnr_from_mse
+from unirender_evaluation.metrics import HIGHER, LOWER, SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000, psnr_from_mse
 
 ERODED = 5  # pixels, side of the square by which Stanford-ORB shrinks its masks
 PEAK_HDR, PEAK_LDR = 4.0, 1.0  # radiance at which PSNR-H and PSNR-L clip
@@ -31,16 +31,16 @@ NO_POWER = 1e-6  # a sum of squares below which no factor is fitted
 DELTA = 0.10  # of WHDR: relative difference from which one of two points is darker
 LEAST_REFLECTANCE = 1e-10
 
-PSNR_H = Metric("psnr_h", "PSNR-H", "dB", True, math.inf, ("scale",), 2)
-PSNR_L = Metric("psnr_l", "PSNR-L", "dB", True, math.inf, ("scale",), 2)
-ORB_SSIM = Metric("ssim_3", "SSIM", "", True, 1.0, ("scale",), 4)
-ORB_LPIPS_VGG = Metric("lpips_vgg", "LPIPS-VGG", "", False, 0.0, ("scale",), 4)
-ORB_LPIPS_ALEX = Metric("lpips_alex", "LPIPS-Alex", "", False, 0.0, ("scale",), 4)
-COSINE_DISTANCE = Metric("cosine_distance", "1 - cos", "", False, 0.0, (), 4)
-DEPTH_SI_MSE = Metric("si_mse", "SI-MSE", "", False, 0.0, (), 5)
-WHDR = Metric("whdr", "WHDR", "", False, 0.0, (), 4)
-INTENSITY = Metric("intensity", "si-MSE x 100", "", False, 0.0, (), 3)
-CHROMATICITY = Metric("chromaticity", "CIEDE2000", "", False, 0.0, (), 3)
+PSNR_H = Metric("psnr_h", "PSNR-H", "dB", HIGHER, math.inf, ("scale",), 2)
+PSNR_L = Metric("psnr_l", "PSNR-L", "dB", HIGHER, math.inf, ("scale",), 2)
+ORB_SSIM = Metric("ssim_3", "SSIM", "", HIGHER, 1.0, ("scale",), 4)
+ORB_LPIPS_VGG = Metric("lpips_vgg", "LPIPS-VGG", "", LOWER, 0.0, ("scale",), 4)
+ORB_LPIPS_ALEX = Metric("lpips_alex", "LPIPS-Alex", "", LOWER, 0.0, ("scale",), 4)
+COSINE_DISTANCE = Metric("cosine_distance", "1 - cos", "", LOWER, 0.0, (), 4)
+DEPTH_SI_MSE = Metric("si_mse", "SI-MSE", "", LOWER, 0.0, (), 5)
+WHDR = Metric("whdr", "WHDR", "", LOWER, 0.0, (), 4)
+INTENSITY = Metric("intensity", "si-MSE x 100", "", LOWER, 0.0, (), 3)
+CHROMATICITY = Metric("chromaticity", "CIEDE2000", "", LOWER, 0.0, (), 3)
 
 Rgb = Float[np.ndarray, "h w 3"]
 OneMask = Float[np.ndarray, "h w 1"]

@@ -114,5 +114,6 @@ def _from_z_test(name: str, test: ZTest, note: str) -> Check:
     note = f"{note}; {share}" if note else share
     if test.min_p >= test.threshold and not test.passed:
         statistic = f"share of p >= {LEVEL}"
-        return Check(name, statistic, test.pass_share, test.share_threshold, ">=", False, f"{note}; p {family_p:.3g}")
+        note = f"{note}; p {family_p:.3g}"
+        return Check(name, statistic, test.pass_share, test.share_threshold, ">=", passed=False, note=note)
     return Check(name, "p (Sidak)", family_p, CONDITION_ALPHA, ">=", test.passed, note)

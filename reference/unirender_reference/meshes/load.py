@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from unirender.arguments import as_path
 from unirender.errors import UnirenderError
@@ -133,21 +133,18 @@ def _grouped(pieces: list[Piece]) -> list[_Group]:
 
 
 def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
+    """The object of a model's pieces, in the unit sphere, and where it stood."""
     single, doubles = without_doubles(model.pieces)
     groups = _grouped(single)
     pieces = [piece for group in groups for piece in group.pieces]
     patches = [group.patch() for group in groups]
-    points = np.concatenate([patch.points for patch in patches])
-    check_geometry(points, max(piece.step for piece in pieces))
+    check_geometry(np.concatenate([patch.points for patch in patches]), max(piece.step for piece in pieces))
     atlas = build_atlas(patches)
-    arrays = {id(piece.vertices): piece.vertices for piece in pieces}  # an OBJ's pieces share one
-    starts = dict(zip(arrays, np.cumsum([0, *map(len, arrays.values())]), strict=False))
     sphere = bounding_sphere(np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces]))
+    points, corners = _one_array(pieces)
+    normals_at_corners = np.concatenate([piece_normals(piece) for piece in pieces])
     vertices, faces, normals, uv = split_corners(
-        sphere.to_unit(np.concatenate(list(arrays.values()))).astype(np.float32),
-        np.concatenate([piece.faces + starts[id(piece.vertices)] for piece in pieces]),
-        np.concatenate([piece_normals(piece) for piece in pieces]),
-        atlas.uv,
+        sphere.to_unit(points).astype(np.float32), corners, normals_at_corners, atlas.uv
     )
     smaller = {SMALLER} if any(group.material.has_smaller_textures() for group in groups) else set()
     maps = atlas.maps
@@ -177,6 +174,14 @@ def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
         },
     )
     return obj, sphere
+
+
+def _one_array(pieces: list[Piece]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
+    """The vertices of all pieces, those of pieces that share an array (an OBJ's do) once, and the faces among them."""
+    arrays = {id(piece.vertices): piece.vertices for piece in pieces}
+    starts = dict(zip(arrays, np.cumsum([0, *map(len, arrays.values())])[:-1], strict=True))
+    faces = np.concatenate([piece.faces + starts[id(piece.vertices)] for piece in pieces])
+    return np.concatenate(list(arrays.values())), faces
 
 
 def _scalar_map(texels: Float[np.ndarray, "h w 1"] | None) -> Float[np.ndarray, "i j"] | None:

@@ -44,8 +44,9 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
     entries: dict[str, MtlEntry] = {}
     entry = MtlEntry()
     for line in io.StringIO(text.removeprefix("\ufeff"), newline=None):  # LF, CR LF or CR
-        keyword, rest = (*line.split(None, 1), "", "")[:2]
-        keyword, rest = keyword.lower(), rest.strip()
+        words = line.split(None, 1)
+        keyword = words[0].lower() if words else ""
+        rest = words[1].strip() if len(words) > 1 else ""
         if keyword == "newmtl":
             entry = entries.setdefault(rest, MtlEntry())
             check_materials(len(entries))

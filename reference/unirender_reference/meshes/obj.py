@@ -154,60 +154,91 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
             f"has no faces, expected a triangle mesh: {len(lines.points) // 3:,} lines of v, none of f; is it an OBJ "
             "file?"
         )
-    points = np.array(lines.points).reshape(-1, 3)
-    coordinates = np.array(lines.coordinates).reshape(-1, 2)
-    normals = np.array(lines.normals).reshape(-1, 3)
-    corners = np.array(lines.corners, np.int64).reshape(-1, 3)
-    sizes = np.array(lines.sizes, np.int64)
-    at_corners = points[np.clip(corners[:, 0], 1, len(points)) - 1] if len(points) else None  # checked below
-    triangles, polygon = fans(sizes) if at_corners is None else triangulate(at_corners, sizes)
-    owner = np.array(lines.materials, np.int64)[polygon]
-    points_of, coordinates_of, normals_of = np.moveaxis(corners[triangles], -1, 0)  # (m, 3 corners) each, from 1
-    colors = _colors(lines, len(points))
+    mesh = _Corners(lines)
     names = list(lines.names)
-    used = [names[i] for i in np.unique(owner)]
+    used = [names[i] for i in np.unique(mesh.owner)]
     entries = _libraries(folder, lines.libraries) if any(name is not None for name in used) else {}
     mapped = np.array([bool(name in entries and entries[name].maps) for name in names])
-    # Faces of a material that lack what its others have are a piece of their own.
-    kind = 8 * owner + 4 * (mapped[owner] & _lacking(coordinates_of, coordinates)) + 2 * (normals_of == 0).any(1)
-    kind += 0 if colors is None else _lacking(points_of, colors)
-    order = np.argsort(kind, kind="stable")
-    present, starts = np.unique(kind[order], return_index=True)
     materials = MtlMaterials(folder, entries, used)
-    pieces = []
     made: dict[tuple[str | None, bool, bool], Material] = {}
-    ignored = set[str]()
-    for number, group in zip(present // 8, np.split(order, starts[1:]), strict=True):
-        name = names[number]
-        faces = _looked_up(points_of[group], len(points), "vertex")
-        if faces is None:
-            raise UnirenderError("a face names vertex 0, OBJ counts from 1; export it again")
-        at = _looked_up(coordinates_of[group], len(coordinates), "texture coordinate")
-        turned = _looked_up(normals_of[group], len(normals), "normal")
-        uv = None if at is None else coordinates[at] * [1, -1] + [0, 1]  # v from below -> from the first row
-        textured = uv is not None and bool(np.isfinite(uv).all())
+    pieces, owners, ignored = [], [], set[str]()
+    for group in mesh.alike(mapped):
+        owners.append(mesh.owner[group[0]])
+        name = names[owners[-1]]
         maps = entries[name].maps if name in entries else {}
-        own = None if colors is None else colors[faces]
-        if own is not None and np.isnan(own).any():
-            ignored |= set() if np.isnan(own).all() else {"colours of faces with a bare corner"}
-            own = None
-        ignored |= {BARE} if maps and not textured else set()
-        key = name, textured, own is not None
+        faces, uv, normals = mesh.faces(group), mesh.uv_at(group), mesh.normals_at(group)
+        colors = None if mesh.colors is None else mesh.colors[faces]
+        if colors is not None and np.isnan(colors).any():
+            ignored |= set() if np.isnan(colors).all() else {"colours of faces with a bare corner"}
+            colors = None
+        ignored |= {BARE} if maps and uv is None else set()
+        key = name, uv is not None, colors is not None
         if key not in made:
             made[key] = materials.make(*key)
-        pieces.append(
-            Piece(
-                vertices=points,
-                faces=faces,
-                normals=None if turned is None else normals[turned],
-                uv={0: uv} if uv is not None and textured else {},
-                colors=None if "albedo" in maps else own,
-                material=made[key],
-            )
-        )
+        shown = None if "albedo" in maps else colors
+        pieces.append(Piece(mesh.points, faces, normals, {} if uv is None else {0: uv}, shown, made[key]))
     if any(name is not None and name not in entries for name in used):
         ignored.add("undefined materials")
-    return Model(_smoothed(pieces, present // 8), frozenset(ignored | materials.ignored))
+    return Model(_smoothed(pieces, np.array(owners)), frozenset(ignored | materials.ignored))
+
+
+class _Corners:
+    """The triangles of a file, with what stands at their corners.
+
+    Attributes:
+        points: [n 3].
+        colors: of the points [n 3], linear, NaN where one has none; None where none has.
+        owner: number of each triangle's material [m].
+    """
+
+    def __init__(self, lines: _Lines) -> None:
+        self.points = np.array(lines.points).reshape(-1, 3)
+        self._coordinates = np.array(lines.coordinates).reshape(-1, 2)
+        self._normals = np.array(lines.normals).reshape(-1, 3)
+        corners = np.array(lines.corners, np.int64).reshape(-1, 3)
+        sizes = np.array(lines.sizes, np.int64)
+        count = len(self.points)
+        at_corners = self.points[np.clip(corners[:, 0], 1, count) - 1] if count else None  # checked by `faces`
+        triangles, polygon = fans(sizes) if at_corners is None else triangulate(at_corners, sizes)
+        self.owner = np.array(lines.materials, np.int64)[polygon]
+        self.colors = _colors(lines, len(self.points))
+        self._point, self._coordinate, self._normal = np.moveaxis(corners[triangles], -1, 0)  # [m 3] each, from 1
+
+    def alike(self, mapped: Bool[np.ndarray, " k"]) -> list[Int[np.ndarray, " f"]]:
+        """The triangles by material. Those that lack what others of their material have are a group of their own.
+
+        Args:
+            mapped: whether each material has textures, so that its triangles need texture coordinates.
+        """
+        lacks = [
+            mapped[self.owner] & _lacking(self._coordinate, self._coordinates),
+            (self._normal == 0).any(axis=1),
+            np.False_ if self.colors is None else _lacking(self._point, self.colors),
+        ]
+        kind = self.owner
+        for missing in lacks:
+            kind = 2 * kind + missing
+        order = np.argsort(kind, kind="stable")
+        starts = np.unique(kind[order], return_index=True)[1]
+        return np.split(order, starts[1:])
+
+    def faces(self, group: Int[np.ndarray, " f"]) -> Int[np.ndarray, "f 3"]:
+        """Indices of the points of some triangles."""
+        faces = _looked_up(self._point[group], len(self.points), "vertex")
+        if faces is None:
+            raise UnirenderError("a face names vertex 0, OBJ counts from 1; export it again")
+        return faces
+
+    def normals_at(self, group: Int[np.ndarray, " f"]) -> Float[np.ndarray, "f 3 3"] | None:
+        """Normals at the corners of some triangles; None where any corner has none."""
+        at = _looked_up(self._normal[group], len(self._normals), "normal")
+        return None if at is None else self._normals[at]
+
+    def uv_at(self, group: Int[np.ndarray, " f"]) -> Float[np.ndarray, "f 3 2"] | None:
+        """Texture coordinates at the corners, v from the first row; None where any corner has no finite one."""
+        at = _looked_up(self._coordinate[group], len(self._coordinates), "texture coordinate")
+        uv = None if at is None else self._coordinates[at] * [1, -1] + [0, 1]  # OBJ's v counts from below
+        return uv if uv is not None and np.isfinite(uv).all() else None
 
 
 def _smoothed(pieces: list[Piece], owners: Int[np.ndarray, " k"]) -> list[Piece]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from unirender.camera import Camera
     from unirender.intrinsics import Intrinsics
-    from unirender_reference.optimize.report import Progress
+    from unirender_reference.optimize.report import OnReport
     from unirender_reference.optimize.solution import Solution
     from unirender_reference.optimize.views import Step, Views
     from unirender_reference.shapes import MeshObject, Sphere
@@ -176,7 +176,7 @@ class Optimize:
         check_alignment(views, obj, place, self.up)
         return views, obj, place
 
-    def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "Progress") -> "Solution":
+    def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "OnReport") -> "Solution":
         """What the model predicts for every view, on the mesh."""
         import time
 

@@ -47,7 +47,8 @@ class PyramidAdam:
             size = (max(1, sizes[-1][0] // FACTOR), max(1, sizes[-1][1] // FACTOR))
             if size != sizes[-1]:
                 sizes.append(size)
-                rows, columns = interpolation(height, size[0], False), interpolation(width, size[1], circular)
+                rows = interpolation(height, size[0], circular=False)
+                columns = interpolation(width, size[1], circular=circular)
                 self._up.append((rows, columns))
         self.moments: list[Moments] = [(np.zeros((*s, channels)), np.zeros((*s, channels))) for s in sizes]
 
@@ -79,7 +80,7 @@ class PyramidAdam:
 
 
 @lru_cache(maxsize=64)
-def interpolation(fine: int, coarse: int, circular: bool) -> Float[np.ndarray, "fine coarse"]:
+def interpolation(fine: int, coarse: int, *, circular: bool) -> Float[np.ndarray, "fine coarse"]:
     """The matrix of linear interpolation from `coarse` to `fine` texels of the same side; rows sum to 1."""
     place = (np.arange(fine) + 0.5) * coarse / fine - 0.5
     low = np.floor(place).astype(int)

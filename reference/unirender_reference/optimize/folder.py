@@ -24,8 +24,9 @@ from unirender.color import srgb_decode, srgb_encode, unpremultiply
 from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
-from unirender.files import new_folder, write_png
+from unirender.files import new_folder
 from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
+from unirender.visualization import write_png
 from unirender_reference.meshes.images import area_means
 from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
 from unirender_reference.optimize.views import SATURATED, View, Views
@@ -68,21 +69,7 @@ def read_views(
     if main is None:
         there = "is no folder" if not folder.is_dir() else f"has no {' or '.join(SEEN_FILES)}"
         raise UnirenderError(f"{folder}: {there}; expected posed pictures (docs/optimization.md has the format)")
-    frames = read_transforms(main)
-    seen = [frame for frame in frames if not frame.held_out]
-    held_out = [frame for frame in frames if frame.held_out]
-    if not held_out:
-        other = next((folder / name for name in HELD_OUT_FILES if (folder / name).is_file()), None)
-        held_out = [] if other is None else read_transforms(other)
-    if hold_out:
-        held_out = held_out + seen[hold_out - 1 :: hold_out]
-        seen = [frame for index, frame in enumerate(seen) if (index + 1) % hold_out]
-    if not seen:
-        raise UnirenderError(f"{main}: all {len(frames)} pictures are held out, expected some to optimise against")
-    both = {frame.file.resolve() for frame in seen} & {frame.file.resolve() for frame in held_out}
-    if both:
-        names = " and ".join(frame.name for frame in (*seen, *held_out) if frame.file.resolve() == min(both))
-        raise UnirenderError(f"{names}: one picture is both seen and held out; expected each once")
+    seen, held_out = _split(main, hold_out)
     seen, held_out = _spread(seen, most_views), _spread(held_out, most_views)
     hdr = {frame.file.suffix.lower() == ".exr" for frame in (*seen, *held_out)}
     if len(hdr) > 1:
@@ -102,6 +89,26 @@ def read_views(
         raise UnirenderError(f"{folder}: {error}") from error
     _warn(views, [*seen, *held_out])
     return views
+
+
+def _split(main: Path, hold_out: int) -> tuple[list[Frame], list[Frame]]:
+    """The frames that are seen, and those that are held out: by the files, and every N-th of the others."""
+    frames = read_transforms(main)
+    seen = [frame for frame in frames if not frame.held_out]
+    held_out = [frame for frame in frames if frame.held_out]
+    if not held_out:
+        other = next((file for name in HELD_OUT_FILES if (file := main.with_name(name)).is_file()), None)
+        held_out = [] if other is None else read_transforms(other)
+    if hold_out:
+        held_out = held_out + seen[hold_out - 1 :: hold_out]
+        seen = [frame for index, frame in enumerate(seen) if (index + 1) % hold_out]
+    if not seen:
+        raise UnirenderError(f"{main}: all {len(frames)} pictures are held out, expected some to optimise against")
+    both = {frame.file.resolve() for frame in seen} & {frame.file.resolve() for frame in held_out}
+    if both:
+        names = " and ".join(frame.name for frame in (*seen, *held_out) if frame.file.resolve() == min(both))
+        raise UnirenderError(f"{names}: one picture is both seen and held out; expected each once")
+    return seen, held_out
 
 
 def _check_arguments(up: Up, hold_out: int, most_views: int | None, longest_side: int | None) -> None:
@@ -183,7 +190,7 @@ def read_picture_file(path: Path, *, upright: bool = True) -> PictureFile:
     picture = read_picture(path, upright=upright)
     for remark in picture.remarks.values():
         _log.warning("%s: %s", path, remark)
-    return PictureFile(picture.image_srgb, picture.mask, False, picture.camera)
+    return PictureFile(picture.image_srgb, picture.mask, linear=False, camera=picture.camera)
 
 
 def _linear_picture(path: Path) -> PictureFile:
@@ -200,7 +207,8 @@ def _linear_picture(path: Path) -> PictureFile:
         _log.warning("%s: %.1g%% of the radiance is negative and was set to 0", path, 100 * negative)
         rgb = np.maximum(rgb, 0)
     mask = None if alpha is None else check_mask(alpha[..., None], f"{path} ({name})")
-    return PictureFile(rgb if mask is None else unpremultiply(rgb, mask), mask, True, header_camera(attributes))
+    straight = rgb if mask is None else unpremultiply(rgb, mask)
+    return PictureFile(straight, mask, linear=True, camera=header_camera(attributes))
 
 
 def reduced(view: View, longest_side: int, linear: bool) -> View:

@@ -97,4 +97,4 @@ def interpolated_light(environment: Float[np.ndarray, "h w 3"], rows: int) -> Fl
     low = np.minimum(place.astype(int), height - 2)
     share = (place - low)[:, None, None]
     taller = environment[low] * (1 - share) + environment[low + 1] * share
-    return np.einsum("jw,hwc->hjc", interpolation(columns, width, True), taller).astype(np.float32)
+    return np.einsum("jw,hwc->hjc", interpolation(columns, width, circular=True), taller).astype(np.float32)

@@ -26,7 +26,7 @@ class Report:
     remaining: float | None
 
 
-Progress = Callable[[Report], None]
+OnReport = Callable[[Report], None]  # whoever shows it
 
 
 def refinement_note(stages: Sequence[Mapping[str, Any]]) -> str | None:

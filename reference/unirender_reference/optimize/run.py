@@ -7,17 +7,18 @@ as far as the renderer is: `docs/optimization.md` says how far.
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from unirender.arguments import as_instance, as_path
 from unirender.errors import UnirenderError
 from unirender.whole_files import file_sha256
+from unirender_reference.backend import renderer_threads
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine import HeldOut, RefineConfig, RefineState, refine
-from unirender_reference.optimize.report import Progress, Report
+from unirender_reference.optimize.report import OnReport, Report
 from unirender_reference.optimize.result import write_result
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
@@ -38,7 +39,7 @@ def optimize(
     config: OptimizeConfig,
     out: str | Path | None = None,
     init: Solution | None = None,
-    progress: Progress | None = None,
+    progress: OnReport | None = None,
     place: Sphere | None = None,
     pictures: bool = True,
     threads: int = 0,
@@ -117,24 +118,6 @@ def _is(path: Path, sha256: str) -> bool:
     return path.is_file() and file_sha256(path) == sha256
 
 
-@contextlib.contextmanager
-def renderer_threads(count: int) -> Iterator[None]:
-    """Lets Dr.Jit work with this many threads; 0: as it is."""
-    from unirender_reference.backend import mitsuba
-
-    mitsuba()
-    import drjit as dr
-
-    before = dr.thread_count()
-    if count:
-        dr.set_thread_count(count)
-    try:
-        yield
-    finally:
-        if count:
-            dr.set_thread_count(before)
-
-
 def _plan(obj: MeshObject | None, init: Solution | None, config: OptimizeConfig) -> list[str]:
     """The names of the stages.
 
@@ -160,7 +143,7 @@ class _Run:
         views: Views,
         config: OptimizeConfig,
         folder: RunFolder | None,
-        show: Progress,
+        show: OnReport,
         plan: list[str],
         began: float | None = None,
     ) -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -40,9 +40,14 @@ TOP = 400.0  # precision that holds log albedo below that of 1
 LOG_RADIANCE = (-8.0, 9.0)
 FINISHED = 2e-3  # relative gain of a step below which the search ends
 
-Eliminated = tuple[
-    np.ndarray, np.ndarray, np.ndarray
-]  # theta's indices, -du / dtheta (n, t), -du where theta stays (n,)
+
+@dataclass(frozen=True)
+class Eliminated:
+    """How one channel of u follows from a move of theta, `scale` of a full step: du = -(scale still + slope move)."""
+
+    index: Int[np.ndarray, " t"]  # the entries of theta that the channel depends on, of which `move` is taken
+    slope: Float[np.ndarray, "n t"]
+    still: Float[np.ndarray, " n"]  # -du of a full step where theta stays
 
 
 @dataclass(frozen=True)
@@ -203,7 +208,7 @@ class Fit:
             hessian[np.ix_(index, index)] += added - cross.T @ solved[:, :-1]
             gradient[index] += jacobian.T @ seen - cross.T @ solved[:, -1]
             gradient[3 * c + k] += TOP * model.above[:, k].sum()
-            eliminated.append((index, solved[:, :-1], solved[:, -1]))
+            eliminated.append(Eliminated(index, solved[:, :-1], solved[:, -1]))
         return hessian, gradient, eliminated
 
     def step(
@@ -242,6 +247,6 @@ class Fit:
         low, high = NODES[0] - maps["roughness"].max(), NODES[-1] - maps["roughness"].min()
         roughness = float(np.clip(roughness, low, high))
         move = np.concatenate([move[:-2], [metallic - at.metallic, roughness - at.roughness]])
-        follow = [-(constant * scale + per @ move[index]) for index, per, constant in eliminated]
+        follow = [-(of.still * scale + of.slope @ move[of.index]) for of in eliminated]
         pixel = at.pixel + np.clip(np.stack(follow, axis=1), -1, 1)
         return Unknowns(pixel, at.light + move[:c], at.gain + move[c : c + 3], metallic, roughness)

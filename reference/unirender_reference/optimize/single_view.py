@@ -30,7 +30,7 @@ from unirender_reference.shapes import MeshObject
 
 LEAST_RADIANCE = 0.02  # of a predicted light: its logarithm is what changes
 
-OnStep = Callable[[Step], None]
+OnStep = Callable[[Step], None]  # it only hears
 
 
 def optimize_image(

@@ -45,7 +45,7 @@ LEAST_SCALE = 0.2  # of the residuals under Cauchy's loss, in units of SIGMA
 LEAST_SHARE = 1.5  # pixels for each of its texels
 LEAST_SIDE = 64  # pixels of a reduced picture: fewer do not tell metallic
 
-OnStep = Callable[[Step], bool]
+OnStep = Callable[[Step], bool]  # whether to go on
 
 
 def start_solution(views: Views, obj: MeshObject, texture_size: int, light_rows: int) -> Solution:

@@ -5,7 +5,12 @@ import itertools
 from unirender_reference.optimize.transport_config import TransportConfig
 
 # What the parts take beside each other: seconds of one run of 8 views of 64 pixels on 2 cores. Only ratios count.
-MATRICES, START, FULL, SHARPER, MAPS, ROUND = 8.0, 0.6, 2.6, 2.0, 2.2, 4.0
+MATRICES = 8.0  # the transport matrices
+START = 0.6  # a solve with few steps from one of the starts
+FULL = 2.6  # the solve from the best of them
+SHARPER = 2.0  # more of it, where the light is sharpened
+MAPS = 2.2  # materials that vary over the surface
+ROUND = 4.0  # a round of correction by path-traced pictures
 
 
 def solve_shares(config: TransportConfig, starts: int) -> list[float]:

@@ -53,6 +53,13 @@ class MeshObject:
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        self._check_types()
+        self._check_arrays()
+        self._check_albedo()
+        self._check_maps()
+        self._check_lengths()
+
+    def _check_types(self) -> None:
         if not isinstance(self.name, str):
             raise UnirenderError(f"object name: got {self.name!r:.40}, expected a text")
         for label in ("vertices", "faces", "normals", "uv", "albedo", "roughness", "metallic", "normal_map"):
@@ -61,6 +68,9 @@ class MeshObject:
                 raise UnirenderError(f"{self.name}: got {label} {array!r:.40}, expected a numpy array")
         if "." in self.name or "/" in self.name:
             raise UnirenderError(f"object name: got {self.name!r}, expected no '.' and no '/'; rename the object")
+
+    def _check_arrays(self) -> None:
+        """Vertices, normals, texture coordinates and faces: their shapes and what they index."""
         n = len(self.vertices)
         for label, array, shape in (
             ("vertices", self.vertices, (n, 3)),
@@ -77,6 +87,8 @@ class MeshObject:
             raise UnirenderError(f"{self.name}: faces must be int32 (m, 3) with m > 0, got {self.faces.shape}")
         if self.faces.min() < 0 or self.faces.max() >= n:
             raise UnirenderError(f"{self.name}: faces index outside the {n} vertices; the mesh is broken")
+
+    def _check_albedo(self) -> None:
         if self.albedo.shape != (3,) and (self.albedo.ndim != 3 or self.albedo.shape[2] != 3 or self.uv is None):
             raise UnirenderError(
                 f"{self.name}: albedo must be (3,), or (h, w, 3) with uv; got {self.albedo.shape}, "
@@ -84,6 +96,9 @@ class MeshObject:
             )
         if self.albedo.dtype != np.float32 or not (self.albedo.min() >= 0 and self.albedo.max() <= 1):
             raise UnirenderError(f"{self.name}: albedo must be float32, linear, within [0, 1]")
+
+    def _check_maps(self) -> None:
+        """Roughness, metallic and normal map, where there are any."""
         for label, texture in (("roughness", self.roughness), ("metallic", self.metallic)):
             if texture is not None:
                 self._check_texture(label, texture, 2)
@@ -93,6 +108,9 @@ class MeshObject:
             self._check_texture("normal_map", self.normal_map, 3)
             if np.abs(np.linalg.norm(self.normal_map, axis=-1) - 1).max() > UNIT_TOLERANCE:
                 raise UnirenderError(f"{self.name}: normal_map must hold unit vectors; normalise it")
+
+    def _check_lengths(self) -> None:
+        """Normals are unit vectors, and the vertices lie in the unit sphere and touch it."""
         length = np.linalg.norm(self.normals, axis=1)
         if np.abs(length - 1).max() > UNIT_TOLERANCE:
             raise UnirenderError(f"{self.name}: normals must be unit vectors, got lengths down to {length.min():.4f}")

@@ -1,8 +1,8 @@
 """Both directions of a trained network: p(attributes | image) and p(image | attributes).
 
-The stream that is given is clean and is encoded once; the other one is sampled (`unirender.diffusion.sampling`), in one
-step or in many. Gradients flow through both, to what is given and to the weights; who needs none calls under
-`torch.no_grad()`.
+They are the two cases of the paper's Eq. 3. The stream that is given is clean (its timestep is 0) and is encoded once;
+the other one is sampled from T downwards (`unirender.diffusion.sampling`), in one step or in many. Gradients flow
+through both, to what is given and to the weights; who needs none calls under `torch.no_grad()`.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ def infer_attributes(
     progress: Progress = iter,
     step_end: StepEnd | None = None,
 ) -> Maps:
-    """Inverse rendering: p(attributes | image).
+    """Inverse rendering: p(attributes | image), (t_attributes, t_image) = (t, 0) in Eq. 3.
 
     Args:
         model: the two streams.
@@ -91,7 +91,7 @@ def infer_image(
     derived: Bool[Tensor, "b 6"] | None = None,
     step_end: StepEnd | None = None,
 ) -> Float[Tensor, "b 3 H W"]:
-    """Rendering: p(image | attributes).
+    """Rendering: p(image | attributes), (t_attributes, t_image) = (0, t) in Eq. 3.
 
     Args:
         model: the two streams.

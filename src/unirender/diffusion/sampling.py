@@ -31,9 +31,8 @@ MOST_STEPS = 500  # of 1000 timesteps; from 667 on a step would start at timeste
 
 PREDICTION_TYPE = "sample"  # diffusers' name of x0
 NO_SIGNAL = 1e-6  # alpha_bar at T: 0, or what diffusers puts there for it
-SAME_SIGNAL = (
-    0.01  # of sqrt(alpha_bar), up to which two noise schedules are one; diffusers' own rescaling is off by 0.0005
-)
+# Of sqrt(alpha_bar), up to which two noise schedules are one; diffusers' own rescaling is off by 0.0005.
+SAME_SIGNAL = 0.01
 CHANGING_X0 = ("clip_sample", "thresholding")  # settings of schedulers
 OTHER_NOISE = tuple(f"use_{kind}" for kind in ("karras_sigmas", "exponential_sigmas", "beta_sigmas", "flow_sigmas"))
 DDIM = ("DDIMScheduler", "DDIMParallelScheduler")

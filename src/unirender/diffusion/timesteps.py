@@ -29,7 +29,7 @@ class Timesteps:
 
 
 def conditional_timesteps(batch: int, last: int, p_render: float, p_t: float, generator: torch.Generator) -> Timesteps:
-    """Eqs. 3 and 4. The rendering samples come first; their share of a batch is exact up to random rounding.
+    """Eq. 3 and Eq. 4. The rendering samples come first; their share of a batch is exact up to random rounding.
 
     Args:
         batch: samples.

@@ -1,6 +1,6 @@
 """Maps <-> the pictures in [-1, 1] that a codec turns into latents.
 
-The attributes are six pictures, the paper's layout with the HDR light as the sixth:
+The attributes are six pictures, the paper's layout (Sec. 3.2, "Latent Preparation") with the HDR light as the sixth:
 
     material [metallic, roughness, mask], albedo, normal, specular, diffuse, environment
 

@@ -1,4 +1,4 @@
-"""The ablation `without_unified`: two dual-stream networks, one per direction, that share no weight.
+"""The ablation `without_unified` (paper Sec. 4.3): two dual-stream networks, one per direction, that share no weight.
 
 `p(image | attributes)` and `p(attributes | image)` each have a network with both encoders and only the decoder of what
 they predict; nothing in either waits for a gradient that never comes. Every row of a batch goes to the network of the

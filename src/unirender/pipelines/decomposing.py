@@ -1,4 +1,15 @@
-"""Decomposing pictures of any size with a network that knows one size: all of them in one batch."""
+"""Decomposing pictures of any size with a network that knows one size: all of them in one batch.
+
+The steps in their order, each with the module that knows how:
+
+    each picture is brought to the network's square                         `framing`
+    p(attributes | image), the inverse case of the paper's Eq. 3            `network`, `diffusion.inference`
+    maps at the picture's size; materials read by the checkpoint's line     `results`, `calibration`
+    the detail of tiles, if it is asked for                                 `tiling`
+    closed: what is rendered of the maps is the picture                     `closure`
+    the albedo made even between its edges, if it is asked for              `flat_albedo`
+    samples become mean and spread, and the light agrees with s and d       `results`
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

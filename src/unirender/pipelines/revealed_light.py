@@ -55,28 +55,19 @@ def agreeing_light(intrinsics: Intrinsics) -> Float[np.ndarray, "eh ew 3"]:
 
 
 def _revealed(intrinsics: Intrinsics, by: tuple[str, ...], steps: int) -> Float[np.ndarray, "eh ew 3"]:
+    """The environment after so many steps `by` specular, or by it and diffuse; as it is where nothing is covered."""
     given = Intrinsics(
         **intrinsics.require("normal", "roughness", *by, "mask", "environment"), camera=intrinsics.camera
     )
     if max(given.height, given.width) > SIDE:
         given = Frame.reduced(given.require("mask")["mask"], SIDE).enter_intrinsics(given)
     given = given.with_unit_normals()
-    maps = given.require("normal", "roughness", *by, "mask")
     environment = intrinsics.require("environment")["environment"]
     rows, columns = environment.shape[:2]
     shape = min(rows, MOST_SHAPE[0]), min(columns, MOST_SHAPE[1])
-    there = (maps["mask"][..., 0] > 0.5) & nonzero(maps["normal"])
-    if not there.any():
+    seen = _seen(given, by, shape)
+    if not seen:
         return environment
-    view = given.camera.view_directions(given.height, given.width)[there].T
-    normal = facing_normal(maps["normal"][there].T, view)
-    texel = np.pi / (shape[0] - 1)
-    alpha = np.maximum(
-        np.square(maps["roughness"][there][:, 0]), np.float32(texel / LOBE_WIDTH)
-    )  # at least a texel wide
-    seen = [(lobe_matrix(normal, view, alpha, shape), maps["specular"][there], 1.0)]
-    if "diffuse" in by:
-        seen.append((cosine_matrix(normal, shape), maps["diffuse"][there], DIFFUSE_WEIGHT))
     total = np.sum([weight * takes.sum(axis=0) for takes, _, weight in seen], axis=0)[:, None]
     prior = PRIOR * total.mean()
     light = resample_environment(environment, shape).reshape(-1, 3)
@@ -88,3 +79,21 @@ def _revealed(intrinsics: Intrinsics, by: tuple[str, ...], steps: int) -> Float[
             wanted = wanted + weight * (takes.T @ ratio)
         gain *= wanted / (total + prior)
     return (environment * resample_environment(gain.reshape(*shape, 3), (rows, columns))).astype(np.float32)
+
+
+def _seen(
+    given: Intrinsics, by: tuple[str, ...], shape: tuple[int, int]
+) -> list[tuple[Float[np.ndarray, "p m"], Float[np.ndarray, "p 3"], float]]:
+    """Of each buffer what its pixels take of the texels (W, C), what they show (s, d), and what that counts (1, c)."""
+    maps = given.require("normal", "roughness", *by, "mask")
+    there = (maps["mask"][..., 0] > 0.5) & nonzero(maps["normal"])
+    if not there.any():
+        return []
+    view = given.camera.view_directions(given.height, given.width)[there].T
+    normal = facing_normal(maps["normal"][there].T, view)
+    narrowest = np.pi / (shape[0] - 1) / LOBE_WIDTH  # alpha of a lobe as wide as a texel
+    alpha = np.maximum(np.square(maps["roughness"][there][:, 0]), np.float32(narrowest))
+    seen = [(lobe_matrix(normal, view, alpha, shape), maps["specular"][there], 1.0)]
+    if "diffuse" in by:
+        seen.append((cosine_matrix(normal, shape), maps["diffuse"][there], DIFFUSE_WEIGHT))
+    return seen

@@ -1,5 +1,13 @@
 """`UniRenderPipeline`: decompose, render, edit and relight with one dual-stream model.
 
+    decompose   picture -> p(attributes | image), Eq. 3's inverse case -> maps closed, light made to agree with s and d
+    render      maps, s and d derived where unknown -> p(image | attributes), Eq. 3's rendering case -> picture
+    edit        decompose -> new material, s of its roughness -> render before and after -> the change on the input
+    relight     decompose -> s and d of the new light -> render before and after -> the change on the input
+
+Eq. 3 is the paper's: the stream that is given is clean, the other begins as noise (`unirender.diffusion.inference`). In
+this order the steps stand in `unirender.pipelines.decomposing` and `unirender.pipelines.rendering`.
+
 Its public arrays are numpy. A *picture* is straight display values like a PNG's, with its mask beside it; a *linear
 image* that comes back is premultiplied. Any size: pictures are brought to the model's square and results back
 (`unirender.pipelines.framing`); `size` runs the network at another multiple of `size_multiple`, `tile` adds the detail

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import unirender
-from unirender.files import write_png
 from unirender.scene_export.card import Card
+from unirender.visualization import write_png
 
 FLOAT, UNSIGNED_SHORT = 5126, 5123
 CLAMP, LINEAR = 33071, 9729

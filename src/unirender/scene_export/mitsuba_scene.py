@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.files import write_png
 from unirender.lighting import area_pixels, drawable
 from unirender.scene_export.card import Card
+from unirender.visualization import write_png
 
 FAR_CLIP = 1e4  # Mitsuba's own
 MOST_VERTICES = 1024  # along a side of the card's grid

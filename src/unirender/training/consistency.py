@@ -53,7 +53,7 @@ class Consistency:
         mask: Float[Tensor, "b 1 H W"],
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
-        """Error of the image rendered from predicted attributes.
+        """Eq. 5: the error of the image rendered from predicted attributes.
 
         Without `cycle_into_renderer` the gradient reaches the attributes, and through them the pass that predicted
         them, but not the weights of the rendering pass.

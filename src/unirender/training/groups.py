@@ -184,17 +184,22 @@ def read_groups(path: str | Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                     )
                 stream = tar.extractfile(info)
                 members[rest] = stream.read() if stream else b""
-            with path.open("rb") as file:  # a file that was cut off reads like a shorter one
-                file.seek(tar.offset)
-                if file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
-                    raise UnirenderError(
-                        f"{path}: stops after group {key} without the two empty blocks that end a tar: it was "
-                        "cut off or is damaged; copy it again, or remake it"
-                    )
+            _check_end(path, tar.offset, key)
     except (tarfile.TarError, OSError) as error:
         raise UnirenderError(f"{path}: not a readable tar shard ({error}); copy it again, or remake it") from error
     if members:
         yield key, members
+
+
+def _check_end(path: Path, offset: int, last: str) -> None:
+    """Looks whether the end of a tar stands after its last group: a file that was cut off reads like a shorter one."""
+    with path.open("rb") as file:
+        file.seek(offset)
+        if file.read(len(END_OF_ARCHIVE)) != END_OF_ARCHIVE:
+            raise UnirenderError(
+                f"{path}: stops after group {last} without the two empty blocks that end a tar: it was cut off or is "
+                "damaged; copy it again, or remake it"
+            )
 
 
 def read_environments(path: str | Path) -> Iterator[tuple[str, dict[int, Float[np.ndarray, "eh ew 3"]]]]:

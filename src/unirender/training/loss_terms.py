@@ -70,7 +70,7 @@ def timestep_weights(
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared errors of latents.
+    """Mean squared errors of latents: Eq. 2 of the paper for one stream, of x0 in place of the noise.
 
     Attributes:
         conditioning: whose codec spreads the weights of pixels over latents.

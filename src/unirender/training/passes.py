@@ -180,13 +180,22 @@ class BatchGradient:
         parts: list[Part] = []
         for j in range(split.parts):
             rows = slice(j, None, split.parts)
-            a, i, x, y = (of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again))
-            w = weight[rows]
-            mass = {"image": of_image[rows][i > 0], "attributes": w[a > 0], "colours": of_colours[rows][a > 0]}
-            mass |= {"environment": a > 0, "composite": w[x], "cycle": w[y], "answers": x}
+            t_attributes, t_image, is_inverse, is_again = (
+                of_batch[split.own][rows] for of_batch in (drawn.attributes, drawn.image, inverse, again)
+            )
+            weights = {
+                "image": of_image[rows][t_image > 0],
+                "attributes": weight[rows][t_attributes > 0],
+                "colours": of_colours[rows][t_attributes > 0],
+                "environment": t_attributes > 0,
+                "composite": weight[rows][is_inverse],
+                "cycle": weight[rows][is_again],
+                "answers": is_inverse,
+            }
+            mass = {kind: float(of_rows.sum()) for kind, of_rows in weights.items()}
             seed = seeds[split.processes.rank + split.processes.size * j]
-            share = int(y.sum()) / max(1, int(x.sum()))
-            parts.append(Part(rows, Timesteps(a, i), seed, share, {kind: float(v.sum()) for kind, v in mass.items()}))
+            cycle_share = int(is_again.sum()) / max(1, int(is_inverse.sum()))
+            parts.append(Part(rows, Timesteps(t_attributes, t_image), seed, cycle_share, mass))
         return parts
 
     def terms(self, part: Part, batch: Maps) -> LossTerms:
@@ -223,17 +232,17 @@ def kind_of(term: str) -> str:
     return term if term in OWN_ROWS else "colours" if term in COLOURS else "attributes"
 
 
-def _plus(a: Sequence[Tensor | None], b: Sequence[Tensor | None]) -> Gradients:
-    """Not in place: autograd may give two parameters one tensor."""
-    both = [(x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None]
-    sums = iter(
-        torch._foreach_add(  # pyright: ignore[reportPrivateImportUsage] - torch.optim is built on it
-            [x for x, _ in both], [y for _, y in both]
-        )
-        if both
-        else ()
-    )
-    return [y if x is None else x if y is None else next(sums) for x, y in zip(a, b, strict=True)]
+def _plus(summed: Sequence[Tensor | None], more: Sequence[Tensor | None]) -> Gradients:
+    """Sums by parameter. Not in place: autograd may give two parameters one tensor."""
+    pairs = list(zip(summed, more, strict=True))
+    sums = [other if own is None else own for own, other in pairs]
+    both = {i: (own, other) for i, (own, other) in enumerate(pairs) if own is not None and other is not None}
+    if both:
+        firsts, seconds = zip(*both.values(), strict=True)
+        added = torch._foreach_add(firsts, seconds)  # pyright: ignore[reportPrivateImportUsage] - torch.optim uses it
+        for i, total in zip(both, added, strict=True):
+            sums[i] = total
+    return sums
 
 
 def laid_out_like(p: Tensor, values: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """The presets: one table, a row per model. Torch-free, so that the command line can show and change them quickly.
 
-`paper` is the supplement's recipe; `tiny` trains on two CPU cores. Ablations are rows, not forks.
+`paper` is the recipe of the supplement, "Model Training"; `tiny` trains on two CPU cores. Ablations (paper
+Sec. 4.3) are rows, not forks.
 """
 
 import dataclasses
@@ -11,9 +12,8 @@ from unirender.training.config import Augmentation, LossConfig, OptimizerConfig,
 
 _TINY = TrainConfig(
     loss=LossConfig(cycle_into_renderer=False),
-    augmentation=Augmentation(
-        mix=0.4, tint=0.15, permute=0.1, turn=0.05
-    ),  # close to natural light: it comes from above
+    # Close to natural light: it comes from above.
+    augmentation=Augmentation(mix=0.4, tint=0.15, permute=0.1, turn=0.05),
     batch_size=24,
     p_render=0.4,
     p_t=0.15,

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,9 +80,7 @@ def _train(
 
     from unirender.models.precision import resolve_dtype
     from unirender.training.checkpoint import STATE_FILE
-    from unirender.training.closed_form_check import doubt
     from unirender.training.export import export_pipeline
-    from unirender.training.groups import split_of, unread_shards
     from unirender.training.live import live_report, never_at_peak
     from unirender.training.memory import training_bytes
     from unirender.training.start import read_start
@@ -110,13 +109,7 @@ def _train(
     if processes.is_main:
         say(f"memory: {memory}")
         if not resumed:  # which goes on with the shards that it has
-            say(f"{options.data}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
-            if unread := unread_shards(options.data):
-                tell(unread)
-            if doubtful := doubt(data):
-                tell(doubtful)
-            if split_of(options.data) == "test":
-                tell(f"{options.data}: was rendered with --split test; what is trained on it cannot be tested on it")
+            _tell_data(options.data, data, say)
     del data  # a folder that grew is opened anew: not both at once
     with contextlib.closing(source):
         with (
@@ -129,6 +122,20 @@ def _train(
         pipeline = export_pipeline(trainer, out / "pipeline") if processes.is_main else None
     processes.close()
     return pipeline
+
+
+def _tell_data(folder: Path, data: "GroupDataset", say: Callable[[str], None]) -> None:
+    """Says what is in a data folder, and what is doubtful about it."""
+    from unirender.training.closed_form_check import doubt
+    from unirender.training.groups import split_of, unread_shards
+
+    say(f"{folder}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+    if unread := unread_shards(folder):
+        notice(unread)
+    if doubtful := doubt(data):
+        notice(doubtful)
+    if split_of(folder) == "test":
+        notice(f"{folder}: was rendered with --split test; what is trained on it cannot be tested on it")
 
 
 def run_config(options: Train, config: TrainConfig, out: Path, parallel: int) -> RunConfig:

@@ -42,7 +42,7 @@ from unirender.training.processes import ALONE, Processes
 from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
 from unirender.training.state import check_alike, resume, state_of, write_config
-from unirender.training.stopping import stopping_gently
+from unirender.training.stopping import StopRequest, stopping_gently
 from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
 
@@ -181,14 +181,7 @@ class Trainer:
         begun, logged = self.step, (self.step, self.seconds)
         with stopping_gently() as request:
             while self.progress < 1:
-                start = time.monotonic()  # pictures, validation and saves are no training
-                batch = source.next()
-                self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
-                self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
-                seconds = self.seconds + time.monotonic() - start
-                told = self.processes.gather((seconds, due("refresh"), request.signal))
-                self.seconds, refreshing, _ = told[0]
-                stopping = _first([signal for _, _, signal in told])
+                refreshing, stopping = self._train_next(source, due, request)
                 if self.step % self.run.log_every == 0 or self.progress >= 1:
                     with request.unheard():
                         self._tell_losses(*logged, report)
@@ -209,6 +202,17 @@ class Trainer:
                 raise Ended(stopping)
         if self.step > begun or not self._picture_file.exists():  # which a kill after the last save has prevented
             self._look(self.shown, validation, report)
+
+    def _train_next(self, source: BatchSource, due: Due, request: StopRequest) -> tuple[bool, int | None]:
+        """One step and its seconds: are there data to refresh (by process 0), and was any process asked to stop."""
+        start = time.monotonic()  # pictures, validation and saves are no training
+        batch = source.next()
+        self.shown = self.shown or {name: value[:SHEET_ROWS].cpu().clone() for name, value in batch.items()}
+        self.log.add(self.train_step(batch, source.read_ahead) | self.overflow(batch))
+        seconds = self.seconds + time.monotonic() - start
+        told = self.processes.gather((seconds, due("refresh"), request.signal))
+        self.seconds, refreshing, _ = told[0]
+        return refreshing, _first([signal for _, _, signal in told])
 
     def _tell_losses(self, step: int, seconds: float, report: Report) -> None:
         """Logs the means of the losses, and the speed since a step and its seconds of training."""

@@ -76,19 +76,26 @@ def can_widen(network: DualStreamModel, other: DualStreamModel) -> bool:
     own, old = (_plain(each) for each in (network, other))
     if any(own[name] != old.get(name) for name in own.keys() - MAY_DIFFER):
         return False
-    widths, narrow, groups = own["block_out_channels"], old["block_out_channels"], own["norm_num_groups"]
-    steps = list(zip(itertools.pairwise(widths), itertools.pairwise(narrow), strict=False))
-    return any(own[name] != old[name] for name in GROWS) and (
-        own["picture_features"] == "none"  # their ways in have the widths of the levels
-        and isinstance(own["attention_head_dim"], int)
-        and len(widths) == len(narrow)
-        and widths[0] == narrow[0]
-        and all(
-            new >= before and new % groups == 0 == before % groups for new, before in zip(widths, narrow, strict=True)
-        )
-        and all(a != b or old_a == old_b for (a, b), (old_a, old_b) in steps)  # no trained shortcut is left over
-        and set(old["attention_levels"]) <= set(own["attention_levels"])
-    )
+    if all(own[name] == old[name] for name in GROWS):
+        return False
+    if own["picture_features"] != "none":  # what they enter by has the widths of the levels
+        return False
+    if not isinstance(own["attention_head_dim"], int) or not set(old["attention_levels"]) <= set(
+        own["attention_levels"]
+    ):
+        return False
+    return _levels_grow(old["block_out_channels"], own["block_out_channels"], own["norm_num_groups"])
+
+
+def _levels_grow(narrow: list[int], wide: list[int], groups: int) -> bool:
+    """Whether each level keeps its channels or gets more, in whole groups; the finest keeps them."""
+    if len(wide) != len(narrow) or wide[0] != narrow[0]:
+        return False
+    if any(new < old or new % groups or old % groups for new, old in zip(wide, narrow, strict=True)):
+        return False
+    # Between levels of one width there is no shortcut: none that was trained may be left over.
+    between = zip(itertools.pairwise(wide), itertools.pairwise(narrow), strict=True)
+    return all(new[0] != new[1] or old[0] == old[1] for new, old in between)
 
 
 def widened(config: ModelConfig, other: DualStreamModel, vae: nn.Module | None = None) -> DualStreamModel:
@@ -194,14 +201,14 @@ class _Growth:
         new.conv_shortcut.bias.zero_()
 
     def attentions(self, new: Part, old: Part, level: int) -> None:
-        """Of a block, if it has any."""
-        before = getattr(old, "attentions", None) or itertools.repeat(None)
-        for mine, theirs in zip(getattr(new, "attentions", None) or (), before, strict=False):
-            if theirs is None:
-                nn.init.zeros_(mine.proj_out.weight)
-                nn.init.zeros_(mine.proj_out.bias)
+        """Of a block, if it has any; where the old one has none, they begin as the identity."""
+        wide, narrow = (getattr(block, "attentions", None) or () for block in (new, old))
+        for i, attention in enumerate(wide):
+            if narrow:
+                self.transformer(attention, narrow[i], self.levels[level])
             else:
-                self.transformer(mine, theirs, self.levels[level])
+                nn.init.zeros_(attention.proj_out.weight)
+                nn.init.zeros_(attention.proj_out.bias)
 
     def transformer(self, new: Part, old: Part, level: Channels) -> None:
         self.layer(new.norm, old.norm, None, level)

@@ -40,9 +40,9 @@ from unirender_evaluation.figures.panels import (
 )
 from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.light_methods import MeanLight
-from unirender_evaluation.methods import InputAsAlbedo, UneditedInput
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites import Material, Scene, Suite, load_suite
+from unirender_evaluation.trivial_methods import InputAsAlbedo, UneditedInput
 
 UNEDITED = Subject("unedited", make_row(UneditedInput(), "trivial"))
 ALBEDO = Subject("as albedo", make_row(InputAsAlbedo(), "trivial"))

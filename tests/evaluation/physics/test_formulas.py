@@ -1,5 +1,6 @@
 """Each physics test: a perfect renderer or decomposer passes, and a broken one (its twin) fails that test."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
-from unirender_evaluation.methods import Composite, Image
+from unirender_evaluation.composite_methods import Composite
+from unirender_evaluation.methods import Image
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.physics import formulas
-from unirender_evaluation.physics.questions import rough_loop, true_maps
+from unirender_evaluation.physics.questions import loop_by_roughness, true_maps
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Stage
 from unirender_evaluation.physics.tests import PHYSICS_TABLE, TESTS, renderer_tests
 from unirender_evaluation.suites import Material, Scene, Suite, load_suite
@@ -135,8 +137,9 @@ def test_the_primary_loop_takes_the_rough_pictures(suite: Suite) -> None:
     def wrong_where_smooth(stage: Stage, material: Material, image: Image) -> Intrinsics:
         return (true_maps if material[1] >= ROUGH else TESTS["loop_smooth"].twin)(stage, material, image)
 
-    assert rough_loop(True, wrong_where_smooth, stage) == rough_loop(True, true_maps, stage)
-    assert rough_loop(False, wrong_where_smooth, stage) < rough_loop(False, true_maps, stage) - 10
+    rough, smooth = (partial(loop_by_roughness, stage=stage, rough=rough) for rough in (True, False))
+    assert rough(wrong_where_smooth) == rough(true_maps)
+    assert smooth(wrong_where_smooth) < smooth(true_maps) - 10
     assert {m[1] >= ROUGH for m in stage.pictures} == {True, False}
 
 

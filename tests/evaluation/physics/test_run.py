@@ -11,7 +11,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.symmetries import turn_rotation
-from unirender_evaluation.methods import Composite
+from unirender_evaluation.composite_methods import Composite
 from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics import run as physics_run
 from unirender_evaluation.physics.ambiguity import POSTERIOR

@@ -16,9 +16,8 @@ from rich.console import Console
 from unirender import cli
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
-from unirender.files import write_png
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import InputAsAlbedo
+from unirender.visualization import write_png
 from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.prediction_check import PredictionError
 from unirender_evaluation.public import answers
@@ -33,6 +32,7 @@ from unirender_evaluation.public.sets import PublicSet
 from unirender_evaluation.public.tables import averaged
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, plugin_rows, prediction_rows
+from unirender_evaluation.trivial_methods import InputAsAlbedo
 from unirender_evaluation.versions import Versions, package_folder
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 

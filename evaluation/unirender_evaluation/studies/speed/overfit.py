@@ -31,7 +31,9 @@ from unirender_evaluation.table_text import TextTable
 
 AIM_DB = 35.0
 PRESET = "tiny_plain"
-BATCH, LEARNING_RATE, WARMUP_STEPS, FINAL_LR, EMA_DECAY = 8, 2e-3, 20, 0.01, 0.98
+BATCH = 8
+LEARNING_RATE, FINAL_LR, WARMUP_STEPS = 2e-3, 0.01, 20  # the final one: of the first
+EMA_DECAY = 0.98
 LOOKS = 12  # measures over the run, besides those at its start and end
 DIRECTIONS = {"render": "render", "inverse": "inverse, six pictures", "albedo": "inverse, albedo"}
 
@@ -155,7 +157,7 @@ def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype:
         def look(pipeline: Any) -> dict[str, Score]:
             found = both_directions(pipeline, pair)
             points.append(Point(trainer.seconds / 60, trainer.step * config.batch_size, found))
-            return {name: Score(value, True) for name, value in found.items()}
+            return {name: Score(value, higher_is_better=True) for name, value in found.items()}
 
         trainer.fit(FixedSource(batch), validate=look)
     return points

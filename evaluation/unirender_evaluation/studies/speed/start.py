@@ -86,8 +86,8 @@ def cold_starts(
         options: further options of `decompose`.
         turns: that count.
     """
-    from unirender.files import write_png
     from unirender.shipped import checkpoint_folder
+    from unirender.visualization import write_png
 
     found = []
     with tempfile.TemporaryDirectory(prefix="unirender-start-") as name:

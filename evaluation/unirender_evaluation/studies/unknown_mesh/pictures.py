@@ -4,7 +4,7 @@ import numpy as np
 from PIL import Image
 
 from unirender.color import image_srgb, unpremultiply
-from unirender.files import map_picture
+from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import Grid, Line, Tile, draw, over_white
 from unirender_evaluation.gallery import Picture
 from unirender_evaluation.multiview.scenes import MultiviewScene

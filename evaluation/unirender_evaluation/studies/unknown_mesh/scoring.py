@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 
 from unirender_evaluation.light_metrics import light_values
-from unirender_evaluation.metrics import Metric, metric_key
+from unirender_evaluation.metrics import HIGHER, LOWER, Metric, metric_key
 from unirender_evaluation.multiview.scenes import LitPictures, MultiviewScene
 from unirender_evaluation.multiview.scoring import NEIGHBOURS, Looks, camera_means, solution_looks
 from unirender_evaluation.scoring import score_image, score_maps
@@ -29,13 +29,20 @@ SHAPE, STEEP = "shape", "shape_steep"
 STEEP_DEG = 60.0  # elevation of the steep cameras, above and below the horizon in turn
 STEEP_CAMERAS = 6
 MASK_IOU = Metric(
-    "mask_iou", "mask IoU", "", True, 1.0, (), 4, "sum of the lesser coverage over that of the greater, mean of cameras"
+    "mask_iou",
+    "mask IoU",
+    "",
+    HIGHER,
+    1.0,
+    (),
+    4,
+    "sum of the lesser coverage over that of the greater, mean of cameras",
 )
 NORMAL_COSINE = Metric(
-    "normal_cosine", "normal cos", "", True, 1.0, (), 4, "mean over the pixels that both cover, by the true coverage"
+    "normal_cosine", "normal cos", "", HIGHER, 1.0, (), 4, "mean over the pixels that both cover, by the true coverage"
 )
 CHAMFER = Metric(
-    "chamfer", "chamfer", "", False, 0.0, (), 4, "mean distance between the surfaces, in radii of the bounding sphere"
+    "chamfer", "chamfer", "", LOWER, 0.0, (), 4, "mean distance between the surfaces, in radii of the bounding sphere"
 )
 
 

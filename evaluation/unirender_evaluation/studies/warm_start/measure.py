@@ -24,7 +24,7 @@ from jaxtyping import Float
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.methods import seen_linear
-from unirender_evaluation.metrics import Metric, metric_key
+from unirender_evaluation.metrics import LOWER, Metric, metric_key
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.optimized_method import SHADE_SPP
@@ -44,7 +44,7 @@ TABLE, PICTURE = "warm-start", "picture"  # the prediction's protocol: it is tol
 USES = frozenset({MODEL, MULTIVIEW, OPTIMIZER, REFERENCE})
 TRUTH_SPP = 1024
 STEPS = Metric(
-    "steps", "steps", "", False, 0.0, (), 1, "Levenberg-Marquardt steps taken; a stage ends when it gains little"
+    "steps", "steps", "", LOWER, 0.0, (), 1, "Levenberg-Marquardt steps taken; a stage ends when it gains little"
 )
 
 
