@@ -140,6 +140,10 @@ def test_algorithm_1_picks_one_stream_for_the_whole_batch() -> None:
             ends = [bool(np.isin(np.asarray(x), [0, 999]).all()) for x in (a, i)]
             assert sorted(ends) == [False, True]
             first[name] += ends[0]
+    for seed in range(9):  # all of it follows the seed
+        a, b = (algorithm1_timesteps(16, 999, torch.Generator().manual_seed(seed)) for _ in range(2))
+        assert torch.equal(a.attributes, b.attributes)
+        assert torch.equal(a.image, b.image)
     for count in first.values():
         assert abs(count / draws - 0.5) < 5 * 0.5 / math.sqrt(draws)
 

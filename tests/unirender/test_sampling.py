@@ -28,6 +28,7 @@ from unirender.diffusion.schedule import last_timestep, make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel
+from unirender.models.packing import TRIPLETS
 
 SAMPLERS = ("ddim", "unipc")
 MU, S = 0.7, 0.5  # x0 ~ N(MU, S^2): the posterior mean and the probability flow are known
@@ -285,17 +286,20 @@ def loop(
 
 
 def test_extras_of_each_camera() -> None:
-    _, conditioning = make_model()
+    _, conditioning = make_model(derived_light=True)
     batch, given = make_batch(2), torch.ones(2, 6, dtype=torch.bool)
     cameras = [Camera(), Camera(fov_deg=60.0, principal=(0.2, 0.9))]
-    both = extras_by_camera(conditioning, batch["mask"], given, batch, cameras)
+    derived = torch.tensor([[False] * 6, [name == "diffuse" for name in TRIPLETS]])
+    both = extras_by_camera(conditioning, batch["mask"], given, batch, cameras, derived)
     for i, camera in enumerate(cameras):
         row = {name: value[i : i + 1] for name, value in batch.items()}
-        own = conditioning.extras(row["mask"], given[i : i + 1], row, camera)
+        own = conditioning.extras(row["mask"], given[i : i + 1], row, camera, derived[i : i + 1])
         assert torch.equal(both.image[i : i + 1], own.image)
         assert own.prior is not None
         assert both.prior is not None
         assert torch.equal(both.prior[i : i + 1], own.prior)
+    without = make_model(physics_prior="none")[1]
+    assert extras_by_camera(without, batch["mask"], given, batch, cameras).prior is None
     with pytest.raises(ValueError, match="2 cameras for 1 rows"):
         extras_by_camera(conditioning, batch["mask"][:1], given[:1], None, cameras)
 
