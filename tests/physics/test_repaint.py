@@ -15,7 +15,6 @@ SIZE = 32
 SPP = 1024
 LEAST = 30.0  # dB (measured 31 to 39; the two cubes face each other, and their light is of the old colours)
 PAINTED = np.float32(1) - ALBEDO[::-1]  # far more than training does
-PAINTED_6 = np.random.default_rng(1).uniform(0.1, 0.9, (6, 6, 3)).astype(np.float32)
 
 
 def buffers(renderer: Renderer, roughness: float, metallic: float, environment: np.ndarray, seed: int) -> Maps:
@@ -66,12 +65,13 @@ def test_the_closed_form_of_a_repainted_object_is_exact() -> None:
     """What is left out is light from one part of the object to another, which it has not."""
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(6, 6, 3)) * (0.3, 0.3, 0) + (0, 0, 1)
-    maps = {name: rng.uniform(0.1, 0.9, (6, 6, 3)).astype(np.float32) for name in ("albedo", "specular", "diffuse")}
+    old, new = rng.uniform(0.1, 0.9, (2, 6, 6, 3)).astype(np.float32)
+    maps = {name: rng.uniform(0.1, 0.9, (6, 6, 3)).astype(np.float32) for name in ("specular", "diffuse")}
     maps |= {name: rng.uniform(0.1, 0.9, (6, 6, 1)).astype(np.float32) for name in ("roughness", "metallic")}
     maps |= {"normal": (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)}
     maps |= {"mask": np.ones((6, 6, 1), np.float32)}
-    before, after = (split_sum_image(Intrinsics(**maps | {"albedo": colour})) for colour in (maps["albedo"], PAINTED_6))
-    found = repaint(maps | {"image": before}, PAINTED_6)
+    before, after = (split_sum_image(Intrinsics().replace(**maps, albedo=colour)) for colour in (old, new))
+    found = repaint(maps | {"image": before, "albedo": old}, new)
     np.testing.assert_allclose(found["image"], after, rtol=0, atol=2e-6)
     assert np.abs(before - after).max() > 0.1
 

@@ -385,11 +385,14 @@ def test_every_option_reaches_the_run(tmp_path: Path, monkeypatch: pytest.Monkey
     assert (what.out, what.limit) == (tmp_path / "out", 1)
     assert command("iiw", "set") == 0
     assert runs[-1].out == Path("results/public-iiw")
-    for name, kind in (("iiw", Iiw), ("maw", Maw)):
-        reader = BenchPublic(name, orb, resolution=16).reader()
-        assert (type(reader), reader.folder, reader.resolution) == (kind, orb, 16)
+    readers = BenchPublic("iiw", orb, resolution=16).reader(), BenchPublic("maw", orb, resolution=16).reader()
+    for reader, kind in zip(readers, (Iiw, Maw), strict=True):
+        assert isinstance(reader, kind)
+        assert (reader.folder, reader.resolution) == (orb, 16)
     assert Iiw(orb).resolution == BenchPublic("iiw", orb).resolution
-    assert [found.tolerance_deg for found in (StanfordOrb(orb), BenchPublic("stanford-orb", orb).reader())] == [2, 2]
+    usual = BenchPublic("stanford-orb", orb).reader()
+    assert isinstance(usual, StanfordOrb)
+    assert usual.tolerance_deg == StanfordOrb(orb).tolerance_deg == 2
 
 
 def command(*words: str) -> int:
