@@ -67,7 +67,7 @@ def error_at(name: str, steps: int, t: int) -> float:
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_every_number_of_steps_starts_at_pure_noise_and_is_finite(name: str) -> None:
     noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
-    for steps in (*range(2, 51), 61, MOST_STEPS):  # diffusers has 62 timesteps for 61 steps: one too many, at -1
+    for steps in (*range(2, 21), 30, 50, 61, MOST_STEPS):  # diffusers has 62 timesteps for 61: one too many, at -1
         states = path(name, steps, noise)
         assert max(states) == last_timestep(make_scheduler())
         assert len(states) == steps + 1
