@@ -11,7 +11,9 @@ import pytest
 from PIL import Image, ImageFont
 from tiny_suites import SIZE, make_suite
 
+from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
+from unirender.intrinsics import Intrinsics
 from unirender.options import ModelOptions
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender.whole_files import replace_file
@@ -228,6 +230,20 @@ def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite
     assert [name for name in MAPS if found[name] is not None] == ["albedo"]
     assert found["metallic 1"] is None
     assert all(tile is not None for tile in grid.lines[1].tiles[1:])
+
+
+def test_the_overview_asks_for_the_suites_edits_and_the_scenes_other_light(suite: Suite) -> None:
+    class Finds(Told):
+        def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+            return Intrinsics(albedo=image_srgb, mask=mask, camera=camera)
+
+    finds, base, scene = Finds(), suite.spec.base, suite.scenes[0]
+    overview([Subject("finds", make_row(finds, "external"))], suite, [scene])
+    *edited, relit = ({name: call[name] for name in call.keys() - {"mask", "camera"}} for call in finds.calls)
+    expected = [(edit.get("metallic", base[0]), edit.get("roughness", base[1])) for edit in edited]
+    assert expected == [tuple(edit) for edit in suite.spec.edits]
+    assert list(relit) == ["environment"]
+    np.testing.assert_array_equal(relit["environment"], suite.environment(suite.other_light(scene)))
 
 
 def test_the_light_figure_shows_balls_with_the_errors_of_the_tables(suite: Suite) -> None:

@@ -11,15 +11,15 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.config import ModelConfig
+from unirender.training.presets import PRESETS
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
+from unirender_evaluation.rows import evenly
 from unirender_evaluation.studies.training import run as training_run
 from unirender_evaluation.studies.training.choices import BASE_PRESET, PLAIN, Choice, training_choices
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.training.run import TrainingStudy, run
 from unirender_evaluation.studies.training.tables import COLUMNS, cells, table
-
-pytestmark = pytest.mark.long
 
 ROWS = (
     Choice(PLAIN, "", "Plain model", TRAIN),
@@ -76,11 +76,29 @@ def test_rows_may_be_changes_of_another_preset() -> None:
         training_choices(preset="no-such")
 
 
+def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    seen = list[tuple]()
+    monkeypatch.setattr(training_run, "run", lambda *given: seen.append(given))
+    asked = BenchTraining(
+        tmp_path, "standard", tmp_path / "out", 3, 7, "tiny_muon", ("seed", PLAIN), 6, 2, device="cpu", seed=5
+    )
+    assert asked.run() == 0
+    ((study, rows, scenes, _),) = seen
+    assert (study.data, study.out, study.steps) == (tmp_path, tmp_path / "out", 7)
+    assert (study.device, study.parallel, study.preset) == ("cpu", 2, "tiny_muon")
+    assert study.suite.spec.name == "standard"
+    assert scenes == evenly(study.suite.scenes, 3)
+    assert [(row.name, row.config.seed, row.config.batch_size) for row in rows] == [(PLAIN, 5, 6), ("seed", 6, 6)]
+    assert rows[0].config.optimizer == PRESETS["tiny_muon"].optimizer
+
+
 def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
         BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
 
 
+@pytest.mark.long
 def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
     """With all columns of the table."""
     assert [(r.method, r.sample) for r in records] == [
@@ -91,6 +109,7 @@ def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
     assert cells(records, PLAIN)[0].mean != cells(records, "seed")[0].mean
 
 
+@pytest.mark.long
 def test_a_second_run_trains_nothing(
     study: TrainingStudy, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +158,7 @@ def test_missing_data_is_named(tmp_path: Path) -> None:
         BenchTraining(data=tmp_path / "none").run()
 
 
+@pytest.mark.long
 def test_rows_that_the_data_cannot_train_are_left_out_at_the_start(
     study: TrainingStudy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
