@@ -50,6 +50,7 @@ def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
     assert plain.name == PLAIN
     assert not plain.group
     assert plain.config.model.physics_prior == "none"
+    assert plain.config.seed == BenchTraining(data=Path()).seed == 0
     assert len({str(row.config) for row in (plain, *others)}) == len(others) + 1
     for row in others:
         own, base = asdict(row.config), asdict(plain.config)
@@ -81,14 +82,14 @@ def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.Monk
     seen = list[tuple]()
     monkeypatch.setattr(training_run, "run", lambda *given: seen.append(given))
     asked = BenchTraining(
-        tmp_path, "standard", tmp_path / "out", 3, 7, "tiny_muon", ("seed", PLAIN), 6, 2, device="cpu", seed=5
+        tmp_path, "standard", tmp_path / "out", 1, 7, "tiny_muon", ("seed", PLAIN), 6, 2, device="cpu", seed=5
     )
     assert asked.run() == 0
     ((study, rows, scenes, _),) = seen
     assert (study.data, study.out, study.steps) == (tmp_path, tmp_path / "out", 7)
     assert (study.device, study.parallel, study.preset) == ("cpu", 2, "tiny_muon")
     assert study.suite.spec.name == "standard"
-    assert scenes == evenly(study.suite.scenes, 3)
+    assert scenes == evenly(study.suite.scenes, 1)
     assert [(row.name, row.config.seed, row.config.batch_size) for row in rows] == [(PLAIN, 5, 6), ("seed", 6, 6)]
     assert rows[0].config.optimizer == PRESETS["tiny_muon"].optimizer
 
@@ -138,6 +139,7 @@ def test_differences_are_paired_by_scene() -> None:
     cell = cells(made, "seed")[0]
     assert cell.difference is not None
     assert cell.difference.mean == pytest.approx(1.0)
+    assert (cell.mean, cell.n) == (pytest.approx(11.0), 3)
     assert cell.decided
     shifted = [record("seed", s, 10.0 * i + d) for (i, s), d in zip(enumerate("abc"), (1.0, -1.0, 0.5), strict=True)]
     assert not cells(made[:3] + shifted, "seed")[0].decided, "a row that wins and loses"
