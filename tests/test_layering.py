@@ -86,52 +86,35 @@ def lint_imports(folder: Path) -> str:
     return "" if result.returncode == 0 else result.stdout + result.stderr
 
 
-@pytest.fixture(scope="module")
-def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the sources that a test may break."""
-    folder = tmp_path_factory.mktemp("layering")
+FORBIDDEN = [
+    ("src/unirender/camera.py", "torch", "shared vocabulary"),
+    ("src/unirender/ggx.py", "torch", "shared vocabulary"),
+    ("src/unirender/scene_export/card.py", "mitsuba", "knows nothing of the ground truth"),
+    ("src/unirender/pipelines/__init__.py", "mitsuba", "knows nothing of the ground truth"),
+    ("src/unirender/training/__init__.py", "unirender_evaluation", "knows nothing of the ground truth"),
+    ("src/unirender/models/build.py", "unirender.training.presets", "training > pipelines > diffusion > models"),
+    ("reference/unirender_reference/__init__.py", "unirender.models", "independent of the model"),
+    ("reference/unirender_reference/shade.py", "unirender.scene_export", "independent of the model"),
+    ("evaluation/unirender_evaluation/__init__.py", "unirender.cli", "composition root"),
+    ("src/unirender/exr.py", "unirender_reference", "unirender_evaluation > unirender_reference"),
+]
+
+
+@pytest.mark.slow
+def test_the_contracts_are_kept_and_forbidden_imports_break_them(tmp_path: Path) -> None:
+    """Each inside a function, whose imports the linter counts, too."""
     for root, package in PACKAGES.items():
         ignore = shutil.ignore_patterns("__pycache__", "data", "*.safetensors")
-        shutil.copytree(ROOT / root / package, folder / root / package, ignore=ignore)
-    shutil.copy(ROOT / "pyproject.toml", folder)
-    return folder
-
-
-@pytest.mark.slow
-def test_the_contracts_are_kept(checkout: Path) -> None:
-    assert lint_imports(checkout) == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("module", "line", "contract"),
-    [
-        ("src/unirender/camera.py", "import torch", "shared vocabulary"),
-        ("src/unirender/ggx.py", "import torch", "shared vocabulary"),
-        ("src/unirender/scene_export/card.py", "import mitsuba", "knows nothing of the ground truth"),
-        ("src/unirender/pipelines/__init__.py", "import mitsuba", "knows nothing of the ground truth"),
-        ("src/unirender/training/__init__.py", "import unirender_evaluation", "knows nothing of the ground truth"),
-        (
-            "src/unirender/models/build.py",
-            "import unirender.training.presets",
-            "training > pipelines > diffusion > models",
-        ),
-        ("reference/unirender_reference/__init__.py", "import unirender.models", "independent of the model"),
-        ("reference/unirender_reference/shade.py", "import unirender.scene_export", "independent of the model"),
-        ("evaluation/unirender_evaluation/__init__.py", "import unirender.cli", "composition root"),
-        ("src/unirender/exr.py", "import unirender_reference", "unirender_evaluation > unirender_reference"),
-    ],
-)
-def test_a_forbidden_import_breaks_its_contract(checkout: Path, module: str, line: str, contract: str) -> None:
-    path = checkout / module
-    before = path.read_text() if path.exists() else None
-    try:
-        # Inside a function: the linter counts those imports too.
-        path.write_text(f"{before or ''}\n\ndef _forbidden():\n    {line}\n")
-        said = lint_imports(checkout)
-    finally:
-        if before is None:
-            path.unlink()
-        else:
-            path.write_text(before)
-    assert re.search(rf"{re.escape(contract)}.* BROKEN", said), said
+        shutil.copytree(ROOT / root / package, tmp_path / root / package, ignore=ignore)
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    assert lint_imports(tmp_path) == ""
+    for path, target, _ in FORBIDDEN:
+        with (tmp_path / path).open("a") as file:
+            file.write(f"\n\ndef _forbidden():\n    import {target}\n")
+    said = lint_imports(tmp_path)
+    for path, target, contract in FORBIDDEN:
+        module = path.partition("/")[2].removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        broken = re.search(
+            rf"^.*{re.escape(contract)}.*\n-+\n(?:(?!\n\n\n).|\n)*?{module} -> {target} \(l\.", said, re.M
+        )
+        assert broken, f"{module} -> {target}: {said}"

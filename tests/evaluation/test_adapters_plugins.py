@@ -173,6 +173,7 @@ def only_fp16(folder: Path) -> None:
         ),
         (only_fp16, "vae: no weights, expected .safetensors without a variant such as fp16"),
         (removed("tokenizer"), "tokenizer: no tokenizer, expected the files vocab.json and merges.txt"),
+        (removed("tokenizer/merges.txt"), "tokenizer: no tokenizer, expected the files vocab.json and merges.txt"),
         (removed("scheduler"), "scheduler_config.json: is missing, expected the scheduler's configuration"),
         (removed("model_index.json"), "model_index.json: is missing, expected the index of a MarigoldNormalsPipeline"),
         (changed("model_index.json", "default_denoising_steps", "steps"), "no default_denoising_steps, .* say steps="),

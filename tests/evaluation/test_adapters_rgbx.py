@@ -1,5 +1,6 @@
 """RGB-to-X as a method: its conversions against a stated answer, its sampling against diffusers' nearest pipeline."""
 
+import itertools
 import json
 import shutil
 from pathlib import Path
@@ -17,7 +18,7 @@ from tiny_adapter_folders import ANSWER, APPEARANCE, SCHEDULE, SIZE, TRAILING, o
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_evaluation.adapters_conditioned import fit
+from unirender_evaluation.adapters_conditioned import ConditionedDiffusion, fit
 from unirender_evaluation.adapters_rgbx import PROMPTS, RgbToX
 
 
@@ -132,6 +133,17 @@ def test_the_maps_follow_the_picture_and_the_seed(folder: Path, seen: dict[str, 
     assert np.abs(other.maps["albedo"] - first.maps["albedo"]).max() > 1e-3
     single = RgbToX(folder, steps=1, resolution=0).decompose(**seen)
     assert np.abs(single.maps["albedo"] - first.maps["albedo"]).max() > 1e-3
+
+
+def test_answers_are_cut_to_their_range_before_their_mean(
+    folder: Path, seen: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    method, level = RgbToX(folder, steps=1, resolution=16, ensemble=2), itertools.cycle((3.0, -0.5))
+    rows, columns = method.condition(seen["image_srgb"], seen["mask"])[0].shape[2:]
+    size = (1, 3, method.network.factor * rows, method.network.factor * columns)
+    monkeypatch.setattr(ConditionedDiffusion, "denoise", lambda *_: torch.full(size, next(level)))
+    found = method.decompose(**seen).maps["albedo"]
+    np.testing.assert_allclose(of_inside(found, seen), 0.625, atol=1e-6)  # of the mean of 1 and -0.5
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.gallery import (
+    BYTES_PER_PIXEL,
     GALLERY_BYTES,
     data_uri,
     flip_map,
@@ -29,7 +30,7 @@ from unirender_evaluation.gallery import (
     shown_width,
     shrink_covered,
 )
-from unirender_evaluation.metrics import Variant, metric_key
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
 from unirender_evaluation.pictures import Pictures
 from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
 from unirender_evaluation.report import write_report
@@ -84,6 +85,8 @@ def test_it_shows_the_protocol_the_watermark_and_both_values(page: str) -> None:
     assert "paper </span><b>23.20</b>" in page
     assert "22.50" in page  # measured whole-frame mean of ours
     assert "prefers-color-scheme: dark" in page
+    assert "24 x 24 pixels, truth. Up to 6 samples a table" in page, "of no renderer that is known"
+    assert "PSNR\xa0(dB)\xa0↑" in page, "a heading stays on one line"
 
 
 def test_labels_are_escaped(page: str) -> None:
@@ -286,6 +289,22 @@ def test_a_scale_without_a_ceiling_ends_at_a_perfect_value_and_says_so(
     assert [(mark["kind"], mark["at"]) for mark in tile["marks"]] == [("ours", at)]
 
 
+@pytest.mark.parametrize(("quantity", "metric", "best"), [("albedo", "psnr", 22.0), ("metallic", "mse", 0.01)])
+def test_a_tile_has_the_best_of_our_rows_that_are_complete(quantity: str, metric: str, best: float) -> None:
+    """By name the last, by score in the middle; one on fewer samples is not asked."""
+    worse, better_on_one = (20.0, 30.0) if metric == "psnr" else (0.05, 0.001)
+    values = {"m": [best] * 3, "a": [worse] * 3, "z": [worse] * 3, "y": [better_on_one]}
+    key = metric_key(quantity, metric)
+    made = [
+        Record("inverse", "single-image", method, f"s{i}", f"o{i}", {key: value})
+        for method, found in values.items()
+        for i, value in enumerate(found)
+    ]
+    run = replace(RUN, limit=None, methods=tuple(MethodInfo(name, name, "ours") for name in values))
+    (tile,) = [tile for tile in tiles(build_tables(made, run)) if quantity in tile["what"].lower()]
+    assert (tile["by"], tile["value"]) == ("m", f"{best:.{METRICS[metric].decimals}f}")
+
+
 def test_a_scale_with_a_ceiling_ends_there_and_prints_its_n() -> None:
     tile = tile_of("Albedo", {"input": [10.0] * 3, "ours": [20.0] * 3, "ceiling": [50.0]}, "albedo", "psnr")
     assert (tile["end"], tile["end_kind"]) == ("Noise ceiling 50.00 (n\xa0=\xa01)", "ceiling")
@@ -424,6 +443,26 @@ def test_sheets_take_the_worst_first_and_no_more_than_their_limit() -> None:
     assert picture.size == (sheet.width, sheet.height)
 
 
+def test_a_sheet_has_the_input_then_truth_over_answer_inside_their_masks() -> None:
+    """Of even colours, which a lossy picture keeps; nothing stands below the input."""
+    levels = {"input": 0.2, "truth": 0.4, "answer": 0.8}
+    seen, truth, answer = (np.full((SIZE, SIZE, 3), level, np.float32) for level in levels.values())
+    made = replace(
+        item("x"), given={"input": seen}, given_mask=np.ones_like(mask()), truth={"albedo": truth},
+        predictions={"ours": {"albedo": answer}},
+    )  # fmt: skip
+    (sheet,) = make_sheets([made]).values()
+    assert (sheet.names, sheet.caption) == (("input", "albedo"), "question x · caption x")
+    data = Image.open(io.BytesIO(base64.b64decode(sheet.uri.partition(",")[2]))).convert("RGBA")
+    shown = np.asarray(data).reshape(2, SIZE, 2, SIZE, 4)
+    middle = shown[:, SIZE // 2, :, SIZE // 2]
+    np.testing.assert_allclose(middle[..., 0], [[51, 102], [0, 204]], atol=3)
+    assert (shown[0, :, 0, :, 3] == 255).all(), "the input's own mask"
+    assert not shown[1, :, 0, :, 3].any()
+    for line in range(2):
+        np.testing.assert_allclose(shown[line, :, 1, :, 3], np.round(255 * mask()[..., 0]), atol=3)
+
+
 def test_the_gallery_of_large_pictures_is_shown_smaller_and_scored_at_full_size() -> None:
     """Noise, which no PNG can pack: the worst case."""
     large = 384
@@ -441,6 +480,8 @@ def test_the_gallery_of_large_pictures_is_shown_smaller_and_scored_at_full_size(
     assert shown["flip_mean"] == f"FLIP {flip_map(1 - picture, picture, whole)[1]:.3f}"
     assert 12 * sum(len(p["uri"]) for p in (card["truth"][0], shown["picture"], shown["flip"])) < 5 * 1_000_000
     assert shown_width([item("x")]) == SIZE, "small ones stay as they are"
+    full = replace(made, given={"input": picture, "light": picture}, truth=dict.fromkeys("abc", picture))
+    assert shown_width([full], int(7 * BYTES_PER_PIXEL * 100**2)) == 100, "2 given, 3 true, a prediction and its error"
     assert shown_width(items) > most, f"{GALLERY_BYTES} bytes hold more"
 
 

@@ -209,6 +209,8 @@ def test_a_published_value_worse_than_a_constant_has_a_dagger() -> None:
     daggers = {r.label: r.cells[index].dagger for r in table().rows if r.cells[index].published is not None}
     assert daggers == dict.fromkeys(daggers, True)  # 0.100 beats every published row
     assert "**0.1182**†" in to_markdown(table())
+    assert [note for note in table().notes if note.startswith("† The published value is worse than")]
+    assert not [note for note in table("masked").notes if note.startswith("†")]
     without = [record for record in RECORDS if record.method != "constant"]
     assert "†" not in to_markdown(build_table(TABLES["inverse"], without, RUN, protocol="single-image"))
 
@@ -247,6 +249,7 @@ def test_the_protocol_is_printed_with_every_format() -> None:
     found = table()
     names = [name for name, _ in found.protocol]
     assert names[:6] == ["given", "variant", "mask", "colour", "scale alignment", "exposure"]
+    assert dict(found.protocol)["steps x samples"] == "Ours (mean) 1 x 1; Ours (sample) 20 x 5"
     assert {"resolution", "n", "coverage", "steps x samples", "seeds", "LPIPS", "interval", "suite", "truth"} <= set(
         names
     )
@@ -543,11 +546,12 @@ def test_subsets_are_never_mixed() -> None:
 
 def test_a_table_of_ones_own() -> None:
     column = Column("Superposition", "superposition", METRICS["mse"], {"mask": "masked"}, published=False)
-    spec = TableSpec("physics", "Physics", (column,), ("physics",))
+    spec = TableSpec("physics", "Physics", (column,), ("physics",), description="What it is about.")
     values: Mapping[str, float] = {"superposition.mse@masked": 0.01}
     records = [Record("physics", "physics", "ours", f"s{i}", f"o{i}", values) for i in range(3)]
     (found,) = build_tables(records, RUN, {"physics": spec})
     assert found.rows[0].cells[0].measured is not None
+    assert found.notes[0] == spec.description
     with pytest.raises(UnirenderError, match="expected one of"):
         build_table(spec, records, RUN, protocol="given")
 

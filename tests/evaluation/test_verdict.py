@@ -268,6 +268,13 @@ def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> No
     records = [replace(r, values={**r.values, **other.values}) for r, other in zip(records, ssim, strict=True)]
     found = {(b.method, b.key): b.low_db for b in ceiling_breaches(records)}
     assert found == {("above", ALBEDO): pytest.approx(1), ("exact", ALBEDO): math.inf}
+    text = verdict_text(records, run_of(), CHECK)
+    where = f"on inverse/single-image {ALBEDO}"
+    assert f"  FAILS  above exceeds the noise ceiling {where} by at least 1.00 dB\n" in text
+    assert f"  FAILS  exact returns the noisy truth itself {where}: infinite PSNR" in text
+    assert "HOLDS  no measured row" not in text
+    below = [record for record in records if record.method in ("noise-ceiling", "below")]
+    assert "  HOLDS  no measured row exceeds the noise ceiling" in verdict_text(below, run_of(), CHECK)
 
 
 def test_one_object_decides_nothing() -> None:

@@ -5,8 +5,10 @@ import pytest
 from lopsided_scene import ALBEDO, KEY, lopsided_object
 
 from unirender.color import image_srgb
+from unirender.composite import split_sum_image
+from unirender.intrinsics import Intrinsics
 from unirender.symmetries import Maps
-from unirender.training.repaint import CHANNEL_RANGE, POWER_RANGE, mean_colour, recoloured, repaint
+from unirender.training.repaint import CHANNEL_RANGE, mean_colour, recoloured, repaint
 from unirender_reference.render import Renderer
 
 SIZE = 32
@@ -59,6 +61,21 @@ def test_repainted_is_the_render_of_the_repainted_object(
     assert unedited < LEAST - 10, unedited
 
 
+def test_the_closed_form_of_a_repainted_object_is_exact() -> None:
+    """What is left out is light from one part of the object to another, which it has not."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(6, 6, 3)) * (0.3, 0.3, 0) + (0, 0, 1)
+    old, new = rng.uniform(0.1, 0.9, (2, 6, 6, 3)).astype(np.float32)
+    maps = {name: rng.uniform(0.1, 0.9, (6, 6, 3)).astype(np.float32) for name in ("specular", "diffuse")}
+    maps |= {name: rng.uniform(0.1, 0.9, (6, 6, 1)).astype(np.float32) for name in ("roughness", "metallic")}
+    maps |= {"normal": (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)}
+    maps |= {"mask": np.ones((6, 6, 1), np.float32)}
+    before, after = (split_sum_image(Intrinsics().replace(**maps, albedo=colour)) for colour in (old, new))
+    found = repaint(maps | {"image": before, "albedo": old}, new)
+    np.testing.assert_allclose(found["image"], after, rtol=0, atol=2e-6)
+    assert np.abs(before - after).max() > 0.1
+
+
 def test_a_recoloured_object_has_the_colour() -> None:
     rng = np.random.default_rng(0)
     albedo, mask = rng.uniform(0.1, 0.9, (8, 8, 3)).astype(np.float32), np.ones((8, 8, 1), np.float32)
@@ -80,5 +97,7 @@ def test_extreme_colours_stay_in_range() -> None:
         assert result.min() >= 0
         assert result.max() <= 1
     bright = np.full((2, 2, 3), 0.9, np.float32)
-    np.testing.assert_allclose(recoloured(bright, mask, np.zeros(3)), 0.9 ** POWER_RANGE[1], rtol=1e-5)
+    np.testing.assert_allclose(recoloured(bright, mask, np.zeros(3)), 0.9**4, rtol=1e-5)
+    np.testing.assert_allclose(recoloured(0.1 + 0 * bright, mask, np.ones(3)), 0.1**0.25, rtol=1e-5)
+    assert recoloured(1.2 * bright, mask, np.full(3, 0.5)).max() <= 1
     assert (mean_colour(bright, np.zeros((2, 2, 1))) == 0.5).all()  # no pixel: no colour of its own

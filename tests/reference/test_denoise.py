@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +56,23 @@ def test_a_denoised_render_is_closer_to_the_converged_one(kind: str) -> None:
     np.testing.assert_array_equal(clean[..., 3:], noisy[..., 3:])
     again = denoise.denoise(noisy, guide, normal, mask, premultiplied=is_image)
     np.testing.assert_array_equal(again, clean)
+
+
+def test_picture_and_guides_are_handed_on_times_the_mask(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture once, whether it was before or not; and it comes back as it went in, with its alpha."""
+    handed = list[tuple[np.ndarray, ...]]()
+    package = SimpleNamespace(denoise=lambda *pictures, hdr, clean_aux: handed.append(pictures) or pictures[0])
+    monkeypatch.setattr(denoise, "_package", lambda: package)
+    rng = np.random.default_rng(0)
+    picture, albedo, normal = rng.uniform(0.1, 1, (3, 4, 5, 3)).astype(np.float32)
+    mask = rng.uniform(0.2, 1, (4, 5, 1)).astype(np.float32)
+    straight = denoise.denoise(picture, albedo, normal, mask, premultiplied=False)
+    premultiplied = denoise.denoise(np.concatenate([picture * mask, mask], axis=-1), None, normal, mask)
+    np.testing.assert_allclose(straight, picture, rtol=1e-6)
+    np.testing.assert_array_equal(premultiplied, np.concatenate([picture * mask, mask], axis=-1))
+    for pictures, guide in zip(handed, (albedo, 1), strict=True):
+        for found, expected in zip(pictures, (picture * mask, guide * mask * np.ones(3), normal * mask), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 @needs_oidn

@@ -373,7 +373,7 @@ def checkerboard(side: int) -> np.ndarray:
     return np.repeat((np.indices((side, side)).sum(0) % 2 * 255).astype(np.uint8)[..., None], 3, axis=-1)
 
 
-@pytest.mark.parametrize("side", [1536, 4096])
+@pytest.mark.parametrize("side", [1536, 2048])
 def test_large_picture_is_reduced_in_linear_light(tmp_path, side):
     def fill(w: GltfWriter) -> None:
         w.mesh(w.quad(w.material(pbrMetallicRoughness={"baseColorTexture": {"index": w.texture(checkerboard(side))}})))
@@ -381,7 +381,7 @@ def test_large_picture_is_reduced_in_linear_light(tmp_path, side):
     obj = load_mesh(quad_glb(tmp_path, fill))
     assert obj.albedo.shape == (1026, 1026, 3)
     assert obj.albedo.mean() == pytest.approx(0.5, abs=1e-3)
-    if side == 4096:  # whole texels in every mean
+    if side == 2048:  # whole texels in every mean
         assert np.abs(obj.albedo - 0.5).max() < 1e-5
 
 

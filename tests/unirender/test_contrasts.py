@@ -138,6 +138,15 @@ def test_the_command_trains_on_runs_where_the_preset_says_so(tmp_path: Path) -> 
         options.run(lambda suite, count: pytest.fail(f"nothing is scored: {suite}, {count}"), tuple)
 
 
+def test_objects_of_another_block_are_no_set_with_these() -> None:
+    """Two objects each, under two lights, of one metallic value each and of other roughnesses."""
+    groups = [
+        Group(str(i), "one-at-a-time", i, tuple(Pair(10 * i + k, k / 2, (i // 2 + k) / 4, 0, 0, 0) for k in range(2)))
+        for i in range(4)
+    ]
+    assert sets_of(groups) == [[(i, k), (i + 1, k)] for i in (0, 2) for k in range(2)]
+
+
 @pytest.mark.parametrize("pairs", [24, 121])
 def test_sets_are_those_that_the_generator_plans(pairs: int, tmp_path: Path) -> None:
     """By the seeds of objects and lights, which the reader does not see: two of three are one, the third is never."""

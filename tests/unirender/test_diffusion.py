@@ -9,7 +9,7 @@ import torch
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
 from torch import Tensor
 
-from unirender.diffusion.sampling import MOST_STEPS, denoise, draw_noise, set_timesteps, steps_of
+from unirender.diffusion.sampling import MOST_STEPS, denoise, draw_noise, make_sampler, set_timesteps, steps_of
 from unirender.diffusion.schedule import add_noise, last_timestep, make_scheduler, zero_terminal_betas
 from unirender.diffusion.timesteps import algorithm1_timesteps, conditional_timesteps, draw_timesteps
 from unirender.errors import UnirenderError
@@ -45,8 +45,9 @@ def test_schedule_is_the_rescaled_scaled_linear_one() -> None:
     torch.testing.assert_close(ours, slope * (root - root[-1]), rtol=1e-9, atol=1e-9)
 
 
-def test_sampling_starts_at_the_last_index() -> None:
-    scheduler = make_scheduler()
+@pytest.mark.parametrize("name", ["ddim", "unipc"])
+def test_sampling_starts_at_the_last_index(name: str) -> None:
+    scheduler = make_sampler(name, make_scheduler())
     for steps in range(1, MOST_STEPS + 1):
         set_timesteps(scheduler, steps, torch.device("cpu"))
         assert scheduler.timesteps[0] == last_timestep(scheduler)
@@ -140,6 +141,10 @@ def test_algorithm_1_picks_one_stream_for_the_whole_batch() -> None:
             ends = [bool(np.isin(np.asarray(x), [0, 999]).all()) for x in (a, i)]
             assert sorted(ends) == [False, True]
             first[name] += ends[0]
+    for seed in range(9):  # all of it follows the seed
+        a, b = (algorithm1_timesteps(16, 999, torch.Generator().manual_seed(seed)) for _ in range(2))
+        assert torch.equal(a.attributes, b.attributes)
+        assert torch.equal(a.image, b.image)
     for count in first.values():
         assert abs(count / draws - 0.5) < 5 * 0.5 / math.sqrt(draws)
 

@@ -1,5 +1,6 @@
 """What shards may not hold is refused when they are packed, with shard, group and member; rounding is not refused."""
 
+import functools
 import io
 import json
 import re
@@ -27,6 +28,7 @@ Members = dict[str, bytes]
 IMAGE = "l0.m050_r040.exr"
 
 
+@functools.cache  # nobody changes them
 def members(vary: str = "basis", size: int = 16) -> Members:
     return group_members(vary, size, 1, (40,), (0, 50, 100), 7)
 

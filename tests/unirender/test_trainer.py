@@ -41,7 +41,6 @@ from unirender.training.checkpoint import (
 )
 from unirender.training.command import Train
 from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
-from unirender.training.ema import Ema
 from unirender.training.export import export_pipeline, read_history
 from unirender.training.live import live_report, never_at_peak, standing
 from unirender.training.presets import PRESETS, get_preset
@@ -183,24 +182,6 @@ def test_learning_rate_warms_up_and_decays() -> None:
     assert learning_rate(config, 500, 0.5) == pytest.approx(0.55)
     assert learning_rate(config, 999, 1.0) == pytest.approx(0.1)
     assert learning_rate(config, 999, 7.0) == pytest.approx(0.1)
-
-
-def test_ema_is_the_recursion() -> None:
-    layer = nn.Linear(2, 2)
-    ema, expected = Ema(layer, decay=0.5), layer.weight.detach().clone()
-    for n in range(30):
-        with torch.no_grad():
-            layer.weight.add_(1.0)
-        ema.update(layer)
-        decay = min(0.5, (1 + n) / (10 + n))
-        expected = decay * expected + (1 - decay) * layer.weight.detach()
-    torch.testing.assert_close(ema.average["weight"], expected)
-    restored = Ema(nn.Linear(2, 2), decay=0.5)
-    restored.load_state_dict(ema.state_dict())
-    copy = nn.Linear(2, 2)
-    restored.copy_to(copy)
-    assert torch.equal(copy.weight, ema.average["weight"])
-    assert restored.updates == 30
 
 
 def test_averaged_weights_are_in_place_only_inside_the_block(tmp_path: Path) -> None:

@@ -11,8 +11,17 @@ import pytest
 from PIL import Image, ImageFont
 from tiny_suites import SIZE, make_suite
 
+from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.figures.command import Figures, default_scenes, labels
+from unirender.intrinsics import Intrinsics
+from unirender.options import ModelOptions
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
+from unirender.whole_files import replace_file
+from unirender_evaluation.figures import grid as grid_module
+from unirender_evaluation.figures import light as light_module
+from unirender_evaluation.figures import overview as overview_module
+from unirender_evaluation.figures import panels
+from unirender_evaluation.figures.command import ASKED, Figures, default_scenes, labels
 from unirender_evaluation.figures.grid import (
     FONT,
     GAP,
@@ -223,6 +232,20 @@ def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite
     assert all(tile is not None for tile in grid.lines[1].tiles[1:])
 
 
+def test_the_overview_asks_for_the_suites_edits_and_the_scenes_other_light(suite: Suite) -> None:
+    class Finds(Told):
+        def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
+            return Intrinsics(albedo=image_srgb, mask=mask, camera=camera)
+
+    finds, base, scene = Finds(), suite.spec.base, suite.scenes[0]
+    overview([Subject("finds", make_row(finds, "external"))], suite, [scene])
+    *edited, relit = ({name: call[name] for name in call.keys() - {"mask", "camera"}} for call in finds.calls)
+    expected = [(edit.get("metallic", base[0]), edit.get("roughness", base[1])) for edit in edited]
+    assert expected == [tuple(edit) for edit in suite.spec.edits]
+    assert list(relit) == ["environment"]
+    np.testing.assert_array_equal(relit["environment"], suite.environment(suite.other_light(scene)))
+
+
 def test_the_light_figure_shows_balls_with_the_errors_of_the_tables(suite: Suite) -> None:
     found = Subject("mean light", make_row(MeanLight(), "trivial"))
     grid = light_figure([found, UNEDITED], suite, suite.scenes[:2])
@@ -321,6 +344,39 @@ def test_default_scenes_come_from_both_halves_and_labels_are_unique() -> None:
 def test_what_cannot_be_drawn_is_a_usage_error(options: dict, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         Figures(**options).run()
+
+
+def test_every_option_reaches_the_figures(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    drawn, loaded = dict[str, tuple](), list[ModelOptions]()
+    for module, name in (
+        (panels, "material_strip"),
+        (panels, "relighting_grid"),
+        (panels, "comparison_sheet"),
+        (overview_module, "overview"),
+        (light_module, "light_figure"),
+    ):
+        monkeypatch.setattr(module, name, lambda *given, name=name: drawn.update({f"{name} {given[3:4]}": given}))
+    monkeypatch.setattr(grid_module, "save", lambda _, path: replace_file(path, ""))
+    monkeypatch.setattr(ModelOptions, "load", lambda options: loaded.append(options))
+    figures = Figures(
+        tmp_path, (Path("small"), Path("tiny")), (), str(suite.spec.path), (suite.scenes[3].key,),
+        kinds=ASKED, values=(0.0, 0.3), lights=1, spp=8, device="auto",
+    )  # fmt: skip
+    assert figures.run() == 0
+    assert {path.stem for path in tmp_path.iterdir()} == set(ASKED)
+    assert [options.checkpoint for options in loaded] == [checkpoint_folder(name) for name in figures.checkpoint]
+    assert {options.device for options in loaded} == {"auto"}
+    for subjects, of, scenes, *_ in drawn.values():
+        assert [subject.label for subject in subjects] == ["small", "tiny"]
+        assert {subject.row.config["anchored"] for subject in subjects} == {True}
+        assert subjects[0].row.config["weights"] == checkpoint_sha256(checkpoint_folder(Path("small")))
+        assert (of.sha256, [scene.key for scene in scenes]) == (suite.sha256, [suite.scenes[3].key])
+    for what in ("metallic", "roughness"):
+        *_, values, truth = drawn[f"material_strip ('{what}',)"]
+        assert (values, truth.spp) == ((0.0, 0.3), MitsubaTruth(suite, 8).spp)
+    *_, count, truth = drawn["relighting_grid (1,)"]
+    assert (count, truth.spp) == (1, MitsubaTruth(suite, 8).spp)
 
 
 def test_fewer_lights_than_were_asked_for_are_told(capsys: pytest.CaptureFixture[str]) -> None:

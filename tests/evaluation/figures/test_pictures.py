@@ -53,6 +53,7 @@ class Told:
 
     def __init__(self) -> None:
         self.asked: list[dict[str, Any]] = []
+        self.lit: list[np.ndarray] = []
 
     def decompose(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera) -> Intrinsics:
         assert mask.shape == (*image_srgb.shape[:2], 1)
@@ -60,6 +61,10 @@ class Told:
 
     def edit(self, image_srgb: np.ndarray, **given: Any) -> np.ndarray:
         self.asked.append({name: value for name, value in given.items() if name in ("metallic", "roughness")})
+        return np.zeros_like(image_srgb)
+
+    def relight(self, image_srgb: np.ndarray, mask: np.ndarray, camera: Camera, environment: np.ndarray) -> np.ndarray:
+        self.lit.append(environment)
         return np.zeros_like(image_srgb)
 
 
@@ -76,6 +81,7 @@ def test_every_subject_is_asked_for_maps_edits_and_relightings() -> None:
     assert grid.columns[-2:] == ("left", "right")
     assert [line.label for line in grid.lines] == ["disc.png, told", "disc.png, as albedo"] * 2
     assert told.asked == list(EDITS) * 2
+    assert [light.shape for light in told.lit] == [light.shape for light in lights.values()] * 2
     of_told, of_other = (dict(zip(grid.columns, line.tiles, strict=True)) for line in grid.lines[:2])
     assert of_told["albedo"] is not None
     assert of_told["normal"] is of_told["rendered"] is None

@@ -17,12 +17,15 @@ from unirender import cli
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender.visualization import write_png
 from unirender_evaluation.plugins import Plugin
 from unirender_evaluation.prediction_check import PredictionError
 from unirender_evaluation.public import answers
+from unirender_evaluation.public import rows as public_rows
 from unirender_evaluation.public import run as public_run
 from unirender_evaluation.public.answers import takes_part
+from unirender_evaluation.public.command import BenchPublic
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw
 from unirender_evaluation.public.orb import StanfordOrb
@@ -112,6 +115,15 @@ def test_every_module_that_measures_is_in_the_keys(public: type) -> None:
     assert {path.stem for path in folder.glob("*.py")} >= named >= imported
 
 
+class Dark(Ramp):
+    """A Ramp whose pictures are black."""
+
+    name = "dark"
+
+    def relight(self, image_srgb, mask, camera, environment=None, specular=None, diffuse=None):
+        return np.zeros_like(image_srgb)
+
+
 class Silent:
     """Has no answer."""
 
@@ -128,8 +140,10 @@ class Silent:
 def test_none_is_no_answer(tmp_path: Path) -> None:
     """It is asked all that it is there for, and stands in no table."""
     orb = StanfordOrb(make_orb(tmp_path / "orb"), 32, 60.0)
-    result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp)]), tmp_path / "out")
-    assert {record.method for record in result.records} == {"ramp"}
+    result = done(orb, plugin_rows([Plugin(kind(), "test") for kind in (Silent, Ramp, Dark)]), tmp_path / "out")
+    assert {record.method for record in result.records} == {"ramp", "dark"}
+    assert all(0 < (record.seconds or 0) < 60 for record in result.records)
+    assert "dark: 8 of 8 PSNRs are the benchmark's floor." in result.tables[1].notes
     assert result.computed == len(result.records), "of the records that the run has"
     asked = [record.method for record in read_records(tmp_path / "out" / "records.jsonl")]
     assert asked.count("silent") == asked.count("ramp") > 0
@@ -334,6 +348,53 @@ def test_a_method_is_asked_what_one_picture_can_answer(tmp_path: Path) -> None:
     assert [takes_part(albedo, sample) for sample in orb.samples()] == [True, True, True, False, False]
 
 
+def test_our_model_is_asked_once_anchored_where_a_set_relights(tmp_path: Path) -> None:
+    """And only there: its maps are those of the row beside it."""
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32)
+    plain, anchored = public_rows.our_rows(orb, Path("small"), "cpu")
+    assert [row.config["anchored"] for row in (plain, anchored)] == [False, True]
+    assert plain.config["weights"] == anchored.config["weights"] == checkpoint_sha256(checkpoint_folder(Path("small")))
+    relit = [sample.asks == "relight" and sample.one_picture for sample in orb.samples()]
+    assert [takes_part(anchored, sample) for sample in orb.samples()] == relit
+    assert [takes_part(plain, sample) for sample in orb.samples()] == [True, True, True, True, False]
+    iiw = Iiw(make_iiw(tmp_path / "iiw"))
+    (alone,) = public_rows.our_rows(iiw, None, "cpu")
+    assert not alone.config["anchored"]
+    names = ["unedited-input", "input-as-albedo", "mean-albedo", "mean-normal", "sphere-normal"]
+    assert [[row.info.key for row in trivial_rows(public)] for public in (orb, iiw)] == [names, names[1:3]]
+    mine = {"mine": write_predictions(iiw, Ramp(), tmp_path / "mine")}
+    rows = public_rows.public_rows(iiw, ("plugins",), predictions=mine)
+    assert [row.info.key for row in rows if row.info.kind == "external"][-1:] == ["mine"]
+    assert {*names[1:3]} < {row.info.key for row in rows}, "whoever is there is held against them"
+
+
+def test_every_option_reaches_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    orb, rows = make_orb(tmp_path / "orb"), list[tuple]()
+    runs, predictions = list[PublicRun](), tmp_path / "mine"
+    predictions.mkdir()
+    monkeypatch.setattr(public_rows, "public_rows", lambda *given: rows.append(given) or [])
+    monkeypatch.setattr(public_run, "run", lambda what, _: runs.append(what))
+    words = ["--out", tmp_path / "out", "--limit", 1, "--resolution", 16, "--tolerance-deg", 5, "--checkpoint", "small"]
+    words += ["--methods", "ours", "--method", "a:B", "--predictions", f"mine={predictions}", "--device", "auto"]
+    assert command("stanford-orb", str(orb), *map(str, words)) == 0
+    ((public, *given),), (what,) = rows, runs
+    assert given == [("ours",), ("a:B",), {"mine": predictions}, Path("small"), "auto"]
+    assert what.public is public
+    assert (public.folder, public.resolution, public.tolerance_deg) == (orb, 16, 5)
+    assert (what.out, what.limit) == (tmp_path / "out", 1)
+    assert command("iiw", "set") == 0
+    assert runs[-1].out == Path("results/public-iiw")
+    readers = BenchPublic("iiw", orb, resolution=16).reader(), BenchPublic("maw", orb, resolution=16).reader()
+    for reader, kind in zip(readers, (Iiw, Maw), strict=True):
+        assert isinstance(reader, kind)
+        assert (reader.folder, reader.resolution) == (orb, 16)
+    assert Iiw(orb).resolution == BenchPublic("iiw", orb).resolution
+    usual = BenchPublic("stanford-orb", orb).reader()
+    assert isinstance(usual, StanfordOrb)
+    assert usual.tolerance_deg == StanfordOrb(orb).tolerance_deg == 2
+
+
 def command(*words: str) -> int:
     with pytest.raises(SystemExit) as end:
         cli.main(["bench", "public", *words])
@@ -379,4 +440,5 @@ def test_our_model_answers_every_question(tmp_path: Path) -> None:
     assert all(
         {"normal.cosine_distance", "albedo.psnr_l@raw", "albedo.lpips_alex@aligned_rgb"} <= set(r.values) for r in maps
     )
+    assert "LPIPS backbones: alex; vgg: no weights here, no column" in " ".join((out / "tables.md").read_text().split())
     assert all(r.values["normal.cosine_distance"] < 0.5 for r in maps)  # a ball is seen as one; random normals have 1

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from icc_profiles import SRGB_D50, matrix_profile
 from PIL import Image
@@ -21,7 +22,7 @@ from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public.metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
 from unirender_evaluation.public.orb import StanfordOrb, contract_environment
-from unirender_evaluation.public.orb_frames import Frame, captures, difference_deg, object_of
+from unirender_evaluation.public.orb_frames import Capture, Frame, captures, difference_deg, object_of
 from unirender_evaluation.public.sets import Answer, PublicSet, PublicSetError, block_mean, shrunk
 
 
@@ -74,11 +75,18 @@ def test_orb_relights_only_from_the_same_camera(orb: StanfordOrb) -> None:
     assert relit == {same: True, beside: False}
     wide = StanfordOrb(orb.folder, 32, tolerance_deg=45)
     assert all(sample.one_picture for sample in wide.samples())
+    asked = dict(wide.protocol("stanford-orb-relighting"))["asked"]
+    assert asked.startswith("the object in another place, 2 photographs")
+    assert "only the 2 from within 45 degrees" in asked
+    assert "asked" not in dict(wide.protocol("stanford-orb"))
     with pytest.raises(UnirenderError, match="no photograph was taken"):
         orb.inputs(sample_of(orb, beside))
     found = orb.inputs(sample_of(orb, same))
     assert found["environment"].shape == (16, 32, 3)
     assert found["environment"][3, 7] == pytest.approx(LIGHT["cup_scene002"])
+    ldr, light = orb.folder / "blender_LDR/cup_scene001", orb.folder / "ground_truth/cup_scene002/env_map/0000.exr"
+    handed_out = {light, *(ldr / kind / "0000.png" for kind in ("test", "test_mask"))}
+    assert handed_out <= set(sample_of(orb, same).files), "with other ones a record is another"
 
 
 def test_orb_scores_a_relit_picture_against_the_linear_photograph(orb: StanfordOrb) -> None:
@@ -95,6 +103,7 @@ def test_orb_scores_a_relit_picture_against_the_linear_photograph(orb: StanfordO
     floor = orb.score(same, Answer(image=np.zeros((32, 32, 3), np.float32)), ())
     assert floor[high.replace("psnr_h", "psnr_h_floored")] == 1
     assert right[high.replace("psnr_h", "psnr_h_floored")] == 0
+    assert floor[metric_key("relit", PSNR_L, Variant(scale="aligned_rgb"))] < 40, "black is what is fitted"
 
 
 def test_orb_s_light_is_turned_to_the_contract_s_grid() -> None:
@@ -121,10 +130,16 @@ def test_cameras_differ_by_turn_place_and_field_of_view() -> None:
 
     moved = POSE.copy()
     moved[0, 3] = 3 * np.tan(np.radians(5))
-    assert difference_deg(frame(POSE), frame(POSE)) == 0
+    for degrees in range(0, 360, 7):  # of some the trace is above 3, by rounding
+        assert difference_deg(frame(turned(degrees)), frame(turned(degrees))) == pytest.approx(0, abs=1e-5)
     assert difference_deg(frame(POSE), frame(turned(10))) == pytest.approx(10, abs=0.1)
     assert difference_deg(frame(POSE), frame(moved)) == pytest.approx(5)
     assert difference_deg(frame(POSE), frame(POSE, 0.6 + np.radians(3))) == pytest.approx(3)
+    capture = Capture("a", "cup", (frame(turned(3)), frame(turned(1))), (frame(turned(-2)),), (), ())
+    nearest = capture.nearest(frame(POSE), 5)
+    assert nearest is not None
+    np.testing.assert_array_equal(nearest.matrix, turned(1))
+    assert capture.nearest(frame(POSE), 0.9) is None
     assert object_of("teapot_scene001") == "teapot"
     assert object_of("scene001_obj018_teapot") == "obj018_teapot"
 
@@ -134,6 +149,8 @@ def test_orb_without_hdr_asks_for_maps_alone(tmp_path: Path) -> None:
     shutil.rmtree(folder / "blender_HDR")
     shutil.rmtree(folder / "ground_truth" / "cup_scene001")
     assert [sample.key for sample in StanfordOrb(folder, 32).samples()] == ["cup_scene002_0000", "cup_scene002_0001"]
+    shutil.rmtree(folder / "ground_truth" / "cup_scene002")
+    assert "has nothing to compare with" in problems(StanfordOrb(folder, 32))
 
 
 def test_orb_names_every_file_that_is_not_as_it_should_be(tmp_path: Path) -> None:
@@ -148,6 +165,9 @@ def test_orb_names_every_file_that_is_not_as_it_should_be(tmp_path: Path) -> Non
     said = problems(StanfordOrb(folder, 32))
     assert "'transform_matrix' is missing" in said
     assert "cup_scene002/transforms_test.json: not readable" in said
+    novel = folder / "blender_LDR/cup_scene001/transforms_novel.json"
+    novel.write_text(novel.read_text().replace("0.6", "34.4"))  # degrees
+    assert f"{novel}: not readable (camera_angle_x 34.4)" in problems(StanfordOrb(folder, 32))
     assert "no such folder" in problems(StanfordOrb(tmp_path / "nowhere", 32))
 
 
@@ -158,6 +178,11 @@ def test_orb_refuses_broken_files_and_sizes(orb: StanfordOrb) -> None:
     light = orb.folder / "ground_truth/cup_scene002/env_map/0000.exr"
     write_exr(light, {"Y": np.ones((4, 8), np.float32)})
     with pytest.raises(UnirenderError, match=r"0000\.exr: EXR channels R, G, B missing"):
+        orb.inputs(sample_of(orb, "cup_scene001/relight_cup_scene002_0000"))
+    radiance = np.ones((4, 8, 3), np.float32)
+    radiance[1, 2:5, 0] = np.nan
+    OpenEXR.File({}, {"RGB": radiance}).write(str(light))
+    with pytest.raises(UnirenderError, match=r"0000\.exr: 3 pixels are NaN or infinite"):
         orb.inputs(sample_of(orb, "cup_scene001/relight_cup_scene002_0000"))
     np.save(orb.folder / "ground_truth/cup_scene001/surface_normal/0000.npy", np.full((64, 64, 3), np.nan))
     with pytest.raises(UnirenderError, match="NaN or infinite"):
@@ -196,6 +221,7 @@ def test_orb_looks_at_a_truth_where_it_counts(orb: StanfordOrb) -> None:
     truth = orb.folder / "ground_truth/cup_scene001"
     albedo, normal = np.full((64, 64, 3), 0.5), np.load(truth / "surface_normal/0000.npy")
     albedo[0], normal[0], normal[30:34, 30:34] = 7, 5, 0
+    albedo[32, 30], albedo[32, 31] = 0, 1  # as black and white as a surface may be
     (truth / "pseudo_gt_albedo/0000.png").unlink()
     np.save(truth / "pseudo_gt_albedo/0000.npy", albedo)
     np.save(truth / "surface_normal/0000.npy", normal)
@@ -321,6 +347,7 @@ def test_iiw_names_what_is_wrong(tmp_path: Path) -> None:
     assert "102.json: not readable" in said
     (tmp_path / "empty").mkdir()
     assert "has no .json file" in problems(Iiw(tmp_path / "empty"))
+    assert "nowhere: no such folder" in problems(Iiw(tmp_path / "nowhere"))
 
 
 def test_maw_compares_measured_surfaces(tmp_path: Path) -> None:
@@ -411,6 +438,10 @@ def test_maw_names_what_is_wrong(tmp_path: Path) -> None:
     assert "has 2 labels beside 0, expected 3" in problems(Maw(folder))
     np.save(folder / "labels/colors/DSC1.npy", np.ones(3))
     assert "expected finite numbers of (k, 3)" in problems(Maw(folder))
+    np.save(folder / "labels/colors/DSC1.npy", np.ones((2, 3)))
+    mask = folder / "labels/colors/DSC1_mask.png"
+    Image.open(mask).convert("RGB").save(mask)
+    assert f"{mask}: got uint8 of (240, 320, 3), expected one channel of labels" in problems(Maw(folder))
     meta.unlink()
     assert "meta.csv: cannot be read" in problems(Maw(folder))
 

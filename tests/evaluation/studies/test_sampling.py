@@ -13,16 +13,20 @@ from tiny_models import make_pipeline
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.options import MOST_STEPS
+from unirender.models.precision import resolve_device
+from unirender.options import MOST_STEPS, ModelOptions
+from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
+from unirender_evaluation.rows import evenly
 from unirender_evaluation.statistics import UNPRINTED
+from unirender_evaluation.studies.sampling import run as run_module
 from unirender_evaluation.studies.sampling.calibration import Calibration, calibrate, pool
 from unirender_evaluation.studies.sampling.command import BenchSampling
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Case, SamplingStudy, Setting, measure
 from unirender_evaluation.studies.sampling.plots import PANELS, draw_reliability, from_mean
 from unirender_evaluation.studies.sampling.run import run
-from unirender_evaluation.studies.sampling.tables import COLUMNS, calibration_table, quality_table, tables
+from unirender_evaluation.studies.sampling.tables import COLUMNS, calibration_table, headline, quality_table, tables
 from unirender_evaluation.versions import MODEL, Versions
 
 VERSIONS = Versions("test", {MODEL: "1"})
@@ -249,9 +253,29 @@ def test_the_plot_over_steps_pairs_by_picture() -> None:
     assert from_mean([*made[:-1], infinite], setting, column) is None
 
 
+def test_every_option_reaches_the_study(what: SamplingStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    seen, loaded = list[tuple](), list[ModelOptions]()
+    monkeypatch.setattr(run_module, "run", lambda *given: seen.append(given))
+    monkeypatch.setattr(ModelOptions, "load", lambda options: loaded.append(options) or what.pipeline)
+    made = BenchSampling(
+        str(what.suite.spec.path), tmp_path, Path("small"), 2, (4, 2), (3, 1), "unipc", seed=7, device="auto"
+    )
+    assert made.run() == 0
+    ((study, scenes, _),) = seen
+    assert (study.suite.sha256, study.out, study.sampler, study.seed) == (what.suite.sha256, tmp_path, "unipc", 7)
+    assert (study.steps, study.samples) == ((2, 4), (1, 3))
+    assert study.weights == checkpoint_sha256(checkpoint_folder(Path("small")))
+    assert study.device == str(resolve_device("auto"))
+    assert scenes == evenly(what.suite.scenes, 2)
+    assert study.pipeline.decompose
+    assert [(options.checkpoint, options.device) for options in loaded] == [(Path("small"), "auto")]
+
+
 def test_one_sample_has_no_calibration(what: SamplingStudy, records: list[Record]) -> None:
     settings = (MEAN, Setting("sample", 1, 1), Setting("sample", 2, 1))
     assert len(tables(records, settings, ())) == 1
+    assert (headline(settings), headline(what.settings)) == (None, Setting("sample", 2, 3))
     assert len(tables(records, what.settings, ())) == 3
     assert draw_reliability(records, what.settings[-1]).startswith(b"\x89PNG")
 

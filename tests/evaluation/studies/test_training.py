@@ -12,15 +12,15 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.config import ModelConfig
+from unirender.training.presets import PRESETS
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
+from unirender_evaluation.rows import evenly
 from unirender_evaluation.studies.training import run as training_run
 from unirender_evaluation.studies.training.choices import BASE_PRESET, PLAIN, Choice, training_choices
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.training.run import TrainingStudy, run
 from unirender_evaluation.studies.training.tables import COLUMNS, cells, table, to_json
-
-pytestmark = pytest.mark.long
 
 ROWS = (
     Choice(PLAIN, "", "Plain model", TRAIN),
@@ -51,6 +51,7 @@ def test_rows_differ_from_the_plain_model_in_what_they_say() -> None:
     assert plain.name == PLAIN
     assert not plain.group
     assert plain.config.model.physics_prior == "none"
+    assert plain.config.seed == BenchTraining(data=Path()).seed == 0
     assert len({str(row.config) for row in (plain, *others)}) == len(others) + 1
     for row in others:
         own, base = asdict(row.config), asdict(plain.config)
@@ -77,11 +78,29 @@ def test_rows_may_be_changes_of_another_preset() -> None:
         training_choices(preset="no-such")
 
 
+def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    seen = list[tuple]()
+    monkeypatch.setattr(training_run, "run", lambda *given: seen.append(given))
+    asked = BenchTraining(
+        tmp_path, "standard", tmp_path / "out", 1, 7, "tiny_muon", ("seed", PLAIN), 6, 2, device="cpu", seed=5
+    )
+    assert asked.run() == 0
+    ((study, rows, scenes, _),) = seen
+    assert (study.data, study.out, study.steps) == (tmp_path, tmp_path / "out", 7)
+    assert (study.device, study.parallel, study.preset) == ("cpu", 2, "tiny_muon")
+    assert study.suite.spec.name == "standard"
+    assert scenes == evenly(study.suite.scenes, 1)
+    assert [(row.name, row.config.seed, row.config.batch_size) for row in rows] == [(PLAIN, 5, 6), ("seed", 6, 6)]
+    assert rows[0].config.optimizer == PRESETS["tiny_muon"].optimizer
+
+
 def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
         BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
 
 
+@pytest.mark.long
 def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
     """With all columns of the table."""
     assert [(r.method, r.sample) for r in records] == [
@@ -92,6 +111,7 @@ def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
     assert cells(records, PLAIN)[0].mean != cells(records, "seed")[0].mean
 
 
+@pytest.mark.long
 def test_a_second_run_trains_nothing(
     study: TrainingStudy, records: list[Record], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +140,7 @@ def test_differences_are_paired_by_scene() -> None:
     cell = cells(made, "seed")[0]
     assert cell.difference is not None
     assert cell.difference.mean == pytest.approx(1.0)
+    assert (cell.mean, cell.n) == (pytest.approx(11.0), 3)
     assert cell.decided
     shifted = [record("seed", s, 10.0 * i + d) for (i, s), d in zip(enumerate("abc"), (1.0, -1.0, 0.5), strict=True)]
     assert not cells(made[:3] + shifted, "seed")[0].decided, "a row that wins and loses"
@@ -154,6 +175,7 @@ def test_missing_data_is_named(tmp_path: Path) -> None:
         BenchTraining(data=tmp_path / "none").run()
 
 
+@pytest.mark.long
 def test_rows_that_the_data_cannot_train_are_left_out_at_the_start(
     study: TrainingStudy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,10 +11,12 @@ from tiny_suites import make_suite
 
 from unirender.errors import UsageError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
-from unirender_evaluation.multiview.settings import MultiviewSettings
+from unirender_evaluation.multiview.scenes import multiview_scenes
+from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
-from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
+from unirender_evaluation.studies.unknown_mesh import run as run_module
+from unirender_evaluation.studies.unknown_mesh.command import LEAST_VIEWS, BenchUnknownMesh
 from unirender_evaluation.studies.unknown_mesh.measure import STRIP, UnknownMesh, measure
 from unirender_evaluation.studies.unknown_mesh.run import run
 from unirender_evaluation.studies.unknown_mesh.tables import AIMS, aim_notes
@@ -23,8 +25,6 @@ from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.transport_config import TransportConfig
-
-pytestmark = pytest.mark.long
 
 SETTINGS = MultiviewSettings(seen=4, held_out=1, spp=16, truth_spp=16, buffer_spp=16)
 CONFIG = OptimizeConfig(
@@ -56,7 +56,7 @@ def record(what: UnknownMesh, console: Console) -> Record:
     return run(what, what.suite.scenes[:1], console)[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_everything_is_measured(what: UnknownMesh, record: Record) -> None:
     scene = what.suite.scenes[0]
     assert (record.sample, record.object, record.key) == (scene.key, scene.object, what.key(scene))
@@ -70,7 +70,7 @@ def test_everything_is_measured(what: UnknownMesh, record: Record) -> None:
     assert {"mesh.glb", "environment.exr", "solution.json", STRIP} <= {p.name for p in what.folder(scene).iterdir()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_second_run_measures_nothing(what: UnknownMesh, record: Record, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("measured again")
@@ -83,7 +83,7 @@ def test_a_second_run_measures_nothing(what: UnknownMesh, record: Record, monkey
         next(measure(changed, what.suite.scenes[:1]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lost_record_is_scored_again_from_the_finished_result(
     what: UnknownMesh, record: Record, tmp_path: Path
 ) -> None:
@@ -98,7 +98,7 @@ def test_a_lost_record_is_scored_again_from_the_finished_result(
     assert found.values == record.values
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_tables_show_objects_their_mean_and_the_aims(what: UnknownMesh, record: Record, console: Console) -> None:
     text = (what.out / "unknown_mesh.md").read_text()
     assert text.count("### ") == 3
@@ -114,6 +114,17 @@ def test_tables_show_objects_their_mean_and_the_aims(what: UnknownMesh, record: 
         "n": 1,
     }
     assert [aim["bound"] for aim in content["aims"]] == [0.97, 0.93, 600]
+
+
+def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each with a value that is not its default."""
+    seen = list[tuple]()
+    monkeypatch.setattr(run_module, "run", lambda *given: seen.append(given))
+    assert BenchUnknownMesh("standard", tmp_path, 1, LEAST_VIEWS, progress=False, config=CONFIG).run() == 0
+    ((study, scenes, _, progress),) = seen
+    assert (study.suite.spec.name, study.out, study.config, progress) == ("standard", tmp_path, CONFIG, False)
+    assert study.settings == replace(STANDARD, seen=LEAST_VIEWS)
+    assert scenes == multiview_scenes(list(study.suite.scenes), 1)
 
 
 def test_aims_are_counted_by_object() -> None:

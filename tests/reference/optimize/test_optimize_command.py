@@ -34,7 +34,7 @@ from unirender_reference.optimize.picture import PictureInput, read_normals, rea
 from unirender_reference.optimize.placement import placed
 from unirender_reference.optimize.single_render import rerendered
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.views import Views
+from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import Sphere
 
 PLACE = Sphere(np.array([4.0, 1.0, -2.0]), 0.5)  # where the object stands in the user's units
@@ -43,10 +43,22 @@ QUICK = [
     *("--no-progress", "--texture-size", "16", "--light-rows", "8", "--transport.no-enabled"),
 ]
 
+FEW = [
+    *("--fov", "36", "--no-progress", "--single.light-rows", "8"),
+    *("--single.steps", "1", "--single.noise", "0.1", "--single.fine-steps", "1"),
+]
+
 
 @pytest.fixture(scope="module")
 def solution() -> Solution:
     return truth()
+
+
+def write_one(solution: Solution, path: Path, side: int) -> View:
+    """One picture of the object, as PNG with its mask."""
+    view = rendered_views(solution, 1, 0, side).seen[0]
+    write_png(path, np.concatenate([view.image, view.mask], axis=-1))
+    return view
 
 
 @pytest.fixture(scope="module")
@@ -162,8 +174,7 @@ def test_every_option_reaches_what_it_is_for(
     given, named = taken_by("run.optimize", data / "views", *options)
     assert (given[2].refine.iterations, given[3], named["pictures"], named["threads"]) == (2, out, False, 1)
 
-    view = rendered_views(solution, 1, 0, 12).seen[0]
-    write_png(one, np.concatenate([view.image, view.mask], axis=-1))
+    write_one(solution, one, 12)
     known = ["--mask", "m.png", "--fov", "40", "--normal", "n.png", "--size", "10"]
     given, _ = taken_by("picture.read_picture_input", one, *known)
     assert given == (one, Path("m.png"), 40, Path("n.png"), 10)
@@ -182,8 +193,7 @@ def test_a_mesh_in_other_units_is_refused(data: Path, solution: Solution, tmp_pa
 
 
 def test_a_mesh_that_the_picture_does_not_show_is_refused(solution: Solution, tmp_path: Path):
-    view = rendered_views(solution, 1, 0, 24).seen[0]
-    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+    view = write_one(solution, tmp_path / "one.png", 24)
     write_png(tmp_path / "open.png", view.image)
     trimesh.creation.box((1, 1, 1)).export(tmp_path / "cube.obj")
     write_solution(solution, tmp_path)
@@ -450,21 +460,9 @@ def test_a_full_disk_is_one_sentence(
         chosen = command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK)
         to_do = "run the same command again to go on"
     else:
-        view = rendered_views(solution, 1, 0, 20).seen[0]
-        write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
+        write_one(solution, tmp_path / "one.png", 20)
         monkeypatch.setattr("unirender.files.write_result", full)
-        few = [
-            "--fov",
-            "36",
-            "--no-progress",
-            "--single.steps",
-            "1",
-            "--single.noise",
-            "0.1",
-            "--single.fine-steps",
-            "1",
-        ]
-        chosen = command(tmp_path / "one.png", "--out", out, "--single.light-rows", "8", *few)
+        chosen = command(tmp_path / "one.png", "--out", out, *FEW)
         to_do = "choose another place"
     with pytest.raises(UnirenderError, match=rf"out: cannot be written \(No space left on device\); .*{to_do}$"):
         chosen.run()
@@ -473,10 +471,8 @@ def test_a_full_disk_is_one_sentence(
 
 @pytest.mark.slow
 def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    view = rendered_views(solution, 1, 0, 20).seen[0]
-    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
-    few = ["--fov", "36", "--no-progress", "--single.steps", "1", "--single.noise", "0.1", "--single.fine-steps", "1"]
-    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", "--single.light-rows", "8", *few)
+    view = write_one(solution, tmp_path / "one.png", 20)
+    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", *FEW)
     assert chosen.run() == 0
     found = read_result(tmp_path / "out")
     assert found.present == tuple(MAPS)
@@ -502,9 +498,7 @@ def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureF
 def test_the_seconds_of_one_picture_count_the_prediction(
     solution: Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    view = rendered_views(solution, 1, 0, 12).seen[0]
-    write_png(tmp_path / "one.png", np.concatenate([view.image, view.mask], axis=-1))
-    few = ["--single.steps", "0", "--single.noise", "0.1", "--single.fine-steps", "0", "--single.light-rows", "8"]
+    write_one(solution, tmp_path / "one.png", 12)
 
     def predict(image, mask, camera) -> Intrinsics:
         time.sleep(3)
@@ -513,7 +507,8 @@ def test_the_seconds_of_one_picture_count_the_prediction(
         normal = np.concatenate([0 * one, 0 * one, one], -1)
         return maps.replace(normal=normal, environment=np.full((16, 32, 3), 0.4, np.float32))
 
-    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", "--no-progress", "--init", "unirender", *few)
+    none = ["--init", "unirender", "--single.steps", "0", "--single.fine-steps", "0"]
+    chosen = command(tmp_path / "one.png", "--out", tmp_path / "out", *FEW, *none)
     began = time.perf_counter()
     assert chosen.run(predict) == 0
     seconds = float(capsys.readouterr().out.split(": ")[1].split(" s")[0])
