@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from unirender.arguments import as_floats, as_instance
+from unirender.arguments import as_coverage, as_floats, as_instance
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -68,7 +68,7 @@ def optimize_image(
     """
     as_instance(config, SingleConfig, "optimize: config")
     as_instance(camera, Camera, "optimize: camera")
-    image, mask = as_floats(image, "image"), as_floats(mask, "mask")
+    image, mask = as_floats(image, "image"), as_coverage(mask, "mask")
     linear = _checked(image, mask, hdr)
     if geometry is not None:
         check_in_picture(mask, camera, geometry)
