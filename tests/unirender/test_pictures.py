@@ -180,14 +180,21 @@ def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_r
 
 
 @pytest.mark.parametrize(
-    ("bits", "photometric", "told"), [(16, 1, None), (16, 0, "its 0 is white"), (12, 1, "its grey has 12 bits")]
+    ("bits", "photometric", "signed", "told"),
+    [
+        (16, 1, False, None),
+        (16, 0, False, "its 0 is white"),
+        (12, 1, False, "its grey has 12 bits"),
+        (16, 1, True, "its values are signed"),
+        (8, 1, True, "its values are signed"),
+    ],
 )
 def test_a_grey_tiff_whose_values_mean_something_else_is_refused(
-    bits: int, photometric: int, told: str | None, tmp_path: Path
+    bits: int, photometric: int, signed: bool, told: str | None, tmp_path: Path
 ) -> None:
-    """Pillow hands out such values as they are stored: inverted, or at a sixteenth of their brightness."""
-    values = RNG.integers(0, 2**bits, (8, 10, 1))
-    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric)
+    """Pillow hands out such values as they are stored: inverted, or at a sixteenth or a half of their brightness."""
+    values = RNG.integers(0, 2 ** (bits - signed), (8, 10, 1))
+    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric, signed=signed)
     readers = (
         lambda: read_picture(tmp_path / "a.tif").image_srgb,
         lambda: read_mask(tmp_path / "a.tif", (8, 10)),
@@ -401,6 +408,23 @@ def test_clipped_is_the_share_of_the_object_at_display_white(tmp_path: Path) -> 
     rgba[..., :3] = 254
     Image.fromarray(rgba[..., :3]).save(tmp_path / "c.png")
     assert read_picture(tmp_path / "c.png").clipped == 0
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"\0\0\0\x18ftypheic", "a HEIC picture"),
+        (b"\xff\x0a12345", "a JPEG XL picture"),
+        (b"#?RADIANCE\n\n", "a Radiance file"),
+        (b"", "is empty"),
+        (b"GIF", r"not a readable picture \("),
+    ],
+)
+def test_what_a_file_is_that_cannot_be_read(data: bytes, told: str, tmp_path: Path) -> None:
+    """Telephones name HEIC pictures .jpg."""
+    (tmp_path / "a.jpg").write_bytes(data)
+    with pytest.raises(UnirenderError, match=rf"a\.jpg: {told}.*, expected PNG, JPG.*; save it as PNG \(linear"):
+        read_picture(tmp_path / "a.jpg")
 
 
 def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
