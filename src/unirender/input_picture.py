@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
-from unirender.machine import in_gib, memory_bytes
+from unirender.machine import memory_excess
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -77,8 +77,7 @@ def _check_memory(path: Path, pixels: int) -> None:
     Raises:
         UnirenderError: it takes more memory than the machine has in all.
     """
-    if (wanted := BYTES_OF_NONE + BYTES_A_PIXEL * pixels) > (present := memory_bytes()):
+    if excess := memory_excess(BYTES_OF_NONE + BYTES_A_PIXEL * pixels):
         raise UnirenderError(
-            f"{path}: a picture of {pixels / 1e6:,.0f} megapixels, which would take about {in_gib(wanted)} of memory, "
-            f"and this machine has {in_gib(present)}; scale it down first"
+            f"{path}: a picture of {pixels / 1e6:,.3g} megapixels, which {excess}; scale it down first"
         )
