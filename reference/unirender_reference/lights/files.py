@@ -174,7 +174,9 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     try:
         with path.open("rb") as file:
             if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
-                raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
+                raise UnirenderError(
+                    f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR); name it .png"
+                )
             file.seek(0)
             turned = RGBE_TURNED.match(file.read(MOST_HEADER_BYTES))
         if turned:
@@ -185,7 +187,9 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]
-        raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
+        raise UnirenderError(
+            f"light {path}: not a readable HDR map ({reason}), expected RGBE, PFM or EXR; save it as EXR"
+        ) from error
     return _as_its_header_says(np.array(bitmap), path), {}
 
 

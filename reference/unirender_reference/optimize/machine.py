@@ -15,7 +15,7 @@ def require_cores(threads: int) -> None:
     """
     cores = os.cpu_count() or 1
     if threads > cores:
-        raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine")
+        raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine; 0 takes all")
 
 
 def require_memory(needed: Mapping[str, float]) -> None:
