@@ -13,10 +13,12 @@ from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
+from unirender.commands import Relight
 from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
+from unirender.options import InputOptions, OutputOptions
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -439,6 +441,8 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     needed = BYTES_OF_NONE + BYTES_A_PIXEL * 400 * 300
     monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
     read_input(tmp_path / "a.png", None)
+    with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
+        Relight(InputOptions(tmp_path / "a.png"), tmp_path / "a.hdr", OutputOptions(tmp_path / "out")).run(np.asarray)
     monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed - 1)
     with pytest.raises(
         UnirenderError, match=r"a picture of 0\.12 megapixels.* about 0\.5 GiB .* has 0\.4 GiB for it; scale"
