@@ -143,6 +143,15 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     return read_exr_bytes(data, name=str(path))
 
 
+def pixel_count(path: Path) -> int:
+    """By the header of a file; 0 where it has none that can be read."""
+    try:
+        low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+    except Exception:  # several types, as in reading
+        return 0
+    return (int(high[0]) - int(low[0]) + 1) * (int(high[1]) - int(low[1]) + 1)
+
+
 def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:
     """As `read_exr`, from memory; `name` stands in error messages."""
     try:
