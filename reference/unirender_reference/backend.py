@@ -181,7 +181,10 @@ def mitsuba(variant: str | None = None) -> Any:
             "call unirender_reference.backend.mitsuba() before these imports"
         )
     if name not in module.variants():
-        raise UnirenderError(f"Mitsuba variant: got {name!r}, expected one of {', '.join(module.variants())}")
+        raise UnirenderError(
+            f"Mitsuba variant: got {name!r}, expected one of {', '.join(module.variants())}; "
+            f"choose one of them ({VARIANT_VARIABLE})"
+        )
     if module.variant() != name:
         module.set_variant(name)
     return module

@@ -195,7 +195,10 @@ def _start_slurm(jobs: int, stack: contextlib.ExitStack) -> tuple[Any, int]:
         cluster.sync(_submit, cluster)
     except RuntimeError as error:
         said = str(error).partition("stderr:")[2] or str(error)
-        raise UnirenderError(f"cluster slurm: `sbatch` refused the job: {' '.join(said.split())}") from error
+        raise UnirenderError(
+            f"cluster slurm: `sbatch` refused the job: {' '.join(said.split())}; "
+            "change its queue, cores, memory or walltime in ~/.config/dask/jobqueue.yaml"
+        ) from error
     cluster.adapt(minimum_jobs=jobs, maximum_jobs=jobs)
     _log.info("waiting for the first of %d Slurm jobs", jobs)
     return cluster, jobs * processes

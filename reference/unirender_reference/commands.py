@@ -93,7 +93,9 @@ class Dataset:
         from unirender_reference.dataset_config import DatasetConfig
 
         if self.cluster is not None and self.workers:
-            raise UsageError(f"--workers {self.workers}: expected none with --cluster, whose workers are its own")
+            raise UsageError(
+                f"--workers {self.workers}: expected none with --cluster, whose workers are its own; leave it out"
+            )
         vary = self.vary or ("independent" if self.materials == "maps" else "basis")
         pairs = DEFAULT_PAIRS.get(vary, PAIRS_OF_MAPS if self.materials == "maps" else OTHER_PAIRS)
         try:
@@ -162,7 +164,9 @@ class Dataset:
         if self.recipe is not None:
             return max([part.run() for part in self.parts().values()])
         if self.assets is not None:
-            raise UsageError("--assets: got it without --recipe, expected a recipe that names folders in it")
+            raise UsageError(
+                "--assets: got it without --recipe, expected a recipe that names folders in it; leave it out"
+            )
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -144,7 +144,9 @@ class DatasetConfig:
                 "--vary paper for a floor of each picture"
             )
         if self.denoise and self.split == "test":
-            raise UnirenderError("dataset denoise: got --split test, expected train: truth is never denoised")
+            raise UnirenderError(
+                "dataset denoise: got --split test, expected train: truth is never denoised; leave --denoise out"
+            )
         if self.denoise and self.noise_floor is not None:
             raise UnirenderError(
                 "dataset denoise: got a noise floor too, which says nothing about a denoised picture; choose one"

@@ -39,10 +39,13 @@ def base_color_bitmap(albedo_linear: Float[np.ndarray, "*size 3"]) -> dict[str, 
     if albedo.ndim == 1:
         albedo = np.broadcast_to(albedo, (2, 2, 3))
     if albedo.ndim != 3 or albedo.shape[-1] != 3:
-        raise UnirenderError(f"albedo: got shape {albedo.shape}, expected (3,) or (height, width, 3)")
+        raise UnirenderError(
+            f"albedo: got shape {albedo.shape}, expected (3,) or (height, width, 3); move the channels last"
+        )
     if not np.isfinite(albedo).all() or albedo.min() < 0 or albedo.max() > 1:
         raise UnirenderError(
-            f"albedo: got values in [{albedo.min():.4g}, {albedo.max():.4g}], expected finite linear values in [0, 1]"
+            f"albedo: got values in [{albedo.min():.4g}, {albedo.max():.4g}], expected finite linear values in [0, 1]; "
+            "divide 8-bit values by 255 and decode them (unirender.color.srgb_decode)"
         )
     return _bitmap(albedo)
 

@@ -121,7 +121,9 @@ def mesh_folder(
                 break
     if not names:
         held = f" for --split {split} with --holdout {holdout}" if holdout else ""
-        raise UnirenderError(f"{pattern}: no mesh files{held}, expected .glb, .gltf, .obj or .ply files")
+        raise UnirenderError(
+            f"{pattern}: no mesh files{held}, expected .glb, .gltf, .obj or .ply files; give another folder or pattern"
+        )
     return MeshFolder(base, names, unreadable)
 
 

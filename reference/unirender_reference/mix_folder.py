@@ -93,7 +93,9 @@ def _check_places(files: Sequence[MeshFile], out: Path) -> None:
     for file in files:
         path = file.path.resolve()
         if path in seen:
-            raise UnirenderError(f"mix-meshes: {file.path} is named by two of the patterns, expected it once")
+            raise UnirenderError(
+                f"mix-meshes: {file.path} is named by two of the patterns, expected it once; leave one out"
+            )
         if path.is_relative_to(out.resolve()):
             raise UnirenderError(
                 f"--out: got {out}, which holds one of the meshes that are mixed ({file.name}); expected another place"
@@ -173,7 +175,8 @@ class _Drawn:
         first = f", the first because {next(iter(self.refused.values()))}" if self.refused else ""
         raise UnirenderError(
             f"mix-meshes: none of the {len(self.files):,} meshes can be used: {len(self.too_large):,} have more than "
-            f"{self.max_faces:,} triangles (--max-faces), {len(self.refused):,} are refused{first}"
+            f"{self.max_faces:,} triangles (--max-faces), {len(self.refused):,} are refused{first}; "
+            "raise --max-faces, or give other meshes"
         )
 
     def donor(self, rng: np.random.Generator, parts: Sequence[int]) -> tuple[int, list[Texture]]:

@@ -127,7 +127,9 @@ def measured_floor_db(picture: Estimate, converged: Estimate, mask: Mask, premul
         premultiplied: whether both are.
     """
     if converged.variance is None:
-        raise UnirenderError("noise floor: got a render without variance, expected one from several batches")
+        raise UnirenderError(
+            "noise floor: got a render without variance, expected one from several batches; render it with batches=16"
+        )
     shown, true = (
         image_srgb(unpremultiply(x.mean[..., :3], mask) if premultiplied else x.mean[..., :3]).astype(np.float64)
         for x in (picture, converged)
@@ -206,7 +208,10 @@ def render_to_floor(
         count = full_spp(wanted, batches, mask.size)
         found = render(count, seed + number)
         if found.variance is None:
-            raise UnirenderError("noise floor: got a render without variance, expected one from several batches")
+            raise UnirenderError(
+                "noise floor: got a render without variance, expected one from several batches; "
+                "render it with batches=16"
+            )
         mean, variance = found.mean.astype(np.float64), found.variance.astype(np.float64)
         return FloorEstimate(mean, variance, count, *judge(mean, variance), floor_db, found.nan_pixels)
 

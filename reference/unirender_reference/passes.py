@@ -251,7 +251,9 @@ def pass_count(spp: int, batches: int, most: int) -> int:
     if spp < 1 or batches < 1 or batches > spp:
         raise UnirenderError(f"spp: got {spp} in {batches} batches, expected at least one sample in each")
     if spp > (limit := MOST_PASSES * max(most, 1)):
-        raise UnirenderError(f"spp: got {spp}, expected at most {limit:,}, which {MOST_PASSES:,} passes take")
+        raise UnirenderError(
+            f"spp: got {spp}, expected at most {limit:,}, which {MOST_PASSES:,} passes take; average several seeds"
+        )
     if (count := _grid_passes(spp, batches, most)) is not None:
         return count
     below = next(n for n in range(spp - 1, 0, -1) if n < batches or _grid_passes(n, batches, most) is not None)

@@ -59,7 +59,7 @@ class Recipe:
             raise UsageError(f"--recipe {self.path.stem}: needs the folders {', '.join(wanted)}; pass --assets FOLDER")
         missing = [name for name in wanted if assets is not None and not (assets / name).is_dir()]
         if missing:
-            hint = f"; to get them: {self.assets_from}" if self.assets_from else ""
+            hint = f"; to get them: {self.assets_from}" if self.assets_from else "; copy or link them there"
             raise UnirenderError(f"{assets}: no folder {', '.join(missing)} in it, expected {', '.join(wanted)}{hint}")
         return {
             name: {key: str(assets / value) if assets and key in FOLDERS else value for key, value in part.items()}
@@ -94,9 +94,11 @@ def read_recipe(name_or_path: str) -> Recipe:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected a recipe") from None
+        raise UnirenderError(
+            f"{path}: cannot be read ({error.strerror}), expected a recipe; is the path right?"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UnirenderError(f"{path} is not TOML: {error}") from None
+        raise UnirenderError(f"{path} is not TOML: {error}; correct that line") from None
     common, parts = data.pop("common", {}), data.pop("parts", {})
     title, assets_from = data.pop("title", ""), data.pop("assets_from", "")
     problems = [f"unknown key {key!r}" for key in data]

@@ -74,7 +74,10 @@ class Renderer:
 
     def __init__(self, obj: MeshObject, camera: Camera | None = None, resolution: int = 64) -> None:
         if not isinstance(resolution, Integral) or resolution < 1:
-            raise UnirenderError(f"resolution: got {resolution!r:.60}, expected a whole number of pixels, at least 1")
+            raise UnirenderError(
+                f"resolution: got {resolution!r:.60}, expected a whole number of pixels, at least 1; "
+                "pictures are square"
+            )
         self.obj = as_instance(obj, MeshObject, "renderer")
         self.camera = Camera() if camera is None else as_instance(camera, Camera, "renderer")
         self.resolution = resolution

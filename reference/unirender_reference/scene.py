@@ -131,15 +131,21 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
     environment = as_radiance("environment", environment)
     if environment.ndim != 3 or environment.shape[-1] != 3 or environment.shape[0] < 3 or environment.shape[1] < 2:
         # Mitsuba resamples smaller maps when it loads them.
-        raise UnirenderError(f"environment: got shape {environment.shape}, expected (height >= 3, width >= 2, 3)")
+        raise UnirenderError(
+            f"environment: got shape {environment.shape}, expected (height >= 3, width >= 2, 3); "
+            "move the channels last, or resample it (unirender.lighting.resample_environment)"
+        )
     if not np.isfinite(environment).all() or environment.min() < 0:
-        raise UnirenderError("environment: got negative, infinite or NaN radiance, expected finite values >= 0")
+        raise UnirenderError(
+            "environment: got negative, infinite or NaN radiance, expected finite values >= 0; "
+            "np.maximum(light, 0) is what to do with a filter's ringing"
+        )
     if environment.max() > MOST_RADIANCE:
         raise UnirenderError(
             f"environment: got radiance up to {environment.max():.3g}, expected at most {MOST_RADIANCE:g}; scale it"
         )
     if environment.max() <= 0:
-        raise UnirenderError("environment: all texels are black, expected some light")
+        raise UnirenderError("environment: all texels are black, expected some light; give another one")
     return drawable(environment)
 
 
@@ -247,7 +253,10 @@ class EditableScene:
                     f"{key}: got None, the object's own map, but {self._obj.name} has none; expected a value in [0, 1]"
                 )
             if value is not None and not (isinstance(value, Real) and 0.0 <= value <= 1.0):
-                raise UnirenderError(f"{key}: got {value!r:.60}, expected a value in [0, 1]")
+                raise UnirenderError(
+                    f"{key}: got {value!r:.60}, expected a value in [0, 1]; a map belongs to the "
+                    f"object (dataclasses.replace(obj, {key}=map)) and is None here"
+                )
         mapped = frozenset(key for key, value in values.items() if value is None)
         found = self._surfaces.get((surface, mapped))
         if found is None:

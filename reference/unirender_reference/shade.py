@@ -122,7 +122,7 @@ def shade_gradients(
     if image_gradient.shape != (*mask.shape[:2], 3) or not np.isfinite(image_gradient).all():
         raise UnirenderError(
             f"shade_gradients: got an image gradient of shape {image_gradient.shape}, expected finite "
-            f"{(*mask.shape[:2], 3)}"
+            f"{(*mask.shape[:2], 3)}, as the picture that `shade` returns; has it an alpha channel?"
         )
     given = {**maps, "environment": light}
     totals = {name: np.zeros(given[name].shape, np.float64) for name in wrt}
@@ -162,7 +162,9 @@ def _arguments(
     if environment is None:
         environment = intrinsics.require("environment")["environment"]
     if maps["normal"].ndim != 3:
-        raise UnirenderError(f"shade: got maps of shape {maps['normal'].shape}, expected one picture (h, w, c)")
+        raise UnirenderError(
+            f"shade: got maps of shape {maps['normal'].shape}, expected one picture (h, w, c); call it for each"
+        )
     light = as_light(environment)
     envmap_data(light if light.any() else np.ones_like(light))  # checks
     inside = np.any(maps["normal"] != 0, axis=-1, keepdims=True)

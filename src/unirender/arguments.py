@@ -56,3 +56,13 @@ def as_floats(value: Any, what: str) -> Float[np.ndarray, "..."]:
     if given.dtype.kind not in "bif":
         raise UnirenderError(f"{what}: got {type(value).__name__} {value!r:.60}, expected numbers")
     return given
+
+
+def as_coverage(value: Any, what: str) -> Float[np.ndarray, "..."]:
+    """The same of a mask, which may be one of whole numbers where these are 0 and 1.
+
+    Raises:
+        UnirenderError: as `as_floats`.
+    """
+    given = np.asarray(value)
+    return given.astype(np.float32) if given.dtype.kind == "u" and given.max(initial=0) <= 1 else as_floats(value, what)

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from unirender.arguments import as_floats
+from unirender.arguments import as_coverage, as_floats
 from unirender.blocks import by_rows, by_values
 from unirender.errors import UnirenderError
 
@@ -77,9 +77,9 @@ def unpremultiply(
     """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0.
 
     Raises:
-        UnirenderError: one of them is of whole numbers, or the mask has not one channel.
+        UnirenderError: one of them is of whole numbers (a mask of 0 and 1 may be), or the mask has not one channel.
     """
-    image_linear, mask = as_floats(image_linear, "image"), as_floats(mask, "mask")
+    image_linear, mask = as_floats(image_linear, "image"), as_coverage(mask, "mask")
     if mask.shape[-1:] != (1,) or mask.ndim < min(image_linear.ndim, 3):  # one mask may be that of several pictures
         raise UnirenderError(
             f"mask: got shape {mask.shape} for an image of {image_linear.shape}, expected [height, width, 1]"

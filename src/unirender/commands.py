@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.input_picture import RELIT_BYTES_A_PIXEL
 from unirender.notices import notice
 from unirender.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
 from unirender.remarks import (
@@ -222,7 +223,7 @@ class Relight:
         self.model.check()
         self.decomposition.check(self.model.mode)
         check_stops(self.exposure)
-        picture, camera = self.input.read(self.model)
+        picture, camera = self.input.read(self.model, RELIT_BYTES_A_PIXEL)
         options = {"anchored": self.anchored, **self.decomposition.settings, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light, rule = exposed_light(read_light, self.environment, self.exposure)

@@ -1,5 +1,6 @@
 """Picture files of Pillow's and PIL pictures as display values in [0, 1]: colours in sRGB, data as it is stored."""
 
+import re
 import struct
 from pathlib import Path
 
@@ -9,18 +10,29 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from unirender.cicp import Cicp, read_cicp
 from unirender.errors import UnirenderError
+from unirender.exif_colors import exif_remark
 from unirender.icc import in_srgb
 from unirender.primaries import REC709, SAME_PRIMARIES
 from unirender.sixteen_bits import as_stored, has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
+OTHER_FORMATS = {  # and how their files begin
+    "a HEIC picture": rb".{4}ftyp(hei|hev|mif1|msf1)",
+    "a JPEG XL picture": rb"\xff\x0a|\x00\x00\x00\x0cJXL ",
+    "an OpenEXR file under another name": rb"\x76\x2f\x31\x01",
+    "a Radiance file": rb"#\?",
+    "a PDF": rb"%PDF",
+    "an SVG or another text": rb"\s*<",
+}
+FIRST_BYTES = 12
 MAX_PIXELS = 100_000_000
 DISPLAY_MAX_8_BIT, DISPLAY_MAX_16_BIT = 255, 65535  # display white of grey
 SRGB_GAMMA, SAME_GAMMA = 1 / 2.2, 0.05  # of the gAMA chunk of a PNG, and how far others may be from it
 GREY_STEPS = {"L;2": 255 // 3, "L;4": 255 // 15}  # grey of 2 and 4 bits as Pillow names it: a step in 8 bits
 GREYS = ("1", "L", "I")  # first bands of modes without colour; of a palette it is P
 PNG_POINTS, PNG_SRGB = ("white", "red", "green", "blue"), (*REC709[6:], *REC709[:6])  # of the cHRM chunk
+CMYK = "its colours are CMYK without a profile, of which sRGB is a guess: save it in sRGB where it was made"
 SIXTEEN_BITS = "its colours have 16 bits, of which 8 are read: save it as PNG in sRGB to keep them"
 
 
@@ -51,7 +63,17 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
     except UnirenderError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
-        raise UnirenderError(f"{path}: not a readable picture ({error}), expected {FORMATS}") from error
+        raise UnirenderError(
+            f"{path}: {_unreadable(Path(path), error)}, expected {FORMATS}; save it as PNG (linear radiance as EXR)"
+        ) from error
+
+
+def _unreadable(path: Path, error: Exception) -> str:
+    """What a file is that Pillow did not read, where its first bytes tell, else what Pillow says."""
+    with path.open("rb") as file:
+        start = file.read(FIRST_BYTES)
+    told = (what for what, sign in OTHER_FORMATS.items() if re.match(sign, start, re.DOTALL))
+    return next(told, "is empty" if not start else f"not a readable picture ({error})")
 
 
 def _check_grey(image: Image.Image, name: str) -> None:
@@ -100,10 +122,16 @@ def srgb_values_and_remarks(
     """The same, and remarks by kind on what was lost in reading it; `upright` as of `stored_values`."""
     image = open_picture(path, upright=upright)
     coded = read_cicp(path)
-    if coded is not None and coded.is_srgb:
-        image.info.pop("icc_profile", None)  # which counts less
+    if coded is not None:  # it counts more
+        image.info.pop("exif", None)
+        if coded.is_srgb:
+            image.info.pop("icc_profile", None)
     srgb = in_srgb(image, name)
     remarks = _png_remarks(image, coded)
+    if image.mode == "CMYK" and not image.info.get("icc_profile"):
+        remarks["primaries"] = CMYK
+    if said := exif_remark(image):
+        remarks["primaries"] = said
     full = sixteen_bit_values(path, upright=upright) if srgb is image else None
     if full is not None:
         return full, remarks
@@ -113,8 +141,8 @@ def srgb_values_and_remarks(
 
 
 def _png_remarks(image: Image.Image, coded: Cicp | None) -> dict[str, str]:
-    """What is due on a PNG that states other colours than sRGB's and has no ICC profile, by which it is converted; of
-    gamma and primaries where nothing counts more (`unirender.cicp`)."""
+    """What is due on a PNG or an AVIF that states other colours than sRGB's and has no ICC profile, by which it is
+    converted; of gamma and primaries where nothing counts more (`unirender.cicp`)."""
     if image.info.get("icc_profile"):
         return {}
     if coded is not None:

@@ -35,6 +35,9 @@ COLORS = ("", *(name for name, components in _COMPONENTS.items() if components =
 MAP_CHANNELS: Mapping[str, tuple[str, ...]] = {
     name: tuple(f"{name}.{component}" for component in _COMPONENTS.get(name, "Y")) for name in IMAGE_MAPS
 }
+COLOR_SPACE_ATTRIBUTE = "colorInteropID"  # of OpenEXR 3.4 and later: <transfer>_<primaries>_<scene or display>
+OUR_COLOR_SPACES = ("lin_rec709_scene", "data", "unknown")
+SQUARE = 0.02  # of 1: how far pixels may be from square, as writers round
 
 
 def write_exr(
@@ -140,16 +143,29 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     return read_exr_bytes(data, name=str(path))
 
 
+def pixel_count(path: Path) -> int:
+    """By the header of a file; 0 where it has none that can be read."""
+    try:
+        low, high = OpenEXR.File(str(path), header_only=True).header()["dataWindow"]
+    except Exception:  # several types, as in reading
+        return 0
+    return (int(high[0]) - int(low[0]) + 1) * (int(high[1]) - int(low[1]) + 1)
+
+
 def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:
     """As `read_exr`, from memory; `name` stands in error messages."""
     try:
         file = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         parts = len(file.parts)
-        channels = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in file.channels().items()}
-        header = file.header()
+        stored_channels, header = file.channels(), file.header()
+        _check_stored(stored_channels, header, name)
+        channels = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in stored_channels.items()}
+    except UnirenderError:
+        raise
     except Exception as error:  # the binding raises several types for broken data
         raise UnirenderError(
-            f"{name}: not a readable OpenEXR file, but another or a damaged one ({str(error).splitlines()[0]})"
+            f"{name}: not a readable OpenEXR file, but another, a damaged or a mip-mapped one "
+            f"({str(error).splitlines()[0]}); write it again, as scan lines"
         ) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
@@ -165,6 +181,33 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
         channels = in_rec709(channels, header["chromaticities"], COLORS, name)
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
     return channels, attributes
+
+
+def _check_stored(channels: Mapping[str, OpenEXR.Channel], header: Mapping[str, object], name: str) -> None:
+    """Looks for pixels that are no picture of radiance, before any is converted.
+
+    Raises:
+        UnirenderError: a deep file, channels with fewer pixels than the picture, colours that are whole numbers or of
+            another space than the numbers of `chromaticities` can say, or pixels that are not square.
+    """
+    got = ""
+    for key, channel in channels.items():
+        kind = channel.pixels.dtype.kind
+        if kind == "O":
+            got = f"a deep file (several samples in a pixel of {key}), expected one value a pixel; flatten it first"
+        elif (channel.xSampling, channel.ySampling) != (1, 1):
+            step = f"{channel.xSampling} x {channel.ySampling}"
+            got = f"one value of {key} for {step} pixels, expected one for each; save it as R, G, B without subsampling"
+        elif kind in "ui" and key.rpartition(".")[2] in ("R", "G", "B"):
+            got = f"whole numbers in {key}, expected radiance in half or float; divide them by their white first"
+    space, ratio = header.get(COLOR_SPACE_ATTRIBUTE), header.get("pixelAspectRatio", 1.0)
+    by_numbers = str(space).startswith("lin_") and "chromaticities" in header
+    if "R" in channels and not (space in (None, *OUR_COLOR_SPACES) or by_numbers):
+        got = f"colours of {space!r} ({COLOR_SPACE_ATTRIBUTE}), expected linear Rec.709; convert it first"
+    if isinstance(ratio, float) and abs(ratio - 1) > SQUARE:
+        got = f"pixels {ratio:.3g} times as wide as high (pixelAspectRatio), expected square ones; resample it first"
+    if got:
+        raise UnirenderError(f"{name}: got {got}")
 
 
 def image_channels(image_linear: Float[np.ndarray, "h w c"]) -> Channels:

@@ -157,7 +157,7 @@ def decompose_folder(
                 continue
             yield path, picture, meta | of_picture(picture)
 
-    for batch in batches(wanted(), max(AT_ONCE // int(settings.get("looks", 1)), 1)):
+    def finish(batch: list[tuple[Path, Picture, dict[str, Any]]]) -> None:
         results = decompose([picture for _, picture, _ in batch])
         for (path, _, meta), result in zip(batch, results, strict=True):
             try:
@@ -168,6 +168,9 @@ def decompose_folder(
                 done.failed[path.name] = str(error)
             else:
                 done.figures[path.name] = {name: written[name] for name in FIGURES if name in written}
+
+    for batch in batches(wanted(), max(AT_ONCE // int(settings.get("looks", 1)), 1)):
+        finish(batch)  # whose results are forgotten before the next are made
     return done
 
 
@@ -199,11 +202,14 @@ def batches(
     pixels = 0
     for item in items:
         height, width = item[1].image_srgb.shape[:2]
-        if batch and (len(batch) == most or pixels + height * width > PIXELS_AT_ONCE):
+        if batch and pixels + height * width > PIXELS_AT_ONCE:
             yield batch
             batch, pixels = [], 0
         batch.append(item)
         pixels += height * width
+        if len(batch) == most or pixels >= PIXELS_AT_ONCE:  # before the next is read
+            yield batch
+            batch, pixels = [], 0
     if batch:
         yield batch
 

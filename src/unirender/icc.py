@@ -1,4 +1,4 @@
-"""Pictures whose file states another colour space by an ICC profile: brought to sRGB."""
+"""Pictures whose file states another colour space by an ICC profile, or by EXIF alone: brought to sRGB."""
 
 import io
 
@@ -6,16 +6,18 @@ import numpy as np
 from PIL import Image, ImageCms
 
 from unirender.errors import UnirenderError
+from unirender.exif_colors import ADOBE_RGB, adobe_rgb_in_srgb, exif_color_space
 
 SAME_PROFILE = 2  # of 255: profiles of sRGB differ by this much among one another
 PROBE = 9  # steps along each axis of the cube that two profiles are compared on
 
 
 def in_srgb(image: Image.Image, name: str) -> Image.Image:
-    """A picture whose ICC profile is not sRGB's, converted: relative colorimetric, 8 bits a channel, RGB or RGBA.
+    """A picture whose ICC profile is not sRGB's, converted: relative colorimetric, 8 bits a channel, RGB or RGBA; and
+    one without a profile that is Adobe RGB by its EXIF (`unirender.exif_colors`).
 
-    Others come back as they are: those without a profile, those of sRGB, to the bit, and 16-bit grey, whose profile is
-    not looked at.
+    Others come back as they are: those of which nothing is stated, those of sRGB, to the bit, and 16-bit grey, whose
+    profile is not looked at.
 
     Args:
         image: the picture; colours, not data.
@@ -25,7 +27,9 @@ def in_srgb(image: Image.Image, name: str) -> Image.Image:
         UnirenderError: the profile is damaged, or of another kind of picture.
     """
     data = image.info.get("icc_profile")
-    if not data or image.mode.startswith(("I", "F")):
+    if not data:
+        return adobe_rgb_in_srgb(image) if exif_color_space(image) == ADOBE_RGB else image
+    if image.mode.startswith(("I", "F")):
         return image
     if image.mode in ("RGBa", "La"):  # premultiplied
         image = image.convert("RGBA" if image.mode == "RGBa" else "LA")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
-from unirender.machine import in_gib, memory_bytes
+from unirender.machine import memory_excess
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -14,16 +14,20 @@ DARK = 0.35  # display value that an object reaches at the exposures of the trai
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
-BYTES_A_PIXEL, BYTES_OF_NONE = 140, 5e8  # of memory: what taking a picture apart takes; to change it takes more
+BYTES_A_PIXEL, BYTES_OF_NONE = 140, 5e8  # of memory: what it takes to take a picture apart, or to edit it
+RELIT_BYTES_A_PIXEL = 230  # what it takes to put it under another light
 
 
-def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tuple["Picture", dict[str, str]]:
+def read_input(
+    path: Path, mask: Path | None, option: str = " (--mask)", bytes_a_pixel: int = BYTES_A_PIXEL
+) -> tuple["Picture", dict[str, str]]:
     """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
 
     Args:
         path: of the picture.
         mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
         option: what remarks on a mask that is not there add: how one is given.
+        bytes_a_pixel: that the work on it takes, besides `BYTES_OF_NONE`.
 
     Raises:
         UnirenderError: an unreadable file, a mask that does not fit, or a picture that this machine is too small for.
@@ -35,7 +39,7 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     picture = read_picture(path)
     remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
-    _check_memory(path, height * width)
+    _check_memory(path, height * width, bytes_a_pixel)
     if mask is not None:
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
@@ -71,14 +75,13 @@ def read_input(path: Path, mask: Path | None, option: str = " (--mask)") -> tupl
     return picture, remarks
 
 
-def _check_memory(path: Path, pixels: int) -> None:
+def _check_memory(path: Path, pixels: int, bytes_a_pixel: int) -> None:
     """Looks at the size of a picture: one sentence before the work instead of an end without a word in it.
 
     Raises:
         UnirenderError: it takes more memory than the machine has in all.
     """
-    if (wanted := BYTES_OF_NONE + BYTES_A_PIXEL * pixels) > (present := memory_bytes()):
+    if excess := memory_excess(BYTES_OF_NONE + bytes_a_pixel * pixels):
         raise UnirenderError(
-            f"{path}: a picture of {pixels / 1e6:,.0f} megapixels, which would take about {in_gib(wanted)} of memory, "
-            f"and this machine has {in_gib(present)}; scale it down first"
+            f"{path}: a picture of {pixels / 1e6:,.3g} megapixels, which {excess}; scale it down first"
         )

@@ -1,16 +1,76 @@
-"""What the machine has."""
+"""What the machine has, or leaves to this process."""
 
+import math
 import os
+from pathlib import Path
 
 GIB = 2**30
+GROUPS = Path("/proc/self/cgroup")  # of Linux: which control groups this process is in
+GROUPS_ROOT = Path("/sys/fs/cgroup")
+SWAPS = Path("/proc/meminfo")
+LIMITS = {  # by version of the control groups: of memory, and of swap, which the first one's counts with memory
+    1: ("memory.limit_in_bytes", "memory.memsw.limit_in_bytes"),
+    2: ("memory.max", "memory.swap.max"),
+}
 
 
 def memory_bytes() -> float:
-    """Of the machine; infinite where the system does not tell."""
+    """Memory and swap that this process may have: of the machine, or of its control groups (a container, a job), where
+    they allow less; infinite where the system does not tell."""
     pages = os.sysconf("SC_PHYS_PAGES") if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}) else -1
-    return float(pages * os.sysconf("SC_PAGE_SIZE")) if pages > 0 else float("inf")
+    if pages <= 0:
+        return math.inf
+    swap = _swap_bytes()
+    return min([float(pages * os.sysconf("SC_PAGE_SIZE")) + swap, *_group_limits(swap)])
 
 
-def in_gib(count: float) -> str:
-    """A number of bytes for messages, rounded."""
-    return f"{count / GIB:,.0f} GiB"
+def memory_excess(wanted: float) -> str | None:
+    """What to say of something that takes so many bytes, where there are not so many; None where there are.
+
+    What is wanted is rounded up and what there is down, so that the numbers differ.
+    """
+    present = memory_bytes()
+    if wanted <= present:
+        return None
+    digits = int(wanted < 100 * GIB)
+    parts = 10**digits
+    needed, there = math.ceil(wanted * parts / GIB) / parts, math.floor(present * parts / GIB) / parts
+    return f"would take about {needed:,.{digits}f} GiB of memory, and this machine has {there:,.{digits}f} GiB for it"
+
+
+def _swap_bytes() -> float:
+    """Of the machine; 0 where it has none or does not tell."""
+    for line in _text(SWAPS).splitlines():
+        if line.startswith("SwapTotal:"):
+            return 1024.0 * int(line.split()[1])
+    return 0.0
+
+
+def _group_limits(swap: float) -> list[float]:
+    """Bytes that each control group around this process allows, with what it may have of the machine's swap."""
+    limits = []
+    for line in _text(GROUPS).splitlines():
+        _, controllers, path = line.split(":", 2)
+        version = 1 if "memory" in controllers.split(",") else 2
+        if version == 2 and controllers:
+            continue
+        root = GROUPS_ROOT / "memory" if version == 1 else GROUPS_ROOT
+        inner = root / path.lstrip("/")  # which is not there inside of a container: `root` is its own group then
+        for folder in (inner, *inner.parents):
+            limit, more = (_number(folder / name) for name in LIMITS[version])
+            if folder.is_relative_to(root) and math.isfinite(limit):
+                limits.append(min(limit + swap, more if version == 1 else limit + more))
+    return limits
+
+
+def _number(path: Path) -> float:
+    """Of a file of the system's; infinite where it has none, or says `max`."""
+    text = _text(path).strip()
+    return float(text) if text.isdigit() else math.inf
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UsageError
-from unirender.input_picture import read_input
+from unirender.input_picture import BYTES_A_PIXEL, read_input
 from unirender.notices import notice
 from unirender.option_checks import at_least, usage
 
@@ -224,14 +224,14 @@ class InputOptions:
         """For `meta.json`."""
         return {"input": self.picture, "mask": self.mask}
 
-    def read(self, model: ModelOptions) -> tuple["Picture", "Camera"]:
+    def read(self, model: ModelOptions, bytes_a_pixel: int = BYTES_A_PIXEL) -> tuple["Picture", "Camera"]:
         """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the
-        picture cannot show.
+        picture cannot show. `bytes_a_pixel` as of `read_input`.
 
         Raises:
-            UnirenderError: an unreadable file, or a mask that does not fit.
+            UnirenderError: as `read_input`.
         """
-        picture, remarks = read_input(self.picture, self.mask)
+        picture, remarks = read_input(self.picture, self.mask, bytes_a_pixel=bytes_a_pixel)
         remarks |= model.camera_remarks(picture)
         for remark in remarks.values():
             notice(remark)

@@ -204,7 +204,8 @@ def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:
         grey = alpha
     if grey is None:
         raise UnirenderError(
-            f"{path}: has the channels {', '.join(sorted(channels))}, expected a mask: A, mask.Y, Y, or R, G and B"
+            f"{path}: has the channels {', '.join(sorted(channels))}, expected a mask: A, mask.Y, Y, or R, G and B; "
+            "rename its channel"
         )
     check_finite(grey[..., None], str(path))
     return grey[..., None]
@@ -214,7 +215,8 @@ def _read_exr_picture(path: Path) -> Picture:
     channels, attributes = read_exr(path)
     if not set("RGB") <= set(channels):
         raise UnirenderError(
-            f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A)"
+            f"{path}: has the channels {', '.join(sorted(channels))}, expected a picture with R, G, B (and A); "
+            "rename those of the layer, or copy grey to all three"
         )
     rgb = channels_rgb(channels)
     name = "A" if "A" in channels else "mask.Y"

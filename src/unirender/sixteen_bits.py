@@ -20,6 +20,7 @@ PLANAR_CONFIGURATION, SEPARATE = 284, 2  # tags and values of TIFF
 COMPRESSION, UNCOMPRESSED = 259, 1
 BITS_PER_SAMPLE = 258
 PHOTOMETRIC, WHITE_IS_ZERO = 262, 0
+SAMPLE_FORMAT, SIGNED = 339, 2
 TURNED_BACK = {  # EXIF orientation -> what undoes its turn
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -100,8 +101,11 @@ def white_is_zero(tags: Mapping[int, Any]) -> bool:
 
 
 def unheeded_grey(picture: Image.Image) -> str:
-    """What a TIFF of grey with more than 8 bits says of its values and Pillow does not heed; empty where nothing is."""
+    """What a TIFF of grey, signed or of more than 8 bits, says of its values and Pillow does not heed; empty where
+    nothing is."""
     tags = getattr(picture, "tag_v2", {})
+    if SIGNED in tags.get(SAMPLE_FORMAT, ()) and max(tags.get(BITS_PER_SAMPLE, (8,))) <= 16:
+        return "its values are signed"
     if not picture.mode.startswith("I"):
         return ""
     if white_is_zero(tags):

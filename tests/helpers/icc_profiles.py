@@ -5,6 +5,7 @@ import struct
 import numpy as np
 
 # Columns: XYZ of red, green and blue under D50, as profiles hold them (Lindbloom; Apple's Display P3).
+ADOBE_RGB_D50 = np.array([[0.60976, 0.20524, 0.14922], [0.31112, 0.62566, 0.06322], [0.01948, 0.06089, 0.74484]])
 SRGB_D50 = np.array([[0.43607, 0.38506, 0.14308], [0.22250, 0.71688, 0.06062], [0.01393, 0.09710, 0.71417]])
 P3_D50 = np.array([[0.51510, 0.29197, 0.15715], [0.24118, 0.69224, 0.06658], [-0.00105, 0.04188, 0.78438]])
 WHITE_D50 = (0.9642, 1.0, 0.8249)

@@ -51,6 +51,7 @@ def write_tiff16(
     planar: bool = False,
     bits: int = 16,
     photometric: int = 2,
+    signed: bool = False,
 ) -> None:
     """A TIFF of `[h w c]` whole numbers, in one strip.
 
@@ -64,6 +65,7 @@ def write_tiff16(
         planar: channels one after the other, each in a strip.
         bits: of a channel: 16, 12 or 8; of 12 in an even number of columns.
         photometric: 2 colour, 1 grey, 0 grey whose 0 is white.
+        signed: whether it says that they are.
     """
     height, width, channels = values.shape
     parts = [values[..., k] for k in range(channels)] if planar else [values]
@@ -78,6 +80,7 @@ def write_tiff16(
     tags += [(262, 3, [photometric]), (273, 4, [0] * len(strips)), (274, 3, [orientation]), (277, 3, [channels])]
     tags += [(278, 3, [height]), (279, 4, [len(strip) for strip in strips]), (284, 3, [2 if planar else 1])]
     tags += [] if extra is None else [(338, 3, [extra])]
+    tags += [(339, 3, [2])] if signed else []
     first = 8 + 2 + 12 * len(tags) + 4
     beside = sum(len(numbers) * struct.calcsize(FORMATS[kind]) for _, kind, numbers in tags if len(numbers) > 1)
     starts = np.cumsum([first + beside, *(len(strip) for strip in strips[:-1])]).tolist()

@@ -18,6 +18,7 @@ from unirender.surface_light import diffuse_light, specular_light
 from unirender_reference.dataset import render_group
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.lights import load_light
+from unirender_reference.lights.files import BYTES_A_TEXEL, BYTES_OF_NONE
 from unirender_reference.lights.light import area_resampled
 from unirender_reference.plan import plan_groups
 
@@ -99,3 +100,23 @@ def test_the_mark_stands_in_the_header_beside_the_others(tmp_path: Path) -> None
     assert on_pole_grid(attributes)
     assert on_pole_grid({"exposure_factor": "1"})
     assert not on_pole_grid({"command": "decompose", "grid": "areas"})
+
+
+RGBE, PFM = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8192 +X 16384\n", b"PF\n16384 8192\n-1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "texels"), [("a.hdr", RGBE, 2**27), ("a.pfm", PFM, 2**27), ("a.exr", None, 2**13)]
+)
+def test_a_map_that_the_machine_is_too_small_for_is_refused_by_its_header(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, start: bytes | None, texels: int
+) -> None:
+    """Before its pixels are read, which are not there; a smaller map is read."""
+    for file, rows in ((name, 64), ("small.exr", 32)):
+        write_exr(tmp_path / file, image_channels(np.ones((rows, 2 * rows, 3))))
+    if start is not None:
+        (tmp_path / name).write_bytes(start)
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: BYTES_OF_NONE + BYTES_A_TEXEL * texels - 1)
+    with pytest.raises(UnirenderError, match=r"million texels, which would take about [\d.]+ GiB .*; scale it down"):
+        load_light(tmp_path / name)
+    assert load_light(tmp_path / "small.exr", shape=(4, 8)).environment.shape == (4, 8, 3)

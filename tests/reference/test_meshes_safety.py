@@ -1,5 +1,6 @@
 """What `load_mesh` refuses: one sentence each, in bounded memory, and nothing read from outside the model's folder."""
 
+import ast
 import json
 import os
 import re
@@ -45,6 +46,22 @@ def reason(path) -> str:
 def test_each_broken_file_has_its_reason(tmp_path, write):
     (tmp_path / "model").mkdir()
     assert re.search((BROKEN | GREEDY)[write], reason(write(tmp_path / "model")))
+
+
+def test_every_refusal_of_a_reader_says_what_to_do() -> None:
+    """Behind a semicolon, or as a question: `load` adds nothing to it but the file."""
+    calls = (
+        (path.name, ast.unparse(node.exc))
+        for path in Path(bounds.__file__).parent.glob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Raise) and node.exc is not None
+    )
+    silent = [
+        (name, call)
+        for name, call in calls
+        if call.startswith("UnirenderError") and not re.search(r"; |\?|: install |_LIMIT", call)
+    ]
+    assert silent == [("load.py", "UnirenderError(f'mesh {path}: {error}')")]
 
 
 @pytest.mark.parametrize("files", [BROKEN, GREEDY], ids=["broken", "greedy"])
@@ -101,7 +118,7 @@ def set_in(document, *keys, value):
     ("keys", "value", "message"),
     [
         (("accessors", 0, "count"), 4_000_000_000, r"accessors\[0\] counts 4,000,000,000 elements, expected at most"),
-        (("accessors", 0, "count"), 400, r"accessors\[0\] needs 4,800 bytes .*cut off"),
+        (("accessors", 0, "count"), 400, r"accessors\[0\] needs 4,800 bytes .*cut off; export it again"),
         (("accessors", 0, "count"), -1, "has count -1, expected a non-negative integer"),
         (("accessors", 2, "count"), 5, "cut off|expected triples"),
         (("bufferViews", 0, "byteLength"), 10**12, r"bufferViews\[0\] needs bytes 0 to 1,000,000,000,000"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from icc_profiles import P3_D50, SRGB_D50, grey_profile, matrix_profile
+from icc_profiles import ADOBE_RGB_D50, P3_D50, SRGB_D50, grey_profile, matrix_profile
 from PIL import Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
 
@@ -74,6 +74,94 @@ def test_cicp_goes_before_all_other_chunks(tmp_path: Path, numbers: tuple[int, i
     both = read_picture(tmp_path / "a.png")
     assert not both.remarks
     assert np.allclose(both.image_srgb, PIXELS / 255, rtol=0, atol=1e-6) == (told is None)
+
+
+@pytest.mark.parametrize(("numbers", "told"), [((9, 16), "Rec.2020 primaries and PQ transfer"), ((1, 13), None)])
+def test_an_avif_of_other_colours_is_told_unless_a_profile_counts(
+    tmp_path: Path, numbers: tuple[int, int], told: str | None
+) -> None:
+    Image.fromarray(PIXELS).save(tmp_path / "a.avif")
+    data = (tmp_path / "a.avif").read_bytes()
+    place = data.index(b"colrnclx") + 8
+    (tmp_path / "a.avif").write_bytes(data[:place] + struct.pack(">HH", *numbers) + data[place + 4 :])
+    remarks = read_picture(tmp_path / "a.avif").remarks
+    assert remarks == {} if told is None else told in remarks["primaries"]
+    Image.fromarray(PIXELS).save(tmp_path / "b.avif", quality=100, icc_profile=matrix_profile(SRGB_D50, 1.0))
+    picture = read_picture(tmp_path / "b.avif")
+    assert not picture.remarks
+    assert picture.image_srgb.mean() > PIXELS.mean() / 255 + 0.1
+
+
+def exif(color_space: int, index: str, orientation: int = 1) -> bytes:
+    """A camera's: an orientation, and in folders below it the colour space and the interoperability index."""
+
+    def folder(*tags: tuple[int, int, int, bytes]) -> bytes:
+        entries = b"".join(struct.pack("<HHI", *numbers) + value.ljust(4, b"\0") for *numbers, value in tags)
+        return struct.pack("<H", len(tags)) + entries + bytes(4)
+
+    first = folder((0x112, 3, 1, struct.pack("<H", orientation)), (0x8769, 4, 1, struct.pack("<I", 38)))
+    second = folder((0xA001, 3, 1, struct.pack("<H", color_space)), (0xA005, 4, 1, struct.pack("<I", 68)))
+    return b"Exif\0\0II*\0\x08\0\0\0" + first + second + folder((1, 2, 4, index.encode() + b"\0"))
+
+
+ADOBE_RGB_TOLD = "its EXIF states Adobe RGB, from which it is converted"
+
+
+@pytest.mark.parametrize(
+    ("stated", "told"),
+    [
+        ((65535, "R03"), ADOBE_RGB_TOLD),
+        ((2, "R98"), ADOBE_RGB_TOLD),
+        ((65535, "R03", 3), ADOBE_RGB_TOLD),
+        ((65535, "R98"), "its EXIF states colours that are not sRGB's .*taken as sRGB: convert it"),
+        ((1, "R98"), None),
+        ((1, "R03"), None),
+    ],
+)
+def test_adobe_rgb_by_exif_alone_is_converted(tmp_path: Path, stated: tuple, told: str | None) -> None:
+    """As the profile of Adobe RGB would be; a profile beside it counts more, and chunks of a PNG do."""
+    image = Image.fromarray(PIXELS)
+    image.save(tmp_path / "a.webp", lossless=True, exif=exif(*stated))
+    picture = read_picture(tmp_path / "a.webp")
+    expected = PIXELS / 255
+    if told == ADOBE_RGB_TOLD:
+        image.save(tmp_path / "b.png", icc_profile=matrix_profile(ADOBE_RGB_D50, 563 / 256))
+        expected = read_picture(tmp_path / "b.png").image_srgb
+        assert np.abs(expected - PIXELS / 255).max() > 0.1
+    turned = expected[::-1, ::-1] if stated[2:] else expected
+    np.testing.assert_allclose(picture.image_srgb, turned, rtol=0, atol=2 / 255)
+    assert list(picture.remarks) == ([] if told is None else ["primaries"])
+    assert told is None or re.search(told, picture.remarks["primaries"])
+    chunk = PngInfo()
+    chunk.add(b"sRGB", b"\0")
+    image.save(tmp_path / "c.png", pnginfo=chunk, exif=exif(*stated[:2]))
+    chunk = PngInfo()
+    chunk.add(b"cICP", bytes((1, 13, 0, 1)))
+    image.save(tmp_path / "d.png", pnginfo=chunk, exif=exif(*stated[:2]))
+    image.save(tmp_path / "e.webp", lossless=True, exif=exif(*stated[:2]), icc_profile=matrix_profile(SRGB_D50, 1.0))
+    for name in ("c.png", "d.png", "e.webp"):
+        assert not read_picture(tmp_path / name).remarks
+    np.testing.assert_array_equal(np.round(255 * read_picture(tmp_path / "d.png").image_srgb), PIXELS)
+
+
+def test_adobe_rgb_by_exif_keeps_its_alpha_and_a_damaged_exif_says_nothing(tmp_path: Path) -> None:
+    rgba = np.dstack([PIXELS, np.full(PIXELS.shape[:2], 128, np.uint8)])
+    rgba[0, 0, 3] = 255
+    Image.fromarray(rgba).save(tmp_path / "a.webp", lossless=True, exif=exif(2, "R03"))
+    picture, _ = as_picture(Image.open(tmp_path / "a.webp").resize((9, 8), Image.Resampling.NEAREST))
+    seen = read_picture(tmp_path / "a.webp")
+    np.testing.assert_array_equal(picture[0], seen.image_srgb[0])
+    assert seen.mask is not None
+    np.testing.assert_array_equal(np.round(255 * seen.mask[..., 0]), rgba[..., 3])
+    Image.fromarray(PIXELS).save(tmp_path / "b.webp", lossless=True, exif=exif(65535, "R03")[:50])
+    assert not read_picture(tmp_path / "b.webp").remarks
+
+
+def test_cmyk_without_a_profile_is_told(tmp_path: Path) -> None:
+    Image.fromarray(PIXELS).convert("CMYK").save(tmp_path / "a.jpg", quality=100)
+    picture = read_picture(tmp_path / "a.jpg")
+    np.testing.assert_allclose(picture.image_srgb, PIXELS / 255, rtol=0, atol=0.05)
+    assert "CMYK without a profile, of which sRGB is a guess" in picture.remarks["primaries"]
 
 
 @pytest.mark.parametrize("profile", [None, ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()])
@@ -245,6 +333,59 @@ def test_chromaticities_of_no_space_are_refused(tmp_path: Path, chromaticities: 
     write(tmp_path / "a.exr", {name: np.ones((3, 3)) for name in "RGB"}, chromaticities)
     with pytest.raises(UnirenderError, match="are those of no colour space, expected x, y of red, green, blue"):
         read_exr(tmp_path / "a.exr")
+
+
+def every_pixel(kind: type, step: int = 1) -> dict[str, OpenEXR.Channel]:
+    values = np.ones((6, 8), kind)  # of which every `step`-th row is written
+    return {name: OpenEXR.Channel(name, values, step, step) for name in "RGB"}
+
+
+def several_samples() -> dict[str, np.ndarray]:
+    values = np.empty((6, 8), object)
+    values[:] = [[np.ones(2, np.float32) for _ in range(8)] for _ in range(6)]
+    return dict.fromkeys("RGBAZ", values)
+
+
+DEEP = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}
+REFUSED = {
+    "deep": (several_samples(), DEEP, "got a deep file .* flatten it"),
+    "subsampled": (every_pixel(np.float32, 2), {}, "got one value of . for 2 x 2 pixels, .* without subsampling"),
+    "whole numbers": (every_pixel(np.uint32), {}, "got whole numbers in ., expected radiance in half or float"),
+    "wide pixels": (every_pixel(np.float32), {"pixelAspectRatio": 2.0}, "got pixels 2 times as wide as high"),
+    "ACEScg": (every_pixel(np.float32), {"colorInteropID": "lin_ap1_scene"}, "got colours of 'lin_ap1_scene'"),
+    "encoded": (
+        every_pixel(np.float32),
+        {"colorInteropID": "srgb_rec709_scene", "chromaticities": REC709},
+        "got colours of 'srgb_rec709_scene' .*convert it",
+    ),
+    "a layer": ({"beauty.R": np.ones((6, 8), np.float32)}, {}, "expected a picture with R, G, B .*; rename"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_an_exr_that_is_no_picture_of_radiance_is_refused(tmp_path: Path, what: str) -> None:
+    """Whole numbers were radiance without a word, of subsampled colours the picture was smaller than it is."""
+    channels, header, message = REFUSED[what]
+    plain = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(plain | header, channels).write(str(tmp_path / "a.exr"))
+    with pytest.raises(UnirenderError, match=f"a.exr: .*{message}"):
+        read_picture(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"colorInteropID": "lin_rec709_scene"},
+        {"colorInteropID": "lin_ap0_scene", "chromaticities": ACES_AP0},
+        {"pixelAspectRatio": 0.999},
+        {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()},
+    ],
+)
+def test_an_exr_that_states_what_is_so_is_read(tmp_path: Path, header: dict[str, object]) -> None:
+    plain = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    number = {"id": np.ones((6, 8), np.uint32)}  # of an object, beside the picture
+    OpenEXR.File(plain | header, every_pixel(np.float32) | number).write(str(tmp_path / "a.exr"))
+    np.testing.assert_allclose(read_picture(tmp_path / "a.exr").image_srgb, 1, rtol=0, atol=1e-4)
 
 
 @pytest.mark.parametrize("names", [("R", "G", "B"), ("R", "G", "B", "A"), ("mask.Y",), ("Y",), ("A",)])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -241,6 +242,30 @@ def test_batches_are_bounded() -> None:
     assert [len(batch) for batch in batches(items)] == [AT_ONCE, 2, 2]
     assert [item for batch in batches(items) for item in batch] == items
     assert max(len(batch) for batch in batches(items, 1)) == 1
+
+
+def test_results_are_forgotten_before_the_next_picture_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of large pictures each is alone: neither the last one's maps nor the next picture lie in memory beside it."""
+    monkeypatch.setattr("unirender.folders.PIXELS_AT_ONCE", 1)
+    taken: list[str] = []
+    made: list[weakref.ref[Intrinsics]] = []
+
+    def taking(path: Path, mask: Path | None) -> Picture:
+        taken.append(path.name)
+        return read(path, mask)
+
+    def watched(batch: list[Picture]) -> list[Decomposition]:
+        assert [picture.name for picture in batch] == taken[-1:]
+        assert [one() for one in made] == [None] * len(made)
+        found = decompose(batch)
+        made.extend(weakref.ref(result.intrinsics) for result in found)
+        return found
+
+    pictures = [save(tmp_path / f"{name}.png") for name in "abc"]
+    assert not run(pictures, tmp_path / "out", read=taking, decompose=watched).failed
+    assert len(made) == 3
 
 
 def make_frame(folder: Path, picture: Path, albedo: float, wide: int = 6, roughness: float = 0.5) -> tuple[Path, Path]:

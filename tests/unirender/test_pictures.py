@@ -1,6 +1,5 @@
 """Pictures and masks from files: what the pixels become, and which files are refused."""
 
-import math
 import struct
 import zlib
 from collections.abc import Callable
@@ -14,11 +13,12 @@ from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
+from unirender.commands import Relight
 from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
-from unirender.machine import memory_bytes
+from unirender.options import InputOptions, OutputOptions
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -180,14 +180,21 @@ def test_a_tiff_with_channels_one_after_the_other_loses_half_of_its_bits_or_is_r
 
 
 @pytest.mark.parametrize(
-    ("bits", "photometric", "told"), [(16, 1, None), (16, 0, "its 0 is white"), (12, 1, "its grey has 12 bits")]
+    ("bits", "photometric", "signed", "told"),
+    [
+        (16, 1, False, None),
+        (16, 0, False, "its 0 is white"),
+        (12, 1, False, "its grey has 12 bits"),
+        (16, 1, True, "its values are signed"),
+        (8, 1, True, "its values are signed"),
+    ],
 )
 def test_a_grey_tiff_whose_values_mean_something_else_is_refused(
-    bits: int, photometric: int, told: str | None, tmp_path: Path
+    bits: int, photometric: int, signed: bool, told: str | None, tmp_path: Path
 ) -> None:
-    """Pillow hands out such values as they are stored: inverted, or at a sixteenth of their brightness."""
-    values = RNG.integers(0, 2**bits, (8, 10, 1))
-    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric)
+    """Pillow hands out such values as they are stored: inverted, or at a sixteenth or a half of their brightness."""
+    values = RNG.integers(0, 2 ** (bits - signed), (8, 10, 1))
+    write_tiff16(tmp_path / "a.tif", values, bits=bits, photometric=photometric, signed=signed)
     readers = (
         lambda: read_picture(tmp_path / "a.tif").image_srgb,
         lambda: read_mask(tmp_path / "a.tif", (8, 10)),
@@ -403,6 +410,23 @@ def test_clipped_is_the_share_of_the_object_at_display_white(tmp_path: Path) -> 
     assert read_picture(tmp_path / "c.png").clipped == 0
 
 
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (b"\0\0\0\x18ftypheic", "a HEIC picture"),
+        (b"\xff\x0a12345", "a JPEG XL picture"),
+        (b"#?RADIANCE\n\n", "a Radiance file"),
+        (b"", "is empty"),
+        (b"GIF", r"not a readable picture \("),
+    ],
+)
+def test_what_a_file_is_that_cannot_be_read(data: bytes, told: str, tmp_path: Path) -> None:
+    """Telephones name HEIC pictures .jpg."""
+    (tmp_path / "a.jpg").write_bytes(data)
+    with pytest.raises(UnirenderError, match=rf"a\.jpg: {told}.*, expected PNG, JPG.*; save it as PNG \(linear"):
+        read_picture(tmp_path / "a.jpg")
+
+
 def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
     side = int(MAX_PIXELS**0.5) + 10
     Image.new("1", (side, side)).save(tmp_path / "bomb.png")
@@ -415,17 +439,15 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
 ) -> None:
     Image.new("RGB", (400, 300), "white").save(tmp_path / "a.png")
     needed = BYTES_OF_NONE + BYTES_A_PIXEL * 400 * 300
-    monkeypatch.setattr("unirender.input_picture.memory_bytes", lambda: needed)
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
     read_input(tmp_path / "a.png", None)
-    monkeypatch.setattr("unirender.input_picture.memory_bytes", lambda: needed - 1)
-    with pytest.raises(UnirenderError, match=r"a\.png: a picture of 0 megapixels.* and this machine has 0 GiB; scale"):
+    with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
+        Relight(InputOptions(tmp_path / "a.png"), tmp_path / "a.hdr", OutputOptions(tmp_path / "out")).run(np.asarray)
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed - 1)
+    with pytest.raises(
+        UnirenderError, match=r"a picture of 0\.12 megapixels.* about 0\.5 GiB .* has 0\.4 GiB for it; scale"
+    ):
         read_input(tmp_path / "a.png", None)
-
-
-def test_a_machine_that_does_not_count_its_memory_has_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert memory_bytes() > 2**28
-    monkeypatch.setattr("os.sysconf", lambda name: -1 if name == "SC_PHYS_PAGES" else 4096)
-    assert memory_bytes() == math.inf
 
 
 def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:

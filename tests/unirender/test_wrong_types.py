@@ -91,6 +91,7 @@ CASES = {
     "map_picture('light', image)": "map: got 'light', expected one of albedo,",
     "srgb_decode(bytes_8)": "display values: got uint8 values, expected floats whose white is 1; divide by 255",
     "image_srgb(None)": "image: got NoneType None, expected numbers",
+    "unpremultiply(image, (255 * mask).astype(np.uint8))": "mask: got uint8 values, expected floats whose white is 1;",
     "unpremultiply(image, mask[..., 0])": "mask: got shape (16, 24) for an image of (16, 24, 3), expected",
     "composite_image(image)": "composite: got ndarray, expected unirender.intrinsics.Intrinsics",
     "load_light(None)": "light: got NoneType None, expected a path",
@@ -170,6 +171,7 @@ FINE = (
     "pipeline.decompose_batch(np.stack([image, image]), np.stack([mask, mask]))",
     "pipeline.decompose_batch(iter([image, image]), iter([mask, mask]))",
     "unpremultiply(np.stack([image, image]), mask)",
+    "unpremultiply(image, (mask > 0.5).astype(np.uint8))",
 )
 
 

@@ -100,7 +100,10 @@ def _in_scalar_process(seed: int) -> Estimate:
         )
         if run.returncode != 0:
             reason = run.stderr.strip().splitlines()[-1:] or ["no message"]
-            raise UnirenderError(f"scalar_rgb: the process ended with status {run.returncode}: {reason[0]}")
+            raise UnirenderError(
+                f"scalar_rgb: the process ended with status {run.returncode}: {reason[0]}; "
+                "`unirender doctor` says what is installed"
+            )
         with np.load(out) as arrays:
             return Estimate(arrays["mean"], arrays["variance"])
 

@@ -30,8 +30,9 @@ from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, image_channels, on_pole_grid, read_exr
+from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
 from unirender.lighting import check_shape, resample_environment
+from unirender.machine import memory_excess
 from unirender.pictures import check_finite, negative_share
 from unirender.primaries import REC709, in_rec709
 from unirender_reference.backend import mitsuba
@@ -49,6 +50,8 @@ HEADER_NUMBERS = {  # of a Radiance file: how many, and what
     "COLORCORR": (3, "three numbers above 0"),
     "PRIMARIES": (8, "x, y of red, green, blue and white"),
 }
+SIZES = re.compile(rb"#\?.*?\n-Y (\d+) \+X (\d+)\s*\n|P[Ff]\s+(\d+)\s+(\d+)\s", re.DOTALL)  # of RGBE, of PFM
+BYTES_A_TEXEL, BYTES_OF_NONE = 50, 5e8  # of memory: what it takes to read a map and bring it to the contract's grid
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
 
@@ -76,8 +79,8 @@ def load_light(
         total is in the provenance.
 
     Raises:
-        UnirenderError: missing, unreadable, not finite, black, more negative than ringing is, or no lat-long map; or
-            the shape is none of a map.
+        UnirenderError: missing, unreadable, too large for the machine, not finite, black, more negative than ringing
+            is, or no lat-long map; or the shape is none of a map.
     """
     path = as_path(path, "light")
     if not path.is_file():
@@ -89,6 +92,8 @@ def load_light(
     if shape is not None:
         check_shape(shape)
     hdr = path.suffix.lower() in HDR_SUFFIXES
+    if hdr:
+        _check_memory(path)
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     check_finite(pixels, f"light {path}")
     as_photograph = photograph if photograph is not None else not hdr
@@ -158,6 +163,17 @@ def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(srgb_values(path, f"light {path}")[..., :3])
 
 
+def _check_memory(path: Path) -> None:
+    """Looks at the size of a map in its header, if that can be read."""
+    texels = pixel_count(path)
+    if not texels:
+        with path.open("rb") as file:
+            found = SIZES.match(file.read(MOST_HEADER_BYTES))
+        texels = math.prod(int(side) for side in found.groups() if side) if found else 0
+    if excess := memory_excess(BYTES_OF_NONE + BYTES_A_TEXEL * texels):
+        raise UnirenderError(f"light {path}: {texels / 1e6:,.3g} million texels, which {excess}; scale it down first")
+
+
 def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     """Radiance, and the attributes of an EXR's header."""
     if path.suffix.lower() == ".exr":
@@ -174,7 +190,9 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
     try:
         with path.open("rb") as file:
             if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
-                raise UnirenderError(f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR)")
+                raise UnirenderError(
+                    f"light {path}: is a PNG under another name, expected radiance (RGBE, PFM or EXR); name it .png"
+                )
             file.seek(0)
             turned = RGBE_TURNED.match(file.read(MOST_HEADER_BYTES))
         if turned:
@@ -185,7 +203,9 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[-1]
-        raise UnirenderError(f"light {path}: not a readable HDR map ({reason}); expected RGBE, PFM or EXR") from error
+        raise UnirenderError(
+            f"light {path}: not a readable HDR map ({reason}), expected RGBE, PFM or EXR; save it as EXR"
+        ) from error
     return _as_its_header_says(np.array(bitmap), path), {}
 
 

@@ -42,11 +42,12 @@ class Light:
         if not isinstance(self.name, str) or not isinstance(e, np.ndarray):
             raise UnirenderError(
                 f"light: got name {self.name!r:.40} and an environment of type {type(e).__name__}, expected a text and "
-                "a numpy array"
+                "a numpy array; load_light reads a file"
             )
         if e.ndim != 3 or e.shape[2] != 3 or e.dtype != np.float32 or not np.isfinite(e).all() or e.min() < 0:
             raise UnirenderError(
-                f"light {self.name}: environment must be finite float32 (h, w, 3) >= 0, got {e.dtype} {e.shape}"
+                f"light {self.name}: environment must be finite float32 (h, w, 3) >= 0, got {e.dtype} {e.shape}; "
+                "load_light makes one of a file; .astype(np.float32) converts an array"
             )
         if "." in self.name or "/" in self.name:
             raise UnirenderError(f"light name: got {self.name!r}, expected no '.' and no '/'; rename the light")

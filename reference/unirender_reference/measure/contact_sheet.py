@@ -50,7 +50,7 @@ class Sheet:
                 "multiple of 8 samples, a seed of 0 or more"
             )
         if not self.out.absolute().parent.is_dir():
-            raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into")
+            raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into; make it first")
         check_file("--out", self.out)
         if self.out.suffix.lower() != ".png":
             raise UsageError(f"--out {self.out}: expected the name of a PNG file, like {self.out.with_suffix('.png')}")

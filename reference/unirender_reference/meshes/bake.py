@@ -79,7 +79,7 @@ def _block_sizes(patch: Patch, clipped: np.ndarray, texels: int) -> Int[np.ndarr
         uv = patch.lookup(texture) * texture.texels.shape[1::-1]
         longest = np.maximum(longest, np.linalg.norm(uv - np.roll(uv, 1, axis=1), axis=-1).max(1))
     if not np.isfinite(longest).all():
-        raise UnirenderError("mesh: texture coordinates are not finite, or leave the range of float32")
+        raise UnirenderError("mesh: texture coordinates are not finite, or leave the range of float32; export it again")
     density = FINEST
     while True:
         chosen = np.minimum(np.searchsorted(SIZES, density * longest + 1), len(SIZES) - 1)

@@ -45,9 +45,13 @@ class ModelFolder:
         shown = name if len(name) <= 80 else name[:77] + "..."
         scheme = urlparse(name).scheme
         if len(scheme) > 1:
-            raise UnirenderError(f"{what} {shown!r} is a {scheme} address, expected a file in {self._where}")
+            raise UnirenderError(
+                f"{what} {shown!r} is a {scheme} address, expected a file in {self._where}; save it there"
+            )
         if spelled.startswith("/") or len(scheme) == 1:
-            raise UnirenderError(f"{what} {shown!r} is an absolute path, expected a file in {self._where}")
+            raise UnirenderError(
+                f"{what} {shown!r} is an absolute path, expected a file in {self._where}; name it from there"
+            )
         if any(tiles in spelled.upper() for tiles in TILE_SETS):
             raise UnirenderError(f"{what} {shown!r} is a set of tiles, not read here; bake them into one picture")
         try:

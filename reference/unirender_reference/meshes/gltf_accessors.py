@@ -50,9 +50,13 @@ def accessor_count(document: Document, index: object) -> int:
 def _layout(accessor: dict[str, Any], index: object) -> tuple[int, Any, int]:
     kind, component, count = accessor.get("type"), accessor.get("componentType"), size(accessor, "count")
     if kind not in WIDTHS or component not in TYPES:
-        raise UnirenderError(f"accessors[{index}] has type {kind} of {component}, which is not read here")
+        raise UnirenderError(
+            f"accessors[{index}] has type {kind} of {component}, which is not read here; export it again"
+        )
     if count > MAX_VERTICES:
-        raise UnirenderError(f"accessors[{index}] counts {count:,} elements, expected at most {MAX_VERTICES:,}")
+        raise UnirenderError(
+            f"accessors[{index}] counts {count:,} elements, expected at most {MAX_VERTICES:,}; decimate the mesh"
+        )
     return WIDTHS[kind], np.dtype(TYPES[component]).newbyteorder("<"), count
 
 
@@ -64,7 +68,8 @@ def _strided(
     needed = offset + (count - 1) * stride + item
     if stride < item or needed > len(view):
         raise UnirenderError(
-            f"accessors[{index}] needs {needed:,} bytes for {count:,} elements, its view has {len(view):,}: cut off"
+            f"accessors[{index}] needs {needed:,} bytes for {count:,} elements, its view has {len(view):,}: cut off; "
+            "export it again"
         )
     return np.ndarray((count, width), dtype, view, offset, (stride, dtype.itemsize))
 
@@ -84,7 +89,9 @@ def _patch(
     place = np.dtype(TYPES[where["componentType"]]).newbyteorder("<")
     at = _strided(document.view(where.get("bufferView")), size(where, "byteOffset", 0), 0, count, 1, place, index)[:, 0]
     if at.max() >= total:
-        raise UnirenderError(f"accessors[{index}] has a sparse value at {at.max():,}, but {total:,} elements")
+        raise UnirenderError(
+            f"accessors[{index}] has a sparse value at {at.max():,}, but {total:,} elements; export it again"
+        )
     view, offset = document.view(what.get("bufferView")), size(what, "byteOffset", 0)
     new = _strided(view, offset, 0, count, values.shape[1], values.dtype, index)
     slot = np.minimum(np.searchsorted(rows, at), max(len(rows) - 1, 0))
@@ -127,7 +134,8 @@ def read_draco(document: Document, primitive: dict[str, Any]) -> dict[str, Num[n
             values = values.reshape(len(values), -1)
             if len(values) != accessors[name].get("count"):
                 raise UnirenderError(
-                    f"its Draco data holds {len(values):,} {name}, expected {accessors[name]['count']:,}"
+                    f"its Draco data holds {len(values):,} {name}, expected {accessors[name]['count']:,}; "
+                    "export it again"
                 )
             arrays[name] = _normalized(values) if accessors[name].get("normalized") else values
     faces = getattr(decoded, "faces", None)
@@ -135,6 +143,6 @@ def read_draco(document: Document, primitive: dict[str, Any]) -> dict[str, Num[n
         raise UnirenderError("its Draco data has no faces, expected a triangle mesh; is it a point cloud?")
     claimed = accessor_count(document, primitive["indices"]) if "indices" in primitive else len(faces) * 3
     if np.size(faces) > claimed:
-        raise UnirenderError(f"its Draco data holds {np.size(faces):,} indices, expected {claimed:,}")
+        raise UnirenderError(f"its Draco data holds {np.size(faces):,} indices, expected {claimed:,}; export it again")
     arrays["indices"] = np.asarray(faces).reshape(-1, 1)
     return arrays

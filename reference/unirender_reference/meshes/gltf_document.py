@@ -74,7 +74,8 @@ class Document:
         offset, length = size(view, "byteOffset", 0), size(view, "byteLength")
         if offset + length > len(data):
             raise UnirenderError(
-                f"bufferViews[{index}] needs bytes {offset:,} to {offset + length:,}, the buffer has {len(data):,}: cut"
+                f"bufferViews[{index}] needs bytes {offset:,} to {offset + length:,}, the buffer has {len(data):,}; "
+                "copy it again"
             )
         return memoryview(data)[offset : offset + length]
 
@@ -103,7 +104,8 @@ class Document:
         data = self._buffers[uri]
         if len(data) < size(buffer, "byteLength"):
             raise UnirenderError(
-                f"truncated: buffers[{index}] holds {len(data):,} bytes, expected {buffer['byteLength']:,}"
+                f"truncated: buffers[{index}] holds {len(data):,} bytes, expected {buffer['byteLength']:,}; "
+                "copy it again"
             )
         return data
 
@@ -141,9 +143,9 @@ def _glb(path: Path) -> tuple[bytes, bytes | None]:
     with path.open("rb") as file:
         header = file.read(12)
         if header[:4] != b"glTF":
-            raise UnirenderError(f"starts with {header[:4]!r}, expected b'glTF': no GLB file")
+            raise UnirenderError(f"starts with {header[:4]!r}, expected b'glTF': no GLB file; export it again")
         if len(header) < 12:
-            raise UnirenderError(f"truncated: has {actual} bytes, expected a header of 12")
+            raise UnirenderError(f"truncated: has {actual} bytes, expected a header of 12; copy it again")
         _, version, length = struct.unpack("<4sII", header)
         if version != 2:
             raise UnirenderError(f"glTF version {version}, expected 2.0; convert it")
@@ -154,10 +156,12 @@ def _glb(path: Path) -> tuple[bytes, bytes | None]:
             count, kind = struct.unpack("<I4s", file.read(8))
             if file.tell() + count > length:
                 raise UnirenderError(
-                    f"truncated: chunk {kind!r} says {count:,} bytes, {length - file.tell():,} are left"
+                    f"truncated: chunk {kind!r} says {count:,} bytes, {length - file.tell():,} are left; copy it again"
                 )
             if kind == JSON_CHUNK and count > MAX_TEXT_BYTES:
-                raise UnirenderError(f"has {count >> 20} MiB of JSON, expected at most {MAX_TEXT_BYTES >> 20}")
+                raise UnirenderError(
+                    f"has {count >> 20} MiB of JSON, expected at most {MAX_TEXT_BYTES >> 20}; merge its nodes"
+                )
             data = file.read(count)
             chunks.setdefault(kind, data)
     if JSON_CHUNK not in chunks:

@@ -39,7 +39,9 @@ def check_bytes(count: int, what: str, limit: int | None = None) -> None:
     limit = MAX_FILE_BYTES if limit is None else limit
     if count > limit:
         unit, name = (2**30, "GiB") if limit >= 2**30 else (2**20, "MiB")
-        raise UnirenderError(f"{what} has {count / unit:.2f} {name}, expected at most {limit / unit:.0f} {name}")
+        raise UnirenderError(
+            f"{what} has {count / unit:.2f} {name}, expected at most {limit / unit:.0f} {name}; reduce it"
+        )
 
 
 def check_faces(count: int) -> None:

@@ -5,7 +5,6 @@ format, in which colour space, what is ignored, and every reason for a refusal.
 """
 
 import contextlib
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,6 @@ from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
 
 SMALLER = "sharpness of smaller textures"  # among what is ignored
-TOLD = re.compile(r"; |\? |\?$|: install ")  # in messages that say what to do
 READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 
 
@@ -74,7 +72,7 @@ def _read(path: Path, root: Path | None) -> Model:
     if not path.is_file():
         raise UnirenderError(f"no such file; expected one of {', '.join(SUFFIXES)}")
     if path.suffix.lower() not in SUFFIXES:
-        raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}")
+        raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; convert it")
     if path.stat().st_size == 0:
         raise UnirenderError("is empty; copy it again")
     model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
@@ -90,12 +88,11 @@ def _corners(pieces: list[Piece]) -> Float[np.ndarray, "m 3 3"]:
 
 @contextlib.contextmanager
 def _one_sentence(path: Path) -> Iterator[None]:
-    """Whatever goes wrong with a file becomes a `UnirenderError` that names it, and says what to do."""
+    """Whatever goes wrong with a file becomes a `UnirenderError` that names it; readers say what to do."""
     try:
         yield
     except UnirenderError as error:
-        to_do = "" if TOLD.search(str(error)) else "; export it again"
-        raise UnirenderError(f"mesh {path}: {error}{to_do}") from error
+        raise UnirenderError(f"mesh {path}: {error}") from error
     except MemoryError as error:
         raise UnirenderError(f"mesh {path}: needs more memory than there is; reduce the model") from error
     except Exception as error:  # parsers raise whatever a broken file makes them raise

@@ -56,7 +56,9 @@ class _Lines:
             kept = b""
             for number, line in enumerate(_each_line(file), start=1):
                 if len(kept) + len(line) > MAX_LINE_BYTES:
-                    raise UnirenderError(f"line {number} has more than {MAX_LINE_BYTES:,} bytes, expected fewer")
+                    raise UnirenderError(
+                        f"line {number} has more than {MAX_LINE_BYTES:,} bytes, expected fewer; export it again"
+                    )
                 if line.rstrip(b"\r\n").endswith(b"\\"):
                     kept += line.rstrip(b"\r\n")[:-1] + b" "
                     continue
@@ -65,7 +67,9 @@ class _Lines:
                 except UnirenderError:
                     raise
                 except (ValueError, OverflowError) as error:
-                    raise UnirenderError(f"line {number} cannot be read ({error}): {line[:60]!r}") from error
+                    raise UnirenderError(
+                        f"line {number} cannot be read ({error}): {line[:60]!r}; export it again"
+                    ) from error
                 kept = b""
 
     def _line(self, parts: list[bytes]) -> None:

@@ -95,7 +95,9 @@ def _rows(lines: list[list[str]], width: int) -> tuple[list[list[str]], list[lis
         vertices, faces = (int(count) for count in lines[0][:2])
     except (ValueError, IndexError):
         what = " ".join(lines[0])[:40] if lines else ""
-        raise UnirenderError(f"its header says {what!r}, expected counts of vertices and faces") from None
+        raise UnirenderError(
+            f"its header says {what!r}, expected counts of vertices and faces; export it again"
+        ) from None
     if vertices < 0 or faces < 0:
         raise UnirenderError(f"its header claims {vertices:,} vertices and {faces:,} faces; export it again")
     if vertices > MAX_VERTICES:

@@ -35,7 +35,9 @@ def whole_stl(path: Path, head: bytes) -> tuple[io.BytesIO | None, set[str]]:
     length, count = path.stat().st_size, int.from_bytes(head[HEADER - 4 : HEADER], "little")
     expected = HEADER + FACET * count
     if length < expected:
-        raise UnirenderError(f"truncated: claims {count:,} triangles in {length:,} bytes, expected {expected:,}")
+        raise UnirenderError(
+            f"truncated: claims {count:,} triangles in {length:,} bytes, expected {expected:,}; copy it again"
+        )
     check_faces(count)
     with path.open("rb") as file:
         data = file.read(expected)  # trimesh takes what follows for a sign that the file is none
@@ -66,5 +68,7 @@ def _of_text(data: bytes) -> io.BytesIO | None:
         raise UnirenderError("has vertices before its first facet; export it again")
     if marks != b"fvvv" * (len(marks) // 4):
         sizes = {len(vertices) for vertices in marks.split(b"f")[1:]} - {3}
-        raise UnirenderError(f"has facets of {', '.join(map(str, sorted(sizes)))} vertices, expected triangles")
+        raise UnirenderError(
+            f"has facets of {', '.join(map(str, sorted(sizes)))} vertices, expected triangles; export it as triangles"
+        )
     return rewritten

@@ -87,9 +87,9 @@ def _check_claims(header: PlyHeader, length: int) -> None:
     for name, count in ((name, element.rows) for name, element in header.elements.items()):
         limit = MAX_FACES if name == "face" else MAX_VERTICES
         if count > limit:
-            raise UnirenderError(f"claims {count:,} of element {name}, expected at most {limit:,}")
+            raise UnirenderError(f"claims {count:,} of element {name}, expected at most {limit:,}; decimate the mesh")
         if count > length:
-            raise UnirenderError(f"truncated: claims {count:,} of element {name} in {length:,} bytes")
+            raise UnirenderError(f"truncated: claims {count:,} of element {name} in {length:,} bytes; copy it again")
 
 
 def _texture(folder: ModelFolder, header: PlyHeader) -> Texture | None:

@@ -97,12 +97,17 @@ class Optimize:
         given = [_option(name) for name in wrong if getattr(self, name) != defaults[name]]
         given += _changed(self.single, SingleConfig(), "single.") if folder else _changed(self.config, OptimizeConfig())
         if given:
-            raise UsageError(f"{', '.join(given)}: of {kind}, but {self.input} is {'a folder' if folder else 'none'}")
+            raise UsageError(
+                f"{', '.join(given)}: of {kind}, but {self.input} is {'a folder' if folder else 'none'}; "
+                f"leave {'it' if len(given) == 1 else 'them'} out"
+            )
         if folder and self.mesh is not None:
             changed = _changed(self.config, OptimizeConfig())
             given = [option for option in changed if option.startswith("--shape")]
             if given:
-                raise UsageError(f"{', '.join(given)}: of the reconstruction, but --mesh gives the shape")
+                raise UsageError(
+                    f"{', '.join(given)}: of the reconstruction, but --mesh gives the shape; leave one of both out"
+                )
         require_cores(self.threads)
 
     def run(self, predict: Predict | None = None) -> int:
@@ -112,7 +117,9 @@ class Optimize:
             predict: the learned model, for `--init unirender`.
         """
         if not self.input.exists():
-            raise UnirenderError(f"{self.input}: no such file or folder, expected posed pictures or one picture")
+            raise UnirenderError(
+                f"{self.input}: no such file or folder, expected posed pictures or one picture; is the path right?"
+            )
         if self.input.suffix.lower() == ".json" and self.input.is_file():
             raise UsageError(f"{self.input}: is a file of poses, expected its folder, {self.input.parent}")
         self.check()
@@ -187,7 +194,9 @@ class Optimize:
         if obj is None:
             raise UsageError("--init unirender: expected --mesh beside it, to put the predicted maps on")
         if views.hdr:
-            raise UsageError("--init unirender: the model sees display pictures, and these are linear (EXR)")
+            raise UsageError(
+                "--init unirender: the model sees display pictures, and these are linear (EXR); leave it out"
+            )
         predictions, began, count = [], time.perf_counter(), len(views.seen)
         for done, view in enumerate(views.seen, 1):
             predictions.append(predict(view.image, view.mask, view.camera))
@@ -214,7 +223,9 @@ class Optimize:
 
             obj = load_mesh(self.mesh)
         if predict is not None and given.hdr:
-            raise UsageError("--init unirender: the model sees display pictures, and this one is linear (EXR)")
+            raise UsageError(
+                "--init unirender: the model sees display pictures, and this one is linear (EXR); leave it out"
+            )
         steps: list[Step] = []
         console = Console(stderr=True, quiet=not self.progress)
         with new_folder(self.out, overwrite=self.overwrite) as folder, live_report(console) as report:

@@ -73,7 +73,9 @@ def read_views(
     seen, held_out = _spread(seen, most_views), _spread(held_out, most_views)
     hdr = {frame.file.suffix.lower() == ".exr" for frame in (*seen, *held_out)}
     if len(hdr) > 1:
-        raise UnirenderError(f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display")
+        raise UnirenderError(
+            f"{folder}: has EXR beside other pictures, expected one kind: all linear, or all display; convert some"
+        )
     linear = hdr.pop()
     notices: set[str] = set()
     views = Views(
@@ -103,7 +105,9 @@ def _split(main: Path, hold_out: int) -> tuple[list[Frame], list[Frame]]:
         held_out = held_out + seen[hold_out - 1 :: hold_out]
         seen = [frame for index, frame in enumerate(seen) if (index + 1) % hold_out]
     if not seen:
-        raise UnirenderError(f"{main}: all {len(frames)} pictures are held out, expected some to optimise against")
+        raise UnirenderError(
+            f"{main}: all {len(frames)} pictures are held out, expected some to optimise against; hold fewer out"
+        )
     both = {frame.file.resolve() for frame in seen} & {frame.file.resolve() for frame in held_out}
     if both:
         names = " and ".join(frame.name for frame in (*seen, *held_out) if frame.file.resolve() == min(both))

@@ -29,7 +29,9 @@ def silhouette_normals(mask: Float[np.ndarray, "h w 1"], camera: Camera) -> Floa
 
     inside = mask[..., 0] >= INSIDE
     if not inside.any():
-        raise UnirenderError(f"mask: covers no pixel by {INSIDE:.0%} or more, expected the object's silhouette")
+        raise UnirenderError(
+            f"mask: covers no pixel by {INSIDE:.0%} or more, expected the object's silhouette; give its mask"
+        )
     padded = np.pad(inside, 1)
     index = np.full(padded.shape, -1)
     index[padded] = np.arange(padded.sum())

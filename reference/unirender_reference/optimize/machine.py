@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping
 
 from unirender.errors import UnirenderError
-from unirender.machine import in_gib, memory_bytes
+from unirender.machine import memory_excess
 
 
 def require_cores(threads: int) -> None:
@@ -15,7 +15,7 @@ def require_cores(threads: int) -> None:
     """
     cores = os.cpu_count() or 1
     if threads > cores:
-        raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine")
+        raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine; 0 takes all")
 
 
 def require_memory(needed: Mapping[str, float]) -> None:
@@ -27,10 +27,6 @@ def require_memory(needed: Mapping[str, float]) -> None:
     Raises:
         UnirenderError: one takes more than the machine has in all.
     """
-    present = memory_bytes()
     for option, wanted in needed.items():
-        if wanted > present:
-            raise UnirenderError(
-                f"{option}: would take about {in_gib(wanted)} of memory, and this machine has {in_gib(present)}; "
-                "expected a smaller number"
-            )
+        if excess := memory_excess(wanted):
+            raise UnirenderError(f"{option}: {excess}; expected a smaller number")

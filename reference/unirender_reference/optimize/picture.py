@@ -191,7 +191,10 @@ def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
     if _has_maps(path):
         normal = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False).normal
         if normal is None:
-            raise UnirenderError(f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z")
+            raise UnirenderError(
+                f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z; "
+                "leave --normal out, or give another file"
+            )
         return normal
     return 2 * stored_values(checked_file(path))[..., :3] - 1
 
@@ -213,7 +216,7 @@ def unit_normals(
         height, width = mask.shape[:2]
         raise UnirenderError(
             f"{path}: the normals are {normal.shape[1]} x {normal.shape[0]} pixels, expected {width} x {height} like "
-            "the picture"
+            "the picture; make them of this picture (`unirender decompose`)"
         )
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     missing = float(((length < LEAST_LENGTH) & (mask > 0.5)).sum() / max(int((mask > 0.5).sum()), 1))

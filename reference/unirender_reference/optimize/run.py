@@ -72,7 +72,9 @@ def optimize(
         as_instance(obj, MeshObject, "optimize: obj")
     as_instance(config, OptimizeConfig, "optimize: config").check()
     if init is not None and obj is not None:
-        raise UnirenderError("optimize: got a mesh and a start with a mesh of its own, expected one of them")
+        raise UnirenderError(
+            "optimize: got a mesh and a start with a mesh of its own, expected one of them; leave obj or init out"
+        )
     views.require_light()
     if obj is None and init is None:
         from unirender_reference.optimize.shape.bounds import check_masks

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from unirender.arguments import as_floats, as_instance
+from unirender.arguments import as_coverage, as_floats, as_instance
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -68,7 +68,7 @@ def optimize_image(
     """
     as_instance(config, SingleConfig, "optimize: config")
     as_instance(camera, Camera, "optimize: camera")
-    image, mask = as_floats(image, "image"), as_floats(mask, "mask")
+    image, mask = as_floats(image, "image"), as_coverage(mask, "mask")
     linear = _checked(image, mask, hdr)
     if geometry is not None:
         check_in_picture(mask, camera, geometry)
@@ -109,10 +109,14 @@ def _checked(
     """The picture, linear and premultiplied."""
     if mask.ndim != 3 or mask.shape[2] != 1 or image.shape != (*mask.shape[:2], 3):
         raise UnirenderError(
-            f"single view: got an image {image.shape} and a mask {mask.shape}, expected (h, w, 3) and (h, w, 1)"
+            f"single view: got an image {image.shape} and a mask {mask.shape}, expected (h, w, 3) and (h, w, 1); "
+            "a mask [h, w] becomes one by mask[..., None]"
         )
     if not (mask.min() >= 0 and mask.max() <= 1) or not mask.any():
-        raise UnirenderError("single view: the mask is empty or leaves [0, 1], expected the object's coverage")
+        raise UnirenderError(
+            "single view: the mask is empty or leaves [0, 1], expected the object's coverage; divide an "
+            "8-bit mask by 255"
+        )
     most = np.inf if hdr else 1.001
     if not np.isfinite(image).all() or image.min() < 0 or image.max() > most:
         raise UnirenderError(
@@ -130,7 +134,8 @@ def _start_maps(mask: Float[np.ndarray, "h w 1"], init: Intrinsics | None) -> di
     maps = init.require("albedo", "roughness", "metallic", "environment")
     if maps["albedo"].shape != (*mask.shape[:2], 3):
         raise UnirenderError(
-            f"single view: init has maps of {maps['albedo'].shape[:-1]}, expected the picture's size {mask.shape[:2]}"
+            f"single view: init has maps of {maps['albedo'].shape[:-1]}, expected the picture's size {mask.shape[:2]}; "
+            "decompose this very picture"
         )
     return {name: maps[name] for name in COLD}
 
@@ -147,7 +152,10 @@ def _start_normals(
     if normal is None:
         return silhouette_normals(mask, camera) if geometry is None else np.zeros((*mask.shape[:2], 3), np.float32)
     if normal.shape != (*mask.shape[:2], 3):
-        raise UnirenderError(f"single view: got normals {normal.shape}, expected {(*mask.shape[:2], 3)}")
+        raise UnirenderError(
+            f"single view: got normals {normal.shape}, expected {(*mask.shape[:2], 3)}, those of this picture; "
+            "leave them out for those of the silhouette"
+        )
     return normal
 
 

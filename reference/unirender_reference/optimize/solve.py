@@ -237,7 +237,8 @@ def shrunk(views: Views, pixels: int) -> Views:
     factor = min(math.isqrt(covered // pixels), shorter // LEAST_SIDE)
     if factor < 2:
         return views
-    return replace(views, seen=tuple(reduced(view, longer // factor, views.hdr) for view in views.seen), held_out=())
+    side = max(longer // factor, -(-LEAST_SIDE * longer // shorter))  # rounded down it may leave one pixel too few
+    return replace(views, seen=tuple(reduced(view, side, views.hdr) for view in views.seen), held_out=())
 
 
 def _brightness(views: Views) -> float:

@@ -111,7 +111,10 @@ class Frame:
                     )
             return focal_y
         if not found:
-            raise UnirenderError(f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y)")
+            raise UnirenderError(
+                f"{self.name}: no field of view, expected camera_angle_x or fl_x (and fl_y); "
+                "write one of them into the file"
+            )
         of_x, of_y = next(iter(found.values())), list(found.values())[-1]
         if abs(of_x / of_y - 1) > FOCAL_TOLERANCE:
             raise UnirenderError(
@@ -164,12 +167,17 @@ def read_transforms(path: Path) -> list[Frame]:
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))  # editors of Windows write a byte order mark
     except OSError as error:
-        raise UnirenderError(f"{path}: cannot be read ({error.strerror}), expected a transforms.json") from error
+        raise UnirenderError(
+            f"{path}: cannot be read ({error.strerror}), expected a transforms.json; is the path right?"
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise UnirenderError(f"{path}: not valid JSON ({error}), expected a transforms.json") from error
+        raise UnirenderError(f"{path}: not valid JSON ({error}), expected a transforms.json; write it again") from error
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise UnirenderError(f"{path}: has no frames, expected a list of file_path and transform_matrix under 'frames'")
+        raise UnirenderError(
+            f"{path}: has no frames, expected a list of file_path and transform_matrix under 'frames'; "
+            "docs/optimization.md has the format"
+        )
     shared = {key: value for key, value in content.items() if key != "frames"}
     splits = {key: _split(path, key, content[key]) for key in SPLITS if key in content}
     return [_frame(path, index, entry, shared, splits) for index, entry in enumerate(frames)]
@@ -185,7 +193,7 @@ def _split(path: Path, key: str, names: Any) -> set[Path]:
 def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits: Mapping[str, set[Path]]) -> Frame:
     where = f"{path}: frames[{index}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-        raise UnirenderError(f"{where} has no file_path, expected the path of a picture")
+        raise UnirenderError(f"{where} has no file_path, expected the path of a picture; write it into the frame")
     own = Path(entry["file_path"])
     unseen = any(own in splits.get(key, ()) for key in SPLITS[1:]) or own not in splits.get(SPLITS[0], {own})
     held_out = entry.get("held_out", unseen)
@@ -225,7 +233,8 @@ def _picture_file(folder: Path, name: str, where: str) -> Path:
         raise UnirenderError(f"{where}: {name} may be {names}; write the suffix into file_path")
     if not found:
         raise UnirenderError(
-            f"{where}: no picture {folder / name}, expected a file (or one with {', '.join(SUFFIXES)} behind it)"
+            f"{where}: no picture {folder / name}, expected a file (or one with {', '.join(SUFFIXES)} behind it); "
+            "copy it there, or correct file_path"
         )
     return found[0]
 

@@ -52,7 +52,9 @@ class View:
                 f"{self.name}: got image {self.image.shape}, mask {self.mask.shape}; expected (h, w, 3) and (h, w, 1)"
             )
         if self.clipped is not None and self.clipped.shape != self.image.shape:
-            raise UnirenderError(f"{self.name}: got clipped {self.clipped.shape}, expected {self.image.shape}")
+            raise UnirenderError(
+                f"{self.name}: got clipped {self.clipped.shape}, expected {self.image.shape}; None: no value is"
+            )
         if not np.isfinite(self.image).all() or self.image.min() < 0:
             raise UnirenderError(f"{self.name}: the image has negative, infinite or NaN values; expected values >= 0")
         if not (self.mask.min() >= 0 and self.mask.max() <= 1):

@@ -43,7 +43,10 @@ def solution_from_predictions(
         UnirenderError: a prediction lacks a map, or there is not one for each view.
     """
     if len(predictions) != len(views.seen):
-        raise UnirenderError(f"warm start: got {len(predictions)} predictions for {len(views.seen)} views")
+        raise UnirenderError(
+            f"warm start: got {len(predictions)} predictions for {len(views.seen)} views, expected "
+            "one for each; leave held-out pictures out"
+        )
     obj = charted(obj, texture_size)
     total = np.zeros((texture_size * texture_size, 5))
     weight = np.zeros(texture_size * texture_size)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from unirender.errors import UnirenderError
 
 UNIT_TOLERANCE = 1e-3
+CONVERT = "repair what is not finite, and convert it by .astype(np.float32)"
 NEEDED = ("vertices", "faces", "normals", "albedo")
 RECONSTRUCTION = "reconstruction"  # the family of meshes made from pictures, in the world of their cameras
 RECONSTRUCTION_TOLERANCE = 0.3  # of their radius: the object's size was guessed from masks before its shape was known
@@ -65,7 +66,7 @@ class MeshObject:
         for label in ("vertices", "faces", "normals", "uv", "albedo", "roughness", "metallic", "normal_map"):
             array = getattr(self, label)
             if not isinstance(array, np.ndarray) and (array is not None or label in NEEDED):
-                raise UnirenderError(f"{self.name}: got {label} {array!r:.40}, expected a numpy array")
+                raise UnirenderError(f"{self.name}: got {label} {array!r:.40}, expected a numpy array; convert it")
         if "." in self.name or "/" in self.name:
             raise UnirenderError(f"object name: got {self.name!r}, expected no '.' and no '/'; rename the object")
 
@@ -81,10 +82,14 @@ class MeshObject:
                 continue
             if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
                 raise UnirenderError(
-                    f"{self.name}: {label} must be finite float32 of shape {shape}, got {array.dtype} {array.shape}"
+                    f"{self.name}: {label} must be finite float32 of shape {shape}, got {array.dtype} {array.shape}; "
+                    f"{CONVERT}"
                 )
         if self.faces.ndim != 2 or self.faces.shape[1:] != (3,) or self.faces.dtype != np.int32 or not len(self.faces):
-            raise UnirenderError(f"{self.name}: faces must be int32 (m, 3) with m > 0, got {self.faces.shape}")
+            raise UnirenderError(
+                f"{self.name}: faces must be int32 (m, 3) with m > 0, got {self.faces.dtype} {self.faces.shape}; "
+                "split polygons, and convert them by .astype(np.int32)"
+            )
         if self.faces.min() < 0 or self.faces.max() >= n:
             raise UnirenderError(f"{self.name}: faces index outside the {n} vertices; the mesh is broken")
 
@@ -95,7 +100,11 @@ class MeshObject:
                 f"uv {'absent' if self.uv is None else 'present'}"
             )
         if self.albedo.dtype != np.float32 or not (self.albedo.min() >= 0 and self.albedo.max() <= 1):
-            raise UnirenderError(f"{self.name}: albedo must be float32, linear, within [0, 1]")
+            raise UnirenderError(
+                f"{self.name}: albedo must be float32, linear, within [0, 1], got {self.albedo.dtype} in "
+                f"[{self.albedo.min():.4g}, {self.albedo.max():.4g}]; divide 8-bit values by 255 and decode them "
+                "(unirender.color.srgb_decode)"
+            )
 
     def _check_maps(self) -> None:
         """Roughness, metallic and normal map, where there are any."""
@@ -103,7 +112,10 @@ class MeshObject:
             if texture is not None:
                 self._check_texture(label, texture, 2)
                 if not (texture.min() >= 0 and texture.max() <= 1):
-                    raise UnirenderError(f"{self.name}: {label} must lie within [0, 1], got up to {texture.max():.4g}")
+                    raise UnirenderError(
+                        f"{self.name}: {label} must lie within [0, 1], got "
+                        f"[{texture.min():.4g}, {texture.max():.4g}]; divide 8-bit values by 255"
+                    )
         if self.normal_map is not None:
             self._check_texture("normal_map", self.normal_map, 3)
             if np.abs(np.linalg.norm(self.normal_map, axis=-1) - 1).max() > UNIT_TOLERANCE:
@@ -113,11 +125,17 @@ class MeshObject:
         """Normals are unit vectors, and the vertices lie in the unit sphere and touch it."""
         length = np.linalg.norm(self.normals, axis=1)
         if np.abs(length - 1).max() > UNIT_TOLERANCE:
-            raise UnirenderError(f"{self.name}: normals must be unit vectors, got lengths down to {length.min():.4f}")
+            raise UnirenderError(
+                f"{self.name}: normals must be unit vectors, got lengths from {length.min():.4f} to "
+                f"{length.max():.4f}; divide them by these"
+            )
         radius = float(np.linalg.norm(self.vertices, axis=1).max())
         tolerance = RECONSTRUCTION_TOLERANCE if self.family == RECONSTRUCTION else UNIT_TOLERANCE
         if abs(radius - 1) > tolerance:
-            raise UnirenderError(f"{self.name}: bounding sphere must have radius 1, got {radius:.4f}")
+            raise UnirenderError(
+                f"{self.name}: bounding sphere must have radius 1, got {radius:.4f}; "
+                "move the vertices there (unirender_reference.shapes.bounding_sphere(vertices).to_unit(vertices))"
+            )
 
     def _check_texture(self, label: str, texture: np.ndarray, dimensions: int) -> None:
         """A texture of the right type, on an object that has texture coordinates."""
@@ -126,7 +144,7 @@ class MeshObject:
             size = "(h, w, 3)" if dimensions == 3 else "(h, w)"
             raise UnirenderError(
                 f"{self.name}: {label} must be finite float32 {size} with uv, got {texture.dtype} {texture.shape}, "
-                f"uv {'absent' if self.uv is None else 'present'}"
+                f"uv {'absent' if self.uv is None else 'present'}; {CONVERT}"
             )
 
     def without_maps(self) -> "MeshObject":
@@ -142,7 +160,9 @@ class MeshObject:
         rotation = np.asarray(rotation)
         unmoved = rotation @ rotation.T if rotation.shape == (3, 3) else np.zeros((3, 3))
         if not np.allclose(unmoved, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
-            raise UnirenderError(f"{self.name}: got {rotation.tolist()}, expected the matrix of a rotation, 3 x 3")
+            raise UnirenderError(
+                f"{self.name}: got {rotation.tolist()}, expected the matrix of a rotation, 3 x 3, no mirror image"
+            )
 
         def turn(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
             return (vectors.astype(np.float64) @ rotation.T).astype(np.float32)

@@ -146,6 +146,7 @@ def test_pictures_with_few_pixels_or_small_sides_stay_as_they_are() -> None:
     assert shrunk(large, 100).height == LEAST_SIDE
     wide = shrunk(blank(128, 4, width=512), 100)
     assert (wide.height, wide.width) == (LEAST_SIDE, 4 * LEAST_SIDE), "the shorter side, in which the object lies"
+    assert shrunk(blank(192, 4, width=194), 100).height == LEAST_SIDE
     low = blank(96, 4, width=512)
     assert shrunk(low, 100) is low
 

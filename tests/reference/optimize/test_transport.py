@@ -41,7 +41,7 @@ def modelled(problem, roughness: float, metallic: float) -> np.ndarray:
     blank = np.zeros((count, 3), np.float32)
     seen = observe(blank, np.ones(count), np.arange(count), np.zeros(blank.shape, bool))
     fit = PixelFit(transport, seen, np.ones_like(blank), 0.5)
-    cells = GRID.averages(light)
+    cells = cases.averages(GRID, light)
     mixed = fit.mixed(Appearance(np.log(cells), np.full(count, float(roughness)), np.full(count, float(metallic))))
     return COLOUR * (mixed.u @ cells) + mixed.v @ cells
 
@@ -63,7 +63,7 @@ def test_matrices_times_light_are_the_direct_image(problem, roughness: float, me
 def test_a_coarse_light_has_the_same_image(problem) -> None:
     _, _, transport, light, _ = problem
     coarse = transport.coarse()
-    cells = coarse.grid.averages(light)
+    cells = cases.averages(coarse.grid, light)
     for whole, part in ((transport.diffuse[0], coarse.diffuse[0]), (transport.gloss[3], coarse.gloss[3])):
         np.testing.assert_allclose(part @ cells, whole @ refined(cells, coarse.grid), rtol=1e-4, atol=1e-6)
 

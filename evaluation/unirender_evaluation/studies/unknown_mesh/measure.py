@@ -21,7 +21,7 @@ from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
 from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.report import Progress
+from unirender_reference.optimize.report import OnReport
 
 TABLE, PROTOCOL, METHOD = "unknown-mesh", "unknown-mesh", "unirender-optimize"
 USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
@@ -65,7 +65,7 @@ class UnknownMesh:
 
 
 def measure(
-    what: UnknownMesh, scenes: Sequence[Scene], progress: Callable[[Scene], Progress | None] = lambda scene: None
+    what: UnknownMesh, scenes: Sequence[Scene], progress: Callable[[Scene], OnReport | None] = lambda scene: None
 ) -> Iterator[tuple[Record, bool]]:
     """The records of scenes, and whether each was measured now; those that are stored are not measured again.
 
@@ -84,7 +84,7 @@ def measure(
     store.close()
 
 
-def measured(what: UnknownMesh, scene: Scene, progress: Progress | None = None) -> Record:
+def measured(what: UnknownMesh, scene: Scene, progress: OnReport | None = None) -> Record:
     """Optimises one object from its pictures, scores the result and draws it."""
     from unirender_evaluation.studies.unknown_mesh.pictures import found_strip
     from unirender_evaluation.studies.unknown_mesh.scoring import score_found

@@ -14,7 +14,7 @@ from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
 from unirender_evaluation.suites import Scene
 from unirender_reference.optimize.live import live_report
-from unirender_reference.optimize.report import Progress
+from unirender_reference.optimize.report import OnReport
 
 NAME = "unknown_mesh"
 
@@ -33,7 +33,7 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
         records, computed = [], 0
         with contextlib.ExitStack() as shown:
 
-            def listener(scene: Scene) -> Progress | None:
+            def listener(scene: Scene) -> OnReport | None:
                 shown.close()
                 console.print(f"{names[scene.key]}: {what.folder(scene)}", highlight=False, markup=False)
                 return shown.enter_context(live_report(console)) if progress else None
