@@ -3,7 +3,8 @@
 What was found on blocks of pixels is interpolated; a grey start, which has no detail, takes that of the picture. s and
 d are those of the light that was found: with shadows on a known mesh. A predicted s and d move towards them; without a
 mesh they change by the ratio of the two lights on the normals, since the prediction knows something of shadows. A
-predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it.
+predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it: maps
+and light together are as bright as the picture, however much of a change is trusted.
 """
 
 import numpy as np
@@ -47,18 +48,22 @@ def result(
         known_mesh: normals and shadows are the mesh's.
         trust: what part of the changes of albedo and of a predicted light is kept.
     """
-    albedo = _changed_albedo(fit, at, maps["albedo"], trust, mask.shape[:2])
+    size = mask.shape[:2]
+    change = enlarge(fit.picture, np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo, size)
+    whole, albedo = (_changed(maps["albedo"], kept * change) for kept in (1.0, trust.albedo))
     if init is None and fit.picture.block > 1:
         straight = unpremultiply(image_linear, mask)
-        albedo = albedo * _ratio(straight, _blurred(fit.picture, image_linear, mask))
+        detail = _ratio(straight, _blurred(fit.picture, image_linear, mask))
+        whole, albedo = whole * detail, albedo * detail
     gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
     if init is None:
         gauge = np.full(3, gauge.mean())
-    light = fit.environment(at) * gauge
-    specular, diffuse = _shading(fit, at, light, init, known_mesh, trust, mask.shape[:2])
+    kept_back = np.maximum(_mean(whole, mask), DARK) / np.maximum(_mean(albedo, mask), DARK)
+    light = fit.environment(at) * gauge * kept_back
+    specular, diffuse = _shading(fit, at, light, init, known_mesh, trust, size)
     found = {
         "albedo": np.clip(albedo / np.maximum(gauge, DARK), 0, 1),
-        "normal": _mesh_normal(fit.picture, mask.shape[:2]) if known_mesh else maps["normal"],
+        "normal": _mesh_normal(fit.picture, size) if known_mesh else maps["normal"],
         "roughness": np.clip(maps["roughness"] + at.roughness, 0, 1),
         "metallic": np.clip(maps["metallic"] + at.metallic, 0, 1),
         "specular": specular,
@@ -69,12 +74,9 @@ def result(
     return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
 
 
-def _changed_albedo(
-    fit: Fit, at: Unknowns, start: Float[np.ndarray, "h w 3"], trust: Trust, size: tuple[int, int]
-) -> Float[np.ndarray, "h w 3"]:
-    """The start with what is trusted of the change that the search found."""
-    change = enlarge(fit.picture, np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo, size)
-    return np.clip(np.exp(np.log(start + DARKEST) + trust.albedo * change) - DARKEST, 0, 1)
+def _changed(albedo: Float[np.ndarray, "h w 3"], change: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """An albedo whose log has changed."""
+    return np.clip(np.exp(np.log(albedo + DARKEST) + change) - DARKEST, 0, 1)
 
 
 def _trusted_light(

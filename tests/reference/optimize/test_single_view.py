@@ -97,6 +97,22 @@ def test_a_prediction_is_refined_and_what_is_not_trusted_stays(
         np.testing.assert_allclose(same.maps[name], prediction.maps[name], rtol=0, atol=2e-4)
 
 
+def test_what_is_not_believed_of_the_paint_goes_into_the_light(
+    truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics
+) -> None:
+    """A predicted albedo too dark in level and tint that is kept: its light makes up for both, channel by channel."""
+    maps = prediction.require("albedo", "mask")
+    dark = prediction.replace(albedo=maps["albedo"] * np.array([0.4, 0.5, 0.7], np.float32))
+    loose = Priors(brightness=1, tint=1, light_level=0.05, light_tint=0.05)  # the fit moves the paint
+    trust = Trust(albedo=0, metallic=0, roughness=0, shading=0)
+    config = replace(QUICK, priors=loose, trust=trust, steps=(6,), noise=(0.1,), fine_steps=1)
+    found = optimize_image(picture, maps["mask"], CAMERA, config, init=dark)
+    np.testing.assert_allclose(found.require("albedo")["albedo"], dark.require("albedo")["albedo"], atol=1e-5)
+    seen = srgb_decode(picture) * maps["mask"]
+    rendered = shade(found, spp=64)
+    np.testing.assert_allclose(rendered.mean(axis=(0, 1)), seen.mean(axis=(0, 1)), rtol=0.15)
+
+
 @pytest.mark.long
 def test_the_result_renders_to_the_picture(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
     mask = truth.require("mask")["mask"]
