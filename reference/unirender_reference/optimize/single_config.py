@@ -75,7 +75,8 @@ class Trust:
     """Of the change of the object's roughness."""
 
     light: float = 1.0
-    """Of the change of log radiance of a predicted light."""
+    """Of the change of log radiance of a predicted light. On a known mesh its level is the one under which the maps are
+    as bright as the picture, unless this is 0."""
 
     shading: float = 1.0
     """Of the change of a predicted s and d, as logarithms."""

@@ -70,7 +70,10 @@ def result(
         "diffuse": diffuse,
     }
     found = {name: np.where(mask > 0, values, 0).astype(np.float32) for name, values in found.items()}
-    environment = fit.picture.transport.grid.environment(_trusted_light(fit, light, init, trust))
+    kept = _trusted_light(fit, light, init, trust)
+    if known_mesh and init is not None and trust.light > 0:
+        kept = kept * _level(fit, at, kept, found["albedo"], mask)
+    environment = fit.picture.transport.grid.environment(kept)
     return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
 
 
@@ -88,6 +91,19 @@ def _trusted_light(
     grid = fit.picture.transport.grid
     predicted = resample_environment(init.environment, (grid.rows, grid.columns)).reshape(light.shape)
     return np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
+
+
+def _level(
+    fit: Fit,
+    at: Unknowns,
+    light: Float[np.ndarray, "j 3"],
+    albedo: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+) -> Float[np.ndarray, "3"]:
+    """What a light between a prediction's and the fit's lacks for the maps to be as bright as the picture."""
+    blocks = unpremultiply(shrink(albedo * mask, fit.picture.block), shrink(mask, fit.picture.block))
+    factor = fit.brightness(at, blocks.reshape(-1, 3)[fit.picture.pixel], light)
+    return np.clip(factor, 1 / MOST_GAIN, MOST_GAIN)
 
 
 def _shading(
