@@ -3,8 +3,9 @@
 What was found on blocks of pixels is interpolated; a grey start, which has no detail, takes that of the picture. s and
 d are those of the light that was found: with shadows on a known mesh. A predicted s and d move towards them; without a
 mesh they change by the ratio of the two lights on the normals, since the prediction knows something of shadows. A
-predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it: maps
-and light together are as bright as the picture, however much of a change is trusted.
+predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it, and
+for what is not trusted of the change. On a known mesh a light between a predicted one and the fit's gets its level from
+the picture.
 """
 
 import numpy as np
