@@ -65,7 +65,8 @@ class Trust:
 
     albedo: float = 1.0
     """Of the change of log albedo. A predicted albedo keeps its mean in each channel: level and tint of paint and light
-    cannot be told apart, and what the fit moves them by is no better. A grey start keeps its level."""
+    cannot be told apart, and what the fit moves them by is no better. A grey start keeps its level. What the mean
+    would have changed by goes into the light, whatever part is kept."""
 
     metallic: float = 1.0
     """Of the change of the object's metallic."""
@@ -74,7 +75,8 @@ class Trust:
     """Of the change of the object's roughness."""
 
     light: float = 1.0
-    """Of the change of log radiance of a predicted light."""
+    """Of the change of log radiance of a predicted light. On a known mesh its level is the one under which the maps are
+    as bright as the picture, unless this is 0."""
 
     shading: float = 1.0
     """Of the change of a predicted s and d, as logarithms."""

@@ -117,6 +117,23 @@ class Fit:
         image = self.model(self.start()).image
         return float(np.log(max(self.picture.radiance.sum(), 1e-6) / max(image.sum(), 1e-9)))
 
+    def brightness(
+        self, at: Unknowns, albedo: Float[np.ndarray, "n 3"], light: Float[np.ndarray, "j 3"]
+    ) -> Float[np.ndarray, "3"]:
+        """The factor of each channel of a light under which maps are as bright as the picture: least squares of display
+        values to first order, without those that are saturated.
+
+        Args:
+            at: the materials.
+            albedo: of the pixels.
+            light: radiance of the texels.
+        """
+        u, v = self.model(at).mixed
+        image = albedo * (u @ light.astype(np.float32)) + v @ light.astype(np.float32)
+        weight = np.where(self.picture.saturated, 0, np.square(self.slope)) * image
+        seen, shown = ((weight * values).sum(axis=0) for values in (self.picture.radiance, image))
+        return np.where(shown > 0, seen / np.maximum(shown, 1e-12), 1)
+
     def materials(self, at: Unknowns) -> tuple[Float[np.ndarray, "n 1"], Float[np.ndarray, "n 1"]]:
         maps = self.picture.maps
         metallic = np.clip(maps["metallic"] + at.metallic, 0, 1)

@@ -3,7 +3,9 @@
 What was found on blocks of pixels is interpolated; a grey start, which has no detail, takes that of the picture. s and
 d are those of the light that was found: with shadows on a known mesh. A predicted s and d move towards them; without a
 mesh they change by the ratio of the two lights on the normals, since the prediction knows something of shadows. A
-predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it.
+predicted albedo keeps its mean in each channel, a grey start that of all channels, and the light makes up for it, and
+for what is not trusted of the change. On a known mesh a light between a predicted one and the fit's gets its level from
+the picture.
 """
 
 import numpy as np
@@ -47,34 +49,38 @@ def result(
         known_mesh: normals and shadows are the mesh's.
         trust: what part of the changes of albedo and of a predicted light is kept.
     """
-    albedo = _changed_albedo(fit, at, maps["albedo"], trust, mask.shape[:2])
+    size = mask.shape[:2]
+    change = enlarge(fit.picture, np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo, size)
+    whole, albedo = (_changed(maps["albedo"], kept * change) for kept in (1.0, trust.albedo))
     if init is None and fit.picture.block > 1:
         straight = unpremultiply(image_linear, mask)
-        albedo = albedo * _ratio(straight, _blurred(fit.picture, image_linear, mask))
+        detail = _ratio(straight, _blurred(fit.picture, image_linear, mask))
+        whole, albedo = whole * detail, albedo * detail
     gauge = _mean(albedo, mask) / np.maximum(_mean(maps["albedo"], mask), DARK)
     if init is None:
         gauge = np.full(3, gauge.mean())
-    light = fit.environment(at) * gauge
-    specular, diffuse = _shading(fit, at, light, init, known_mesh, trust, mask.shape[:2])
+    kept_back = np.maximum(_mean(whole, mask), DARK) / np.maximum(_mean(albedo, mask), DARK)
+    light = fit.environment(at) * gauge * kept_back
+    specular, diffuse = _shading(fit, at, light, init, known_mesh, trust, size)
     found = {
         "albedo": np.clip(albedo / np.maximum(gauge, DARK), 0, 1),
-        "normal": _mesh_normal(fit.picture, mask.shape[:2]) if known_mesh else maps["normal"],
+        "normal": _mesh_normal(fit.picture, size) if known_mesh else maps["normal"],
         "roughness": np.clip(maps["roughness"] + at.roughness, 0, 1),
         "metallic": np.clip(maps["metallic"] + at.metallic, 0, 1),
         "specular": specular,
         "diffuse": diffuse,
     }
     found = {name: np.where(mask > 0, values, 0).astype(np.float32) for name, values in found.items()}
-    environment = fit.picture.transport.grid.environment(_trusted_light(fit, light, init, trust))
+    kept = _trusted_light(fit, light, init, trust)
+    if known_mesh and init is not None and trust.light > 0:
+        kept = kept * _level(fit, at, kept, found["albedo"], mask)
+    environment = fit.picture.transport.grid.environment(kept)
     return Intrinsics(**found, environment=environment, mask=mask, camera=camera)
 
 
-def _changed_albedo(
-    fit: Fit, at: Unknowns, start: Float[np.ndarray, "h w 3"], trust: Trust, size: tuple[int, int]
-) -> Float[np.ndarray, "h w 3"]:
-    """The start with what is trusted of the change that the search found."""
-    change = enlarge(fit.picture, np.log(fit.model(at).albedo + DARKEST) - fit.log_albedo, size)
-    return np.clip(np.exp(np.log(start + DARKEST) + trust.albedo * change) - DARKEST, 0, 1)
+def _changed(albedo: Float[np.ndarray, "h w 3"], change: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """An albedo whose log has changed."""
+    return np.clip(np.exp(np.log(albedo + DARKEST) + change) - DARKEST, 0, 1)
 
 
 def _trusted_light(
@@ -86,6 +92,19 @@ def _trusted_light(
     grid = fit.picture.transport.grid
     predicted = resample_environment(init.environment, (grid.rows, grid.columns)).reshape(light.shape)
     return np.maximum(predicted, DARK) ** (1 - trust.light) * light**trust.light
+
+
+def _level(
+    fit: Fit,
+    at: Unknowns,
+    light: Float[np.ndarray, "j 3"],
+    albedo: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+) -> Float[np.ndarray, "3"]:
+    """What a light between a prediction's and the fit's lacks for the maps to be as bright as the picture."""
+    blocks = unpremultiply(shrink(albedo * mask, fit.picture.block), shrink(mask, fit.picture.block))
+    factor = fit.brightness(at, blocks.reshape(-1, 3)[fit.picture.pixel], light)
+    return np.clip(factor, 1 / MOST_GAIN, MOST_GAIN)
 
 
 def _shading(

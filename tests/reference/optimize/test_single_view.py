@@ -66,6 +66,15 @@ def prediction(truth: Intrinsics) -> Intrinsics:
     )
 
 
+@pytest.fixture(scope="module")
+def small_fit(truth: Intrinsics, prediction: Intrinsics) -> Fit:
+    """Of a linear picture of 200 pixels, with pixels held (a stiff prior) and a wide misfit."""
+    maps = prediction.require("albedo", "roughness", "metallic", "normal", "mask", "environment")
+    start = {name: maps[name] for name in ("albedo", "roughness", "metallic", "normal")}
+    small = make_picture(shade(truth, spp=64), maps["mask"], CAMERA, start, None, 200, (8, 16), True, 0)
+    return Fit(small, np.log(maps["environment"].reshape(-1, 3).astype(np.float64)), Priors(albedo=1e-5), 0.5)
+
+
 def albedo_error(found: Intrinsics, truth: Intrinsics) -> float:
     """Root mean square of display values inside the mask."""
     maps, true = found.require("albedo"), truth.require("albedo", "mask")
@@ -97,6 +106,22 @@ def test_a_prediction_is_refined_and_what_is_not_trusted_stays(
         np.testing.assert_allclose(same.maps[name], prediction.maps[name], rtol=0, atol=2e-4)
 
 
+def test_what_is_not_believed_of_the_paint_goes_into_the_light(
+    truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics
+) -> None:
+    """A predicted albedo too dark in level and tint that is kept: its light makes up for both, channel by channel."""
+    maps = prediction.require("albedo", "mask")
+    dark = prediction.replace(albedo=maps["albedo"] * np.array([0.4, 0.5, 0.7], np.float32))
+    loose = Priors(brightness=1, tint=1, light_level=0.05, light_tint=0.05)  # the fit moves the paint
+    trust = Trust(albedo=0, metallic=0, roughness=0, shading=0)
+    config = replace(QUICK, priors=loose, trust=trust, steps=(6,), noise=(0.1,), fine_steps=1)
+    found = optimize_image(picture, maps["mask"], CAMERA, config, init=dark)
+    np.testing.assert_allclose(found.require("albedo")["albedo"], dark.require("albedo")["albedo"], atol=1e-5)
+    seen = srgb_decode(picture) * maps["mask"]
+    rendered = shade(found, spp=64)
+    np.testing.assert_allclose(rendered.mean(axis=(0, 1)), seen.mean(axis=(0, 1)), rtol=0.15)
+
+
 @pytest.mark.long
 def test_the_result_renders_to_the_picture(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
     mask = truth.require("mask")["mask"]
@@ -123,6 +148,19 @@ def test_a_known_mesh_gives_normals_and_needs_no_start(truth: Intrinsics, pictur
         picture, maps["mask"], CAMERA, replace(QUICK, trust=Trust(roughness=0)), geometry=scenes.sphere()
     )
     assert object_value(flat, "roughness") == 0.5
+
+
+@pytest.mark.long
+def test_on_a_known_mesh_maps_and_light_are_as_bright_as_the_picture(
+    truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics
+) -> None:
+    """Of a predicted light that is far too dark a part is kept, but not of its level."""
+    mask = truth.require("mask")["mask"]
+    dark = prediction.replace(environment=0.05 * prediction.require("environment")["environment"])
+    found = optimize_image(picture, mask, CAMERA, QUICK, geometry=scenes.sphere(), init=dark)
+    rendered = shade(found, spp=64, geometry=scenes.sphere())
+    seen = srgb_decode(picture) * mask
+    np.testing.assert_allclose(rendered.mean(axis=(0, 1)), seen.mean(axis=(0, 1)), rtol=0.1)
 
 
 @pytest.mark.long
@@ -216,14 +254,20 @@ def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, 
         SingleConfig(light_rows=100_000)
 
 
-def test_the_gradient_is_that_of_the_cost(truth: Intrinsics, picture: np.ndarray, prediction: Intrinsics) -> None:
-    """Against central differences, with pixels held (a stiff prior) and without Huber's corner (a wide misfit)."""
-    maps = prediction.require("albedo", "roughness", "metallic", "normal", "mask", "environment")
-    seen = shade(truth, spp=64)
-    start = {name: maps[name] for name in ("albedo", "roughness", "metallic", "normal")}
-    small = make_picture(seen, maps["mask"], CAMERA, start, None, 200, (8, 16), True, 0)
-    light = np.log(maps["environment"].reshape(-1, 3).astype(np.float64))
-    fit = Fit(small, light, Priors(albedo=1e-5), 0.5)
+def test_the_brightness_of_a_light_is_that_of_the_picture(small_fit: Fit) -> None:
+    """A light whose channels are 3, 1 and 1/2 times that of the picture: the inverse, whatever the albedo."""
+    at, albedo = small_fit.start(), 0.5 * small_fit.picture.maps["albedo"]
+    u, v = small_fit.model(at).mixed
+    light, factor = np.exp(small_fit.log_light), np.array([3, 1, 0.5])
+    seen = replace(small_fit.picture, radiance=albedo * (u @ light.astype(np.float32)) + v @ light.astype(np.float32))
+    fit = Fit(seen, small_fit.log_light, small_fit.priors, small_fit.noise)
+    np.testing.assert_allclose(fit.brightness(at, albedo, factor * light), 1 / factor, rtol=1e-5)
+    np.testing.assert_array_equal(fit.brightness(at, albedo, 0 * light), 1)
+
+
+def test_the_gradient_is_that_of_the_cost(small_fit: Fit) -> None:
+    """Against central differences, with pixels held and without Huber's corner."""
+    fit, small = small_fit, small_fit.picture
     rng = np.random.default_rng(0)
     base = rng.normal(0, 0.05, 3 * fit.coarse + 5)
     base[-1] = 0.03  # between two nodes of the roughness table
