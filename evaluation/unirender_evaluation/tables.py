@@ -124,8 +124,9 @@ def build_table(
     methods = [run.method(key) for key in dict.fromkeys(record.method for record in chosen)]
     show_published = declared.published and variant == PUBLISHED_VARIANT and subset == "main"
     spec = _answered(spec, chosen, show_published)
+    published_in = spec.name if show_published and spec.name in published_tables() else None
     measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
-    rows = _merge(published_tables().get(spec.name, ()) if show_published else (), spec, measured)
+    rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
     total = max((row.n for row in rows), default=0)
     rows = _rank(spec, rows, variant)
     return Table(
@@ -137,7 +138,7 @@ def build_table(
         variant=variant,
         columns=spec.columns,
         rows=tuple(rows),
-        protocol=protocol_line(declared, variant, run, methods, chosen, spec.name if show_published else None),
+        protocol=protocol_line(declared, variant, run, methods, chosen, published_in),
         notes=table_notes(spec, chosen, rows, variant),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
