@@ -70,8 +70,11 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
 
 def _unreadable(path: Path, error: Exception) -> str:
     """What a file is that Pillow did not read, where its first bytes tell, else what Pillow says."""
-    with path.open("rb") as file:
-        start = file.read(FIRST_BYTES)
+    try:
+        with path.open("rb") as file:
+            start = file.read(FIRST_BYTES)
+    except OSError:  # a folder, or no permission: Pillow's sentence says so
+        return f"not a readable picture ({error})"
     told = (what for what, sign in OTHER_FORMATS.items() if re.match(sign, start, re.DOTALL))
     return next(told, "is empty" if not start else f"not a readable picture ({error})")
 
