@@ -386,6 +386,7 @@ def test_an_exr_that_is_no_picture_of_radiance_is_refused(tmp_path: Path, what: 
     "header",
     [
         {"colorInteropID": "lin_rec709_scene"},
+        {"colorInteropID": ""},
         {"colorInteropID": "lin_ap0_scene", "chromaticities": ACES_AP0},
         {"pixelAspectRatio": 0.999},
         {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()},
