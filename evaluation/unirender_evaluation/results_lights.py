@@ -23,7 +23,8 @@ def over_lights(results: Results, questions: Sequence[Question], lights: Mapping
     Args:
         results: a run's.
         questions: rows `a` and `b` of each.
-        lights: scene -> light, of the run's suite. A relit picture counts for the light that it is relit by.
+        lights: scene -> light, of the run's suite. A relit picture counts for the light that it is relit by; of an
+            object seen from many sides, for the one that it was seen under.
 
     Raises:
         UnirenderError: a sample belongs to no scene of `lights`.

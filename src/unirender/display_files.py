@@ -10,7 +10,7 @@ from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from unirender.cicp import Cicp, read_cicp
 from unirender.errors import UnirenderError
-from unirender.exif_colors import exif_remark
+from unirender.exif_colors import exif_remark, keep_color_space
 from unirender.icc import in_srgb
 from unirender.primaries import REC709, SAME_PRIMARIES
 from unirender.sixteen_bits import as_stored, has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
@@ -56,6 +56,8 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
                 raise UnirenderError(f"{path}: {what}; save it as PNG, or with interleaved channels")
             _check_grey(file, str(path))
             _scale_transparent_grey(file)
+            if file.format == "TIFF":
+                keep_color_space(file)
             if not upright:
                 return as_stored(file).copy()
             file.load()
@@ -70,8 +72,11 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
 
 def _unreadable(path: Path, error: Exception) -> str:
     """What a file is that Pillow did not read, where its first bytes tell, else what Pillow says."""
-    with path.open("rb") as file:
-        start = file.read(FIRST_BYTES)
+    try:
+        with path.open("rb") as file:
+            start = file.read(FIRST_BYTES)
+    except OSError:  # a folder, or no permission: Pillow's sentence says so
+        return f"not a readable picture ({error})"
     told = (what for what, sign in OTHER_FORMATS.items() if re.match(sign, start, re.DOTALL))
     return next(told, "is empty" if not start else f"not a readable picture ({error})")
 

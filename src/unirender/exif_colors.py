@@ -20,6 +20,7 @@ ADOBE_RGB_GAMMA = np.float32(563 / 256)
 ADOBE_RGB_TO_REC709 = np.array(  # one white, red and blue; green lies further out
     [[1.398356, -0.398356, 0], [0, 1, 0], [0, -0.042929, 1.042929]], dtype=np.float32
 )
+STATED = "exif_color_space"  # entry of the `info` of a TIFF, whose copies lose its tags
 PNG_CHUNKS = ("srgb", "gamma", "chromaticity")  # of Pillow's `info`: they count more
 
 
@@ -30,6 +31,8 @@ def exif_color_space(image: Image.Image) -> int | None:
         return None
     if image.mode.startswith(("I", "F")) or image.mode in ("CMYK", "LAB"):
         return None
+    if STATED in image.info:
+        return image.info[STATED]
     try:
         with warnings.catch_warnings(action="ignore"):  # of what is damaged
             exif = image.getexif()
@@ -41,6 +44,12 @@ def exif_color_space(image: Image.Image) -> int | None:
     if space == ADOBE_RGB or (space == NOT_SRGB and str(index).rstrip("\0") == ADOBE_RGB_INDEX):
         return ADOBE_RGB
     return NOT_SRGB if space == NOT_SRGB else None
+
+
+def keep_color_space(tiff: Image.Image) -> None:
+    """Has copies of an opened TIFF state what its EXIF does."""
+    if (space := exif_color_space(tiff)) is not None:
+        tiff.info[STATED] = space
 
 
 def adobe_rgb_in_srgb(image: Image.Image) -> Image.Image:

@@ -36,7 +36,7 @@ MAP_CHANNELS: Mapping[str, tuple[str, ...]] = {
     name: tuple(f"{name}.{component}" for component in _COMPONENTS.get(name, "Y")) for name in IMAGE_MAPS
 }
 COLOR_SPACE_ATTRIBUTE = "colorInteropID"  # of OpenEXR 3.4 and later: <transfer>_<primaries>_<scene or display>
-OUR_COLOR_SPACES = ("lin_rec709_scene", "data", "unknown")
+OUR_COLOR_SPACES = ("lin_rec709_scene", "data", "unknown", "")
 SQUARE = 0.02  # of 1: how far pixels may be from square, as writers round
 
 

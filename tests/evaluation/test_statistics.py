@@ -193,6 +193,7 @@ def test_the_p_value_is_that_of_the_paired_t_test() -> None:
     assert paired_p_value(b, a, each) == pytest.approx(known)
     assert paired_p_value(a, a, each) == 1
     assert paired_p_value(a, b, dict.fromkeys(a, "one object")) == 1
+    assert paired_p_value({"x": 1.0, "y": -1.0, "z": 0.0}, dict.fromkeys("xyz", 0.0), {"x": 0, "y": 0, "z": 1}) == 1
     assert paired_p_value({"x": 2.0, "y": 3.0}, {"x": 1.0, "y": 2.0}, {"x": 0, "y": 1}) == 0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from icc_profiles import ADOBE_RGB_D50, P3_D50, SRGB_D50, grey_profile, matrix_profile
-from PIL import Image, ImageCms
+from PIL import ExifTags, Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
 
 from unirender.color import srgb_decode, srgb_encode
@@ -142,6 +142,16 @@ def test_adobe_rgb_by_exif_alone_is_converted(tmp_path: Path, stated: tuple, tol
     for name in ("c.png", "d.png", "e.webp"):
         assert not read_picture(tmp_path / name).remarks
     np.testing.assert_array_equal(np.round(255 * read_picture(tmp_path / "d.png").image_srgb), PIXELS)
+
+
+def test_adobe_rgb_by_the_exif_of_a_tiff_is_converted(tmp_path: Path) -> None:
+    """Pillow's copies of a TIFF, which pictures are read from, have none of its tags."""
+    image = Image.fromarray(PIXELS)
+    image.save(tmp_path / "a.tif", tiffinfo={ExifTags.IFD.Exif: {ExifTags.Base.ColorSpace: 2}})
+    image.save(tmp_path / "b.webp", lossless=True, exif=exif(2, "R98"))
+    found, wanted = (read_picture(tmp_path / name) for name in ("a.tif", "b.webp"))
+    np.testing.assert_array_equal(found.image_srgb, wanted.image_srgb)
+    assert ADOBE_RGB_TOLD in found.remarks["primaries"]
 
 
 def test_adobe_rgb_by_exif_keeps_its_alpha_and_a_damaged_exif_says_nothing(tmp_path: Path) -> None:
@@ -376,6 +386,7 @@ def test_an_exr_that_is_no_picture_of_radiance_is_refused(tmp_path: Path, what: 
     "header",
     [
         {"colorInteropID": "lin_rec709_scene"},
+        {"colorInteropID": ""},
         {"colorInteropID": "lin_ap0_scene", "chromaticities": ACES_AP0},
         {"pixelAspectRatio": 0.999},
         {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()},

@@ -14,7 +14,7 @@ from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
 from unirender.commands import Relight
-from unirender.display_files import MAX_PIXELS, display_values, srgb_values_and_remarks, stored_values
+from unirender.display_files import MAX_PIXELS, display_values, open_picture, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
@@ -425,6 +425,12 @@ def test_what_a_file_is_that_cannot_be_read(data: bytes, told: str, tmp_path: Pa
     (tmp_path / "a.jpg").write_bytes(data)
     with pytest.raises(UnirenderError, match=rf"a\.jpg: {told}.*, expected PNG, JPG.*; save it as PNG \(linear"):
         read_picture(tmp_path / "a.jpg")
+
+
+def test_what_cannot_be_opened_is_told_in_words(tmp_path: Path) -> None:
+    """A folder here; a file without permission fails likewise."""
+    with pytest.raises(UnirenderError, match=r"not a readable picture \(.*, expected PNG, JPG"):
+        open_picture(tmp_path)
 
 
 def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:

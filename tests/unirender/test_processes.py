@@ -214,11 +214,12 @@ def test_processes_that_were_told_different_things_are_refused(monkeypatch: pyte
     """Another rate would give each its own weights without a word, another length let one wait for the others."""
     monkeypatch.setattr(Processes, "gather", lambda self, value: [[], value])
 
-    def check(config: TrainConfig = TRAIN, steps: int = 9) -> None:
+    def check(config: TrainConfig = TRAIN, steps: int = 9, parallel: int = 1) -> None:
         run = RunConfig(tmp_path, steps=9)
         first = json.loads(json.dumps(dataclasses.asdict(TRAIN))), {n: getattr(run, n) for n in OF_ALL}
         monkeypatch.setattr(Processes, "share", lambda self, value: first)
-        told = SimpleNamespace(config=config, run=dataclasses.replace(run, steps=steps), processes=Processes(1, 2))
+        own = dataclasses.replace(run, steps=steps, parallel=parallel)
+        told = SimpleNamespace(config=config, run=own, processes=Processes(1, 2))
         check_alike(told)  # pyright: ignore[reportArgumentType] - all that it looks at
 
     check()
@@ -227,6 +228,8 @@ def test_processes_that_were_told_different_things_are_refused(monkeypatch: pyte
         check(dataclasses.replace(TRAIN, optimizer=faster))
     with pytest.raises(UnirenderError, match="process 0 of 2 was started with steps 9 instead of 7"):
         check(steps=7)
+    with pytest.raises(UnirenderError, match="parallel 1 instead of 4"):  # by which each draws seeds for the parts
+        check(parallel=4)
 
 
 def test_a_shard_that_one_machine_lacks_is_told_as_such(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

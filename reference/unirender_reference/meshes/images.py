@@ -12,13 +12,12 @@ from PIL import Image, UnidentifiedImageError
 
 from unirender.color import eight_bits
 from unirender.errors import UnirenderError
-from unirender.sixteen_bits import BITS_PER_SAMPLE, as_stored, misread, white_is_zero
+from unirender.sixteen_bits import BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED, as_stored, misread, white_is_zero
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
 _LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
-SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and a value of it
 STRIP = 500_000  # stored pixels made float at a time
 SLACK = 1e-3  # by which floats may miss [0, 1]: rounding, resampling
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from unirender.training.trainer import Trainer
 
 OF_A_STATE = ("config", "step", "seconds", "model", "ema", "optimizer", "generator", "source")  # of every version
-OF_ALL = ("steps", "minutes", "log_every")  # entries of the run's configuration by which all processes act
+OF_ALL = ("steps", "minutes", "log_every", "parallel", "accumulate")  # entries of the run by which all processes act
 
 
 def state_of(trainer: "Trainer", source: BatchSource) -> dict[str, Any]:
