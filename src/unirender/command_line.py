@@ -97,7 +97,8 @@ def _unknown_words(command: Any, argv: Sequence[str], unknown: Sequence[str], pr
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
         tyro.cli(type(command if nested is None else nested), args=["--help"])
-    known = sorted(set(OPTION.findall(printed.getvalue())))
+    heads = [line[2:].split("  ")[0] for line in printed.getvalue().splitlines() if line[2:3] == "-"]  # not the prose
+    known = sorted(set(OPTION.findall(" ".join(heads))))
     near = dict.fromkeys(match for option in options for match in difflib.get_close_matches(option, known, n=2))
     meant = f"; did you mean {' or '.join(near)}?" if near else ";"
     wrong = "no option of" if options else "not expected by"

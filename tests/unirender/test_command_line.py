@@ -45,6 +45,11 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
             "--objcts, --zzzzzzzz: no option of `unirender bench race`; did you mean --objects or --out? "
             "`unirender bench race --help` lists what it takes",
         ),
+        (  # its help names `unirender bench run --out`
+            ["bench", "report", "x", "--out", "y"],
+            "--out: no option of `unirender bench report`; did you mean --suite? "
+            "`unirender bench report --help` lists what it takes",
+        ),
         (["doctor", "now"], "now: not expected by `unirender doctor`; `unirender doctor --help` lists what it takes"),
         (["optimize", "x", "--out", "y", "--shape.cells", "0"], "--shape.cells 0: expected 8 or more"),
         (["bench", "unknown-mesh", "--shape.depth", "1"], "--shape.depth 1: expected 2 or more"),
