@@ -64,7 +64,11 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
             return ImageOps.exif_transpose(file)
     except UnirenderError:
         raise
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError) as error:
+    except Image.DecompressionBombError as error:  # so many that Pillow does not open it; its message says how many
+        raise UnirenderError(
+            f"{path}: too many pixels ({error}), expected at most {MAX_PIXELS:,}; scale it down first"
+        ) from error
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
         raise UnirenderError(
             f"{path}: {_unreadable(Path(path), error)}, expected {FORMATS}; save it as PNG (linear radiance as EXR)"
         ) from error

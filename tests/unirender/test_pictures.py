@@ -440,6 +440,19 @@ def test_a_picture_bomb_is_refused(tmp_path: Path) -> None:
         read_picture(tmp_path / "bomb.png")
 
 
+def test_so_many_pixels_that_pillow_does_not_open_them_are_told(tmp_path: Path) -> None:
+    """20,000 squared, by the header alone."""
+    Image.new("L", (1, 1)).save(tmp_path / "a.png")
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[16:24] = struct.pack(">2I", 20_000, 20_000)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(
+        UnirenderError, match=r"a\.png: too many pixels \(.*400000000 .*at most 100,000,000; scale it down"
+    ):
+        read_picture(tmp_path / "a.png")
+
+
 def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
