@@ -112,6 +112,7 @@ def test_tables_show_objects_their_mean_and_the_aims(what: UnknownMesh, record: 
         "low": None,
         "high": None,
         "n": 1,
+        "objects": 1,
     }
     assert [aim["bound"] for aim in content["aims"]] == [0.97, 0.93, 600]
 
