@@ -23,7 +23,13 @@ from unirender.training.trainer import Trainer
 from unirender_evaluation.studies.speed import network
 from unirender_evaluation.studies.speed.bare import BarePasses, Rows, cut_batch
 from unirender_evaluation.studies.speed.command import BenchSpeed
-from unirender_evaluation.studies.speed.mitsuba import EqualQuality, equal_quality, fewest_samples, mitsuba_table
+from unirender_evaluation.studies.speed.mitsuba import (
+    EqualQuality,
+    equal_quality,
+    fewest_samples,
+    is_sample_count,
+    mitsuba_table,
+)
 from unirender_evaluation.studies.speed.overfit import (
     Point,
     as_intrinsics,
@@ -41,6 +47,7 @@ from unirender_evaluation.studies.speed.timing import Part, Timing, medians, sid
 from unirender_evaluation.studies.speed.training import throughput, training_table
 from unirender_evaluation.suites import Suite
 from unirender_evaluation.table_text import TextTable
+from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
 
 CPU = torch.device("cpu")
 PLAIN = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="none"))
@@ -120,13 +127,26 @@ def test_mitsuba_gets_no_more_samples_than_it_needs() -> None:
         tried.append(spp)
         return 20 + 10 * math.log10(spp)
 
-    assert fewest_samples(psnr_at, 31.0, 64) == (13, pytest.approx(31.14, abs=0.01))
+    def any_count(spp: int) -> bool:
+        return spp > 0
+
+    assert fewest_samples(psnr_at, 31.0, 64, any_count) == (13, pytest.approx(31.14, abs=0.01))
     assert tried == [1, 2, 4, 8, 16, 12, 14, 13]
-    spp, reached = fewest_samples(psnr_at, 60.2, 1 << 14) or (0, 0.0)
+    spp, reached = fewest_samples(psnr_at, 60.2, 1 << 14, any_count) or (0, 0.0)
     assert 60.2 <= reached < 60.2 + 10 * math.log10(17 / 16)
     assert 10472 <= spp < 10472 * 17 / 16
-    assert fewest_samples(psnr_at, 20.0, 64) == (1, 20.0)
-    assert fewest_samples(psnr_at, 39.0, 64) is None
+    assert fewest_samples(psnr_at, 20.0, 64, any_count) == (1, 20.0)
+    assert fewest_samples(psnr_at, 39.0, 64, any_count) is None
+    even = fewest_samples(psnr_at, 31.0, 64, lambda spp: spp % 2 == 0)
+    assert even == (14, pytest.approx(31.46, abs=0.01))
+
+
+def test_only_sample_counts_that_render_are_tried() -> None:
+    """22 in one batch are no few full grids."""
+    allowed = [spp for spp in range(1, 300) if is_sample_count(spp, 64)]
+    assert 22 not in allowed
+    assert {1 << power for power in range(9)} <= set(allowed)
+    assert len([pass_count(spp, 1, SAMPLES_PER_PASS // 64**2) for spp in allowed]) > 50  # none is refused
 
 
 def test_mitsuba_is_timed_on_the_scene_of_the_suite(suite: Suite) -> None:

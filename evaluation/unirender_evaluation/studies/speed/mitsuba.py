@@ -66,26 +66,38 @@ class EqualQuality:
         return None if self.loading_s is None else self.loading_s / self.model_s
 
 
-def fewest_samples(psnr_at: Callable[[int], float], target: float, most: int) -> tuple[int, float] | None:
+def fewest_samples(
+    psnr_at: Callable[[int], float], target: float, most: int, can_be: Callable[[int], bool]
+) -> tuple[int, float] | None:
     """The fewest samples per pixel whose PSNR is at least the target, to a `NEAR`th of them, and that PSNR.
 
     Args:
         psnr_at: PSNR in dB of a picture with that many samples.
         target: dB.
         most: samples that are tried; None is returned if they are too few.
+        can_be: whether a picture can have that many; powers of two are taken to be.
     """
     spp, below = 1, 0
     while (found := psnr_at(spp)) < target:
         below, spp = spp, 2 * spp
         if spp > most:
             return None
-    while spp - below > max(1, spp // NEAR):
-        middle = (below + spp) // 2
-        if (between := psnr_at(middle)) >= target:
-            spp, found = middle, between
+    between = [count for count in range(below + 1, spp) if can_be(count)]
+    while between and spp - below > max(1, spp // NEAR):
+        middle = between[len(between) // 2]
+        if (psnr := psnr_at(middle)) >= target:
+            spp, found = middle, psnr
         else:
             below = middle
+        between = [count for count in between if below < count < spp]
     return spp, found
+
+
+def is_sample_count(spp: int, resolution: int) -> bool:
+    """Whether a picture of that many pixels a side can be rendered with so many samples per pixel in one batch."""
+    from unirender_reference.passes import SAMPLES_PER_PASS, next_spp
+
+    return next_spp(spp, 1, SAMPLES_PER_PASS // resolution**2) == spp
 
 
 def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most: int = MOST_SPP) -> list[EqualQuality]:
@@ -112,12 +124,15 @@ def equal_quality(pipeline: Any, suite: Suite, scene: Scene, repeats: int, most:
     def psnr(image: Any) -> float:
         return score_image(image, truth, mask)[metric_key("relit", "psnr", DEFAULT_VARIANT)]
 
+    def can_be(spp: int) -> bool:
+        return is_sample_count(spp, suite.spec.resolution)
+
     renderer, found = load(), []
     for given, missing in GIVEN.items():
         known = maps.replace(**dict.fromkeys(missing))
         target = psnr(model(known))
         model_s = timed(lambda known=known: model(known), repeats).median
-        reached = fewest_samples(lambda spp: psnr(render(renderer, spp)), target, most)
+        reached = fewest_samples(lambda spp: psnr(render(renderer, spp)), target, most, can_be)
         spp, reached_psnr = reached or (None, None)
         warm = loading = None
         if spp is not None:
