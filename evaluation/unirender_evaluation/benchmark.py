@@ -41,6 +41,7 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo, write_csv,
 from unirender_evaluation.report_run import report_run
 from unirender_evaluation.results_data import NAME as RESULTS
 from unirender_evaluation.results_file import write_results
+from unirender_evaluation.results_lights import sample_lights
 from unirender_evaluation.rows import Row
 from unirender_evaluation.run_check import CheckRequest, reference_row, run_check
 from unirender_evaluation.run_folder import (
@@ -115,11 +116,12 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     write_run(config.out / "run.json", info)
     write_csv(config.out / "records.csv", records)
     tables = build_tables(records, info, ALL_TABLES, config.variants)
-    verdict = verdict_text(records, info, check)
+    lights = sample_lights(suite)
+    verdict = verdict_text(records, info, check, lights)
     result = BenchResult(tuple(records), info, tuple(tables), verdict, check, len({r.key for r in records} - before))
     write_outputs(config.out, result)
     report_run(config.out, suite, info, records, tables)
-    write_results(config.out / RESULTS, info, records)
+    write_results(config.out / RESULTS, info, records, lights)
     return result
 
 

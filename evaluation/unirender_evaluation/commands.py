@@ -10,7 +10,14 @@ from unirender.option_checks import at_least
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
 from unirender_evaluation.physics.command import BenchPhysics
 from unirender_evaluation.public.command import BenchPublic
-from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
+from unirender_evaluation.results_commands import (
+    BenchCompare,
+    BenchLs,
+    BenchTables,
+    BenchValidate,
+    BenchVerdict,
+    asked_variants,
+)
 from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.shard_scores_command import BenchShards
 from unirender_evaluation.studies.derived_light.command import BenchDerivedLight
@@ -94,6 +101,7 @@ class Bench:
             | Annotated[BenchPublic, tyro.conf.subcommand("public")]
             | Annotated[BenchTables, tyro.conf.subcommand("tables")]
             | Annotated[BenchValidate, tyro.conf.subcommand("validate")]
+            | Annotated[BenchVerdict, tyro.conf.subcommand("verdict")]
             | Annotated[BenchCrosscheck, tyro.conf.subcommand("crosscheck")]
             | Annotated[BenchDerivedLight, tyro.conf.subcommand("derived-light")]
             | Annotated[BenchIngredients, tyro.conf.subcommand("ingredients")]

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.results_data import Lights
 from unirender_evaluation.specs import Column, TableSpec
-from unirender_evaluation.statistics import Estimate, beats, paired_difference
+from unirender_evaluation.statistics import Estimate, beats, crossed_estimate, paired_difference
 
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
 OTHERS = ("trivial", "baseline", "optimisation")  # kinds of rows that ours are held against
@@ -68,6 +69,35 @@ def values_by_method(records: Iterable[Record], key: str) -> dict[str, dict[str,
         if key in record.values:
             found.setdefault(record.method, {})[record.sample] = record.values[key]
     return found
+
+
+def over_lights(values: Mapping[str, float], records: Iterable[Record], lights: Lights) -> Estimate:
+    """Mean of values by sample, with its interval over objects and lights.
+
+    Args:
+        values: of some samples; inf allowed, NaN not.
+        records: of these samples, and of others.
+        lights: of these samples, and of others.
+
+    Raises:
+        UnirenderError: there are no values, or the lights of a sample are not named.
+    """
+    if unnamed := sorted(values.keys() - lights.keys()):
+        raise UnirenderError(
+            f"interval over objects and lights: the lights of {unnamed[0]!r} and {len(unnamed) - 1} more samples are "
+            "not named; `python -m unirender_evaluation.results_lights SUITE results.json` names them"
+        )
+    objects = {record.sample: record.object for record in records}
+    return crossed_estimate(
+        list(values.values()), [objects[sample] for sample in values], [lights[sample] for sample in values]
+    )
+
+
+def difference_over_lights(records: Sequence[Record], key: str, a: str, b: str, lights: Lights) -> Estimate:
+    """Mean of a - b over the samples that both have, with its interval over objects and lights. `records` is one
+    `Selection`; raises as `over_lights` does."""
+    of_a, of_b = values_of(records, a, key), values_of(records, b, key)
+    return over_lights({s: of_a[s] - of_b[s] for s in sorted(of_a.keys() & of_b.keys())}, records, lights)
 
 
 def exact_fit(key: str, value: float) -> bool:

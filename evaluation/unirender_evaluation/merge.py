@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import agree
 from unirender_evaluation.protocol import doubts
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results_data import Results
+from unirender_evaluation.results_data import Lights, Results
 from unirender_evaluation.rows import slug
 
 Sample = tuple[str, str, str, str]  # table, protocol, subset, sample
@@ -134,6 +134,11 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
     # In the order of a run's own records, on which the draws of intervals depend.
     merged.sort(key=lambda r: (r.table, r.protocol, r.method, r.sample))
     return _merged_run([file.run for file in files], methods), merged
+
+
+def merged_lights(files: Sequence[Results]) -> Lights:
+    """The lights of the samples of all files, which are of one suite."""
+    return {sample: names for file in files for sample, names in file.lights.items()}
 
 
 def _without(note: str, parts: Sequence[str]) -> str:

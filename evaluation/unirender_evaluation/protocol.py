@@ -8,7 +8,7 @@ from unirender_evaluation.metrics import FACING_AWAY, LPIPS_SCALES, OWN_MASK, TU
 from unirender_evaluation.published import taken_how
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.specs import Protocol
-from unirender_evaluation.statistics import CONFIDENCE, METHOD
+from unirender_evaluation.statistics import CONFIDENCE, CROSSED, METHOD
 
 SPACE_TEXT = {"srgb": "sRGB (clipped to [0, 1], then encoded)", "linear": "linear Rec.709, clipped to [0, 1]"}
 SCALE_TEXT = {
@@ -79,9 +79,10 @@ def protocol_line(
     methods: Sequence[MethodInfo],
     records: Sequence[Record],
     published_in: str | None,
+    over_lights: bool = False,
 ) -> tuple[tuple[str, str], ...]:
     """(what, value) pairs in the order in which they are printed; `published_in`: the table of the paper whose numbers
-    stand beside, None where none do."""
+    stand beside, None where none do; `over_lights`: whether intervals are over lights, too."""
     spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
     frame = [
@@ -101,7 +102,7 @@ def protocol_line(
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
         *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
-        ("interval", f"{CONFIDENCE:.0%} over objects, under these lights: {METHOD}"),
+        ("interval", CROSSED if over_lights else f"{CONFIDENCE:.0%} over objects, under these lights: {METHOD}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
         ("code", f"{run.code or '-'}, {run.date or '-'}{f' ({run.carried})' if run.carried else ''}"),

@@ -184,7 +184,7 @@ def standing_text(results: Results) -> str:
 
 def store(folder: Path, results: Results, tables: Sequence[Table]) -> None:
     """Every value, and one Markdown file per table, numbered in order; those of an earlier run with other tables go."""
-    write_results(folder / (NAME + PACKED), results.run, results.records)
+    write_results(folder / (NAME + PACKED), results.run, results.records, results.lights)
     names = [
         f"{number:02d}-{table.name}-{table.protocol_key}-{table.variant.mask}-{table.subset}.md"
         for number, table in enumerate(tables)

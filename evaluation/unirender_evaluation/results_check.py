@@ -35,6 +35,7 @@ def content_problems(results: Results) -> list[Problem]:
         *_gathered(results.records, _record_problems),
         *_gathered(results.records, _value_problems(results.run.lpips)),
         *_twice(results.records),
+        *_light_problems(results),
         *_strangers_to_the_suite(results),
     ]
 
@@ -46,6 +47,8 @@ def remarks(results: Results) -> list[str]:
         found.append(f"a partial run (--limit {run.limit}): its tables carry a watermark")
     else:
         found += _untold_part(results)
+    if not results.lights:
+        found.append("the lights of its samples are not named: what holds under other lights, it cannot tell")
     used = {record.method for record in results.records}
     idle = [info.key for info in run.methods if info.key not in used]
     if idle:
@@ -189,6 +192,14 @@ def _twice(records: Iterable[Record]) -> Iterator[Problem]:
             yield Problem(f"records[{i}].object", what)
 
 
+def _light_problems(results: Results) -> Iterator[Problem]:
+    """Where a file names the lights of samples, it does of all."""
+    for sample in sorted({record.sample for record in results.records}) if results.lights else ():
+        if not results.lights.get(sample):
+            what = f"names no light of the sample {sample!r}: name those of all samples, or leave the field out"
+            yield Problem("lights", what)
+
+
 def _suite_of(run: RunInfo) -> "Suite | None":
     """The very suite of a run with its truth; None where this installation does not have it."""
     from unirender_evaluation.suites import load_suite
@@ -230,16 +241,21 @@ def _strangers_to_the_suite(results: Results) -> list[Problem]:
     suite, run = _suite_of(results.run), results.run
     if suite is None:
         return []
+    from unirender_evaluation.results_lights import sample_lights
     from unirender_evaluation.task import PROTOCOLS as QUESTIONS
     from unirender_evaluation.tasks import tasks
 
     scenes = {scene.key: scene.object for scene in suite.scenes}
     names = {*scenes, *scenes.values()}
+    lights = sample_lights(suite)
     asked = {question: {task.sample for task in tasks(suite, *question, list(suite.scenes))} for question in QUESTIONS}
     wrong = []
     if run.resolution != suite.spec.resolution:
         what = f"got {run.resolution}, expected {suite.spec.resolution}: suite {run.suite!r} has pictures of that size"
         wrong.append(Problem("run.resolution", what))
+    for sample, own in results.lights.items():
+        if sample in lights and own != lights[sample]:
+            wrong.append(Problem(f"lights[{sample!r}]", f"got {own}, expected {lights[sample]}, those of the suite"))
 
     def check(record: Record) -> Iterator[tuple[str, str]]:
         found = _beginnings(record.sample) & names

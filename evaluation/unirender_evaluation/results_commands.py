@@ -1,4 +1,4 @@
-"""`unirender bench ls | validate | tables | compare`: what there is to run, and work on files of results.
+"""`unirender bench ls | validate | tables | verdict | compare`: what there is to run, and work on files of results.
 
 Light to import; each command loads what it needs when it runs. None of them measures anything.
 """
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from unirender_evaluation.metrics import Variant
     from unirender_evaluation.tables import Table
 
+Format = Literal["text", "markdown", "latex", "json"]
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
 
@@ -64,13 +65,15 @@ class BenchTables:
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """How numbers are taken: masked or whole, srgb or linear, raw, aligned or aligned_rgb, with - between
     (masked-linear), or all; repeatable. None: whole beside the published values, and masked."""
-    format: Literal["text", "markdown", "latex", "json"] = "text"
+    interval: Literal["objects", "objects-and-lights"] = "objects"
+    """What intervals count as drawn: objects, under the suite's lights; or lights, too, which several objects share."""
+    format: Format = "text"
     """What is printed."""
 
     def run(self) -> int:
         """Prints the tables; returns 1 where there is none."""
         some(self.files, "tables")
-        from unirender_evaluation.merge import merge
+        from unirender_evaluation.merge import merge, merged_lights
         from unirender_evaluation.results_file import read_results
         from unirender_evaluation.schema_check import did_you_mean
         from unirender_evaluation.table_list import ALL_TABLES
@@ -80,14 +83,39 @@ class BenchTables:
             if name not in ALL_TABLES:
                 raise UsageError(f"--table {name}: no such table{did_you_mean(name, ALL_TABLES)}")
         variants = asked_variants(self.variant)
-        run, records = merge([read_results(path) for path in self.files])
+        found = [read_results(path) for path in self.files]
+        run, records = merge(found)
         specs = {name: ALL_TABLES[name] for name in self.table or ALL_TABLES}
-        tables = build_tables(records, run, specs, variants)
+        lights = merged_lights(found) if self.interval == "objects-and-lights" else None
+        tables = build_tables(records, run, specs, variants, lights)
         if not tables:
             raise UnirenderError(
                 f"tables: the files have no values of {', '.join(specs)}; choose another --table, or none"
             )
         _print_tables(tables, self.format)
+        return 0
+
+
+@dataclass(frozen=True)
+class BenchVerdict:
+    """Print the verdict on results, of several files as one: which row beats which, over the objects of the suite under
+    its lights, and under other lights. Nothing is measured, and the truth is not checked.
+    """
+
+    files: Files
+    """`results.json`, packed by gzip or not, or folders of runs, of one suite."""
+    format: Format = "text"
+    """What is printed: the lines of `verdict.txt`, or a table or list of the claims."""
+
+    def run(self) -> int:
+        """Prints the verdict."""
+        some(self.files, "verdict")
+        from unirender_evaluation.merge import merge, merged_lights
+        from unirender_evaluation.results_file import read_results
+        from unirender_evaluation.results_verdict import VERDICTS
+
+        found = [read_results(path) for path in self.files]
+        print(VERDICTS[self.format](*merge(found), merged_lights(found)), end="")
         return 0
 
 

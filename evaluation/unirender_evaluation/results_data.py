@@ -1,7 +1,7 @@
 """What a results file holds: a run's description, its records, and what the numbers mean."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from unirender_evaluation.specs import PROTOCOLS
 from unirender_evaluation.table_list import ALL_METRICS
 
 NAME = "results.json"
+Lights = Mapping[str, tuple[str, ...]]  # sample -> the lights that its values depend on
 PACKED = ".gz"  # what the name of a file that gzip has packed ends in
 
 
@@ -24,12 +25,13 @@ class Definitions:
 
 @dataclass(frozen=True)
 class Results:
-    """A validated file. `source` is how the user named it."""
+    """A validated file. `source` is how the user named it; `lights` is empty of a file that does not name them."""
 
     run: RunInfo
     records: tuple[Record, ...]
     definitions: Definitions
     source: str
+    lights: Lights = field(default_factory=dict)
 
     @property
     def label(self) -> str:

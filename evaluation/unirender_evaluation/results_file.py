@@ -4,6 +4,7 @@
     schema        version of this layout
     run           suite, hashes, versions, one entry for each row of the tables (`records.RunInfo`)
     definitions   what each protocol gives a method, and each metric's formula and direction, as they were in the run
+    lights        the lights that each sample's values depend on, one a line; files of before December 2026 lack it
     records       every value of every row on every sample (`records.Record`), one a line
 
 `bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. One whose name ends in
@@ -31,7 +32,7 @@ from unirender_evaluation.records import (
     run_from_plain,
 )
 from unirender_evaluation.results_check import content_problems
-from unirender_evaluation.results_data import NAME, PACKED, Definitions, Results, definitions
+from unirender_evaluation.results_data import NAME, PACKED, Definitions, Lights, Results, definitions
 from unirender_evaluation.schema import FORMAT, json_schema
 from unirender_evaluation.schema_check import Problem, quoted, schema_problems
 
@@ -47,22 +48,34 @@ NEIGHBOURS = {
 }
 
 
-def write_results(path: Path, run: RunInfo, records: Sequence[Record]) -> None:
+def write_results(path: Path, run: RunInfo, records: Sequence[Record], lights: Lights | None = None) -> None:
     """Writes a file, atomically; packed, if the name ends in `.gz`.
+
+    Args:
+        path: of the file.
+        run: its description.
+        records: of the run.
+        lights: of the samples (`results_lights.sample_lights`), and of others, which are left out; None: not known.
 
     Raises:
         UnirenderError: it would not be valid; nothing is written.
     """
-    document = to_document(run, records, definitions(records))
+    samples = {record.sample for record in records}
+    kept = {sample: lights[sample] for sample in sorted(samples & lights.keys())} if lights else None
+    document = to_document(run, records, definitions(records), kept)
     from_document(document, str(path))
     lines = [json.dumps(record, sort_keys=True, allow_nan=False) for record in document.pop("records")]
+    named = [f"{json.dumps(sample)}: {json.dumps(names)}" for sample, names in document.pop("lights", {}).items()]
     head = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False).removesuffix("\n}")
-    text = head + ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
+    text = head + (',\n "lights": {\n  ' + ",\n  ".join(named) + "\n }" if named else "")
+    text += ',\n "records": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
     replace_file(path, gzip.compress(text.encode(), mtime=0) if path.suffix == PACKED else text)
 
 
-def to_document(run: RunInfo, records: Sequence[Record], meaning: Definitions) -> dict[str, Any]:
-    """The JSON document of a run."""
+def to_document(
+    run: RunInfo, records: Sequence[Record], meaning: Definitions, lights: Lights | None = None
+) -> dict[str, Any]:
+    """The JSON document of a run; without `lights` where none are known."""
     described = json.loads(json.dumps(asdict(run), allow_nan=False))  # tuples become lists, as in a file
     described.pop("schema")
     return {
@@ -70,6 +83,7 @@ def to_document(run: RunInfo, records: Sequence[Record], meaning: Definitions) -
         "schema": SCHEMA_VERSION,
         "run": described,
         "definitions": asdict(meaning),
+        **({"lights": {sample: list(names) for sample, names in lights.items()}} if lights else {}),
         "records": [record.to_plain() for record in records],
     }
 
@@ -139,7 +153,8 @@ def inspect_document(document: Any, source: str) -> tuple[Results | None, list[P
         return None, problems
     meaning = Definitions(document["definitions"]["protocols"], document["definitions"]["metrics"])
     records = tuple(map(Record.from_plain, document["records"]))
-    results = Results(run_from_plain(document["run"]), records, meaning, source)
+    lights = {sample: tuple(names) for sample, names in document.get("lights", {}).items()}
+    results = Results(run_from_plain(document["run"]), records, meaning, source, lights)
     return results, content_problems(results)
 
 

@@ -1,67 +1,68 @@
-"""Paired differences with lights as draws, too: whether a result would stand under other lights than the suite's."""
+"""Under which lights each sample of a suite is: what an interval over objects and lights is made from.
 
-from collections.abc import Mapping, Sequence
+Files that `bench run` wrote before it named them get theirs from the suite, and stay as they are otherwise:
+
+    python -m unirender_evaluation.results_lights SUITE results.json ...
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import Selection, compare, values_of
-from unirender_evaluation.results_data import Results
-from unirender_evaluation.results_findings import NOT_RUN, Question, label_of, markdown_table
-from unirender_evaluation.statistics import crossed_interval
-from unirender_evaluation.suites import Suite
-
-_TO = "_to_"  # between the scene whose picture is relit and the name of its object's other light
+from unirender_evaluation.results_data import Lights, Results
+from unirender_evaluation.results_file import read_results, write_results
+from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
 
 
-def scene_lights(suite: Suite) -> dict[str, str]:
-    """Scene -> its light, as `over_lights` wants it."""
-    return {scene.key: scene.light for scene in suite.scenes}
+def sample_lights(suite: Suite) -> Lights:
+    """The lights that the values of each sample depend on: that of its scene; then that of the target of a relighting.
+
+    What is asked of a scene as a whole (many views, physics) is named as the scene, and relights it as well.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for scene in suite.scenes:
+        found[scene.key] = (scene.light, suite.other_light(scene).light)
+    for question in PROTOCOLS:
+        for task in tasks(suite, *question, list(suite.scenes)):
+            target = (suite.other_light(task.scene).light,) if question[0] == "relighting" else ()
+            found[task.sample] = (task.scene.light, *target)
+    return found
 
 
-def over_lights(results: Results, questions: Sequence[Question], lights: Mapping[str, str]) -> str:
-    """A table with a line for each question: the difference with its interval over objects, and over both.
-
-    Args:
-        results: a run's.
-        questions: rows `a` and `b` of each.
-        lights: scene -> light, of the run's suite. A relit picture counts for the light that it is relit by; of an
-            object seen from many sides, for the one that it was seen under.
+def with_lights(results: Results, suite: Suite) -> Results:
+    """Results with the lights of their samples.
 
     Raises:
-        UnirenderError: a sample belongs to no scene of `lights`.
+        UnirenderError: they are of another suite, or of other truth.
     """
-    head = ["", "A", "B", "A - B", "over objects", "over objects and lights", "pairs (objects, lights)"]
-    return markdown_table(head, [_line(results, question, lights) for question in questions], left=3)
-
-
-def _line(results: Results, question: Question, lights: Mapping[str, str]) -> list[str]:
-    labels = [label_of(results, key) for key in (question.a, question.b)]
-    records = Selection(question.table, question.protocol).of(results.records)
-    a, b = (values_of(records, key, question.key) for key in (question.a, question.b))
-    shared = sorted(a.keys() & b.keys())
-    if not shared:
-        return [question.text, *labels, NOT_RUN, "", "", "0"]
-    found = compare(records, question.kind, question.key, question.a, question.b).difference
-    objects = {record.sample: record.object for record in records}
-    own = [light_of(sample, lights) for sample in shared]
-    crossed = crossed_interval([a[s] - b[s] for s in shared], [objects[s] for s in shared], own)
-    decimals = question.kind.decimals
-    intervals = [f"[{low:+.{decimals}f}, {high:+.{decimals}f}]" for low, high in ((found.low, found.high), crossed)]
-    counts = f"{found.n} ({found.clusters}, {len(set(own))})"
-    return [question.text, *labels, f"{found.mean:+.{decimals}f}", *intervals, counts]
-
-
-def light_of(sample: str, lights: Mapping[str, str]) -> str:
-    """The light under which a sample's answer is scored: that of its scene, or the one that it is relit by.
-
-    Raises:
-        UnirenderError: the sample belongs to no scene of `lights`.
-    """
-    scene = max((key for key in lights if f"{sample}_".startswith(f"{key}_")), key=len, default="")
-    rest = sample.removeprefix(scene)
-    if scene and rest.startswith(_TO):
-        scene = f"{scene.rpartition('_')[0]}_{rest.removeprefix(_TO)}"
-    if scene not in lights:
+    if results.run.suite_hash != suite.sha256:
         raise UnirenderError(
-            f"sample {sample!r} belongs to none of the {len(lights)} scenes, expected the suite that the results are of"
+            f"{results.source}: is of suite {results.run.suite} {results.run.suite_hash[:12]}, expected "
+            f"{suite.spec.name} {suite.sha256[:12]}"
         )
-    return lights[scene]
+    return replace(results, lights=sample_lights(suite))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry point; 0, or 1 with a line on standard error."""
+    if len(arguments) < 2:
+        print("usage: python -m unirender_evaluation.results_lights SUITE results.json ...", file=sys.stderr)
+        return 1
+    try:
+        suite = load_suite(arguments[0])
+        for path in map(Path, arguments[1:]):
+            results = with_lights(read_results(path), suite)
+            write_results(path, results.run, results.records, results.lights)
+            print(f"{path}: the lights of {len({record.sample for record in results.records})} samples")
+    except UnirenderError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -62,6 +62,7 @@ FIELDS: Mapping[str, Mapping[str, dict[str, Any]]] = {
         "mitsuba": {"description": "the version of Mitsuba that rendered the truth, or null"},
     },
 }
+LIGHTS = "the lights that the sample's values depend on: its scene's; where it is relit, then that it is relit by"
 VALUES = {
     "type": "object",
     "propertyNames": {"pattern": r"^[a-z0-9_]+\.[a-z0-9_]+(@[a-z_]+(-[a-z_]+)*)?$"},
@@ -88,25 +89,29 @@ def json_schema() -> dict[str, Any]:
     run = _of_dataclass(RunInfo)
     del run["properties"]["schema"]  # said once, at the top
     run["properties"]["methods"]["items"] = {"$ref": "#/$defs/method"}
+    lights = {"type": "array", "items": {"type": "string", **NAME}, "description": LIGHTS}
     backbones = [name.removeprefix("lpips_") for name in METRICS if name.startswith("lpips_")]
     run["properties"]["lpips"]["items"] = {"enum": backbones}
+    whole = _object(
+        {
+            "format": {"const": FORMAT},
+            "schema": {"const": SCHEMA_VERSION},
+            "run": {"$ref": "#/$defs/run"},
+            "definitions": _object(
+                {
+                    "protocols": {"type": "object", "additionalProperties": {"type": "string"}},
+                    "metrics": {"type": "object", "additionalProperties": metric},
+                }
+            ),
+            "lights": {"type": "object", "additionalProperties": lights},
+            "records": {"type": "array", "items": {"$ref": "#/$defs/record"}},
+        }
+    )
     return {
         "$schema": DIALECT,
         "title": "Results of a unirender benchmark run: its description and every per-sample value",
-        **_object(
-            {
-                "format": {"const": FORMAT},
-                "schema": {"const": SCHEMA_VERSION},
-                "run": {"$ref": "#/$defs/run"},
-                "definitions": _object(
-                    {
-                        "protocols": {"type": "object", "additionalProperties": {"type": "string"}},
-                        "metrics": {"type": "object", "additionalProperties": metric},
-                    }
-                ),
-                "records": {"type": "array", "items": {"$ref": "#/$defs/record"}},
-            }
-        ),
+        **whole,
+        "required": [name for name in whole["required"] if name != "lights"],  # which older files lack
         "$defs": {"method": _of_dataclass(MethodInfo), "record": record, "run": run},
     }
 

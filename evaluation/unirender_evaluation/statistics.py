@@ -13,25 +13,37 @@ reader nothing, so that a ± is printed from `FEWEST_PRINTED` objects on (`Estim
 "A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
 
 All of this is for the lights that the suite has: a light that several objects share is in every draw.
-`crossed_interval` counts lights as drawn, too.
+`crossed_estimate` counts lights as drawn, too.
 """
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 0
 FEW = 20  # objects below which the interval is Student's
+FEWEST_LIGHTS = 5  # from which on it is told what holds under others; Student's t is then 2.8 errors to each side
+LEAST_SEEN = 0.1  # of the variance that lights make, in residuals: what all samples share is in none
 FEWEST_PRINTED = 3  # objects from which on half of the interval is printed beside a number, with ±
 METHOD = f"bootstrap, {RESAMPLES} draws, seed {SEED}, or Student's t below {FEW}"  # as protocol lines say it
+CROSSED = f"{CONFIDENCE:.0%} over objects and lights, both as draws: two-way clusters, Student's t"
 INTERVAL = f"{CONFIDENCE:.0%} interval over objects ({METHOD})"  # as notes do
+UNTOLD = (
+    f"Numbers of one object, or under fewer than {FEWEST_LIGHTS} lights, have no ±: what they would be under others is "
+    "not told."
+)
 UNPRINTED = "Numbers of two objects have no ±: with one degree of freedom their interval says next to nothing."
 
 
@@ -119,49 +131,85 @@ def _ratio_variance(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"])
     return float(count / (count - 1) * np.square(residuals).sum() / sizes.sum() ** 2)
 
 
-def crossed_interval(
+def crossed_estimate(
     values: Sequence[float] | Float[np.ndarray, " n"],
-    objects: Sequence[Hashable],
-    lights: Sequence[Hashable],
+    objects: Sequence[str],
+    lights: Sequence[tuple[str, ...]],
     *,
     confidence: float = CONFIDENCE,
-) -> tuple[float, float]:
-    """Interval of the mean where objects and lights are both draws, and a light is shared by several objects.
+) -> Estimate:
+    """Mean with its interval where objects and lights are both draws: samples that share any of them go together.
 
     Student's, with one degree of freedom less than the rarer of the two has members. The variance is that over objects
-    plus that over lights less that over pairs of the two, which both have counted (Cameron, Gelbach and Miller 2011);
-    where that is below one of the first two, the larger of them.
+    plus that over lights less that of samples which share both, and which both have counted (Cameron, Gelbach and
+    Miller 2011); where that is below one of the first two, the larger of them. Lights of a sample that has two, in one
+    of whose places another sample has one of them, go together as well (dyads: Aronow, Samii and Assenova 2015).
 
     Args:
-        values: one finite number per sample.
+        values: one per sample; inf allowed (then there is no interval), NaN not.
         objects: of each sample.
-        lights: of each sample.
+        lights: of each sample, all that its value depends on, in their places: of a relit picture that of the input,
+            then that it is relit by.
         confidence: share of the interval.
 
     Returns:
-        Both ends; NaN with fewer than two objects or lights.
+        No interval (NaN) of fewer than two objects or `FEWEST_LIGHTS` lights, nor where nearly all samples share one.
 
     Raises:
-        UnirenderError: lengths differ, or a value is not finite.
+        UnirenderError: there are no values, one is NaN, or lengths differ.
     """
     from scipy.special import stdtrit
 
     x = np.asarray(values, dtype=np.float64)
-    if not len(x) == len(objects) == len(lights) or not np.isfinite(x).all():
+    if not 0 < len(x) == len(objects) == len(lights) or np.isnan(x).any():
         raise UnirenderError(
             f"mean over objects and lights: got {len(x)} values, {len(objects)} objects and {len(lights)} lights, "
-            "expected as many of each, and finite values"
+            "expected as many of each, at least one, and no NaN"
         )
-    pairs = list(zip(objects, lights, strict=True))
-    counts = [len(set(labels)) for labels in (objects, lights)]
-    if min(counts) < 2:
-        return math.nan, math.nan
-    over_objects, over_lights, over_pairs = (
-        _ratio_variance(*_cluster_sums(x, labels)) for labels in (objects, lights, pairs)
-    )
-    variance = max(over_objects + over_lights - over_pairs, over_objects, over_lights)
+    mean, counts = float(x.mean()), (len(set(objects)), light_count(lights))
+    terms = _light_terms(tuple(objects), tuple(lights)) if counts[0] > 1 and counts[1] >= FEWEST_LIGHTS else None
+    if terms is None or not np.isfinite(x).all():
+        return Estimate(mean, math.nan, math.nan, len(x), counts[0])
+    over_objects = _ratio_variance(*_cluster_sums(x, objects))
+    over_lights, over_both = (float((x - mean) @ (term @ (x - mean))) for term in terms)
+    variance = max(over_objects + over_lights - over_both, over_objects, over_lights)
     half = float(stdtrit(min(counts) - 1, (1 + confidence) / 2) * math.sqrt(variance))
-    return float(x.mean()) - half, float(x.mean()) + half
+    return Estimate(mean, mean - half, mean + half, len(x), counts[0])
+
+
+def light_count(lights: Sequence[tuple[str, ...]]) -> int:
+    """How many lights samples have: of those that have several each, the fewest in one place."""
+    return min(len(set(names)) for names in zip(*lights, strict=False))
+
+
+@lru_cache(maxsize=16)  # of all rows and metrics of a table
+def _light_terms(objects: tuple[str, ...], lights: tuple[tuple[str, ...], ...]) -> "list[csr_array] | None":
+    """Quadratic forms of residuals, (n, n): variance over lights, and of what lights and objects share; None: untold.
+
+    Each is scaled to be unbiased where samples differ by nothing but what it is over. With one light a sample, and as
+    many samples each, this is the usual k / (k - 1) of k lights.
+    """
+    of_object, of_light = _belongs([(name,) for name in objects]), _belongs(lights)
+    of_both = _belongs([tuple((name, light) for light in own) for name, own in zip(objects, lights, strict=True)])
+    share_light, n = (of_light @ of_light.T).sign(), len(objects)
+    terms = []
+    for members, shared in ((of_light, share_light), (of_both, share_light * (of_object @ of_object.T))):
+        sums, reach = members.sum(axis=0), shared @ members
+        true = np.square(sums).sum()  # times n^2: variance of the mean, if each cluster adds a draw of variance 1
+        seen = (members * reach).sum() - 2 / n * sums @ reach.sum(axis=0) + shared.sum() / n**2 * true
+        if seen < LEAST_SEEN * true:
+            return None
+        terms.append(shared * (true / seen / n**2))
+    return terms
+
+
+def _belongs(labels: Sequence[tuple[Hashable, ...]]) -> "csr_array":
+    """(n, k): 1 where a sample has a label."""
+    from scipy.sparse import csr_array
+
+    columns = {label: i for i, label in enumerate(dict.fromkeys(label for own in labels for label in own))}
+    where = sorted({(row, columns[label]) for row, own in enumerate(labels) for label in own})
+    return csr_array((np.ones(len(where)), tuple(zip(*where, strict=True))), shape=(len(labels), len(columns)))
 
 
 def _cluster_sums(

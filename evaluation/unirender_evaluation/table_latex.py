@@ -48,32 +48,32 @@ def to_latex(table: Table) -> str:
         start += span
     second, third = ["Method"], [""]
     for column in table.columns:
-        name = _tex(_named(column.metric)) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
+        name = tex_text(_named(column.metric)) + (r"$\uparrow$" if column.metric.higher_is_better else r"$\downarrow$")
         second.append(rf"\multicolumn{{2}}{{c}}{{{name}}}" if doubled[id(column)] else name)
         third += ["paper", "here"] if doubled[id(column)] else [""]
     lines = [
         r"\begin{table*}[t]",
         r"\centering",
         r"\setlength{\belowcaptionskip}{4pt}",
-        rf"\caption{{\textbf{{{_tex(table.heading)}.}}{_tex_watermark(table)}}}",
+        rf"\caption{{\textbf{{{tex_text(table.heading)}.}}{_tex_watermark(table)}}}",
         rf"\label{{tab:{table.name}-{table.protocol_key}-{table.variant.label}}}",
         r"\setlength{\tabcolsep}{4pt}",
         r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
         rf"\begin{{tabular}}{{l{'c' * (start - 2)}}}",
         r"\toprule",
     ]
-    lines += [_tex_row(top), "".join(rules), _tex_row(second)]
-    lines += [_tex_row(third)] if any(doubled.values()) else []
+    lines += [tex_row(top), "".join(rules), tex_row(second)]
+    lines += [tex_row(third)] if any(doubled.values()) else []
     for _, rows in groupby(table.rows, key=lambda row: row.section):
-        lines += [r"\midrule", *(_tex_row(_latex_cells(row, table)) for row in rows)]
+        lines += [r"\midrule", *(tex_row(_latex_cells(row, table)) for row in rows)]
     lines += [r"\bottomrule", r"\end{tabular}}"]
     lines += [r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {_tex_below(table)}}}"]
     text = "\n".join([*lines, r"\end{table*}"]) + "\n"
-    return _tex_needs(text) + text
+    return tex_needs(text) + text
 
 
 def _latex_cells(row: Row, table: Table) -> list[str]:
-    texts, counts = [_tex(row_label(row, table))], cell_counts(table.rows, row)
+    texts, counts = [tex_text(row_label(row, table))], cell_counts(table.rows, row)
     for i, (column, cell, doubled) in enumerate(row_cells(row, table)):
         digits = column.metric.decimals
         if doubled:
@@ -96,18 +96,18 @@ def _named(metric: Metric) -> str:
 
 def _tex_stacked(text: str, width: int) -> str:
     """The text in as many lines as it needs where one has `width` letters."""
-    lines = [_tex(line) for line in textwrap.wrap(text, width, break_long_words=False)]
+    lines = [tex_text(line) for line in textwrap.wrap(text, width, break_long_words=False)]
     stacked = r" \\ ".join(lines)
     return rf"\shortstack{{{stacked}}}" if len(lines) > 1 else stacked
 
 
 def _tex_watermark(table: Table) -> str:
-    return rf" \textbf{{{_tex(table.watermark)}.}}" if table.watermark else ""
+    return rf" \textbf{{{tex_text(table.watermark)}.}}" if table.watermark else ""
 
 
 def _tex_below(table: Table) -> str:
     """Protocol and notes, each a sentence."""
-    return " ".join(_tex(f"{text.rstrip('.')}.") for text in (protocol_text(table.protocol), *table.notes))
+    return " ".join(tex_text(f"{text.rstrip('.')}.") for text in (protocol_text(table.protocol), *table.notes))
 
 
 def _tex_rank(text: str, rank: int | None) -> str:
@@ -144,11 +144,12 @@ _TEX = str.maketrans(
 )
 
 
-def _tex(text: str) -> str:
+def tex_text(text: str) -> str:
+    """A text as TeX shows it as it is."""
     return unicodedata.normalize("NFC", text).translate(_TEX).replace("--", "-{}-")
 
 
-def _tex_needs(text: str) -> str:
+def tex_needs(text: str) -> str:
     """The comment above a table: what compiles it."""
     lines = [r"% Needs \usepackage{booktabs,graphicx}."]
     strange = sorted({character for character in text if _is_strange(character)})
@@ -162,7 +163,7 @@ def _is_strange(character: str) -> bool:
     return character in TEX_LACKS or (ord(character) > LATIN and character not in TEX_HAS)
 
 
-def _tex_row(texts: Iterable[str]) -> str:
+def tex_row(texts: Iterable[str]) -> str:
     """A row; what it begins with is no option of the command before it, as [ and * would be."""
     line = " & ".join(texts)
     return ("{}" if line.startswith(("[", "*")) else "") + line + r" \\"

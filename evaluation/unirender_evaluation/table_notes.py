@@ -8,7 +8,7 @@ from unirender_evaluation.comparisons import exact_fit, values_of
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record
 from unirender_evaluation.specs import TableSpec
-from unirender_evaluation.statistics import unprinted_note
+from unirender_evaluation.statistics import UNTOLD, unprinted_note
 from unirender_evaluation.table_counts import cell_counts, label_n
 
 NAMED = (
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from unirender_evaluation.tables import Row
 
 
-def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant) -> tuple[str, ...]:
+def table_notes(
+    spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant, over_lights: bool = False
+) -> tuple[str, ...]:
     """The notes, in their order.
 
     Args:
@@ -28,6 +30,7 @@ def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"
         records: behind it.
         rows: ranked.
         variant: how its numbers are taken.
+        over_lights: whether its intervals are over lights, too.
     """
     notes = [spec.description] if spec.description else []
     notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
@@ -36,7 +39,10 @@ def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"
     fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
     if fewer:
         notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
-    notes += unprinted_note(cell.measured for row in rows for cell in row.cells)
+    measured = [cell.measured for row in rows for cell in row.cells]
+    notes += unprinted_note(measured)
+    if over_lights and any(e and math.isfinite(e.mean) and math.isnan(e.half_width) for e in measured):
+        notes.append(UNTOLD)
     if any(cell.dagger for row in rows for cell in row.cells):
         notes.append(
             "† The published value is worse than what the constant 0.5 scores on materials that are spread evenly over "

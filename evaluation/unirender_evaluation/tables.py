@@ -8,13 +8,15 @@ so that "given" inputs can never stand beside them. Nothing is printed without i
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import Selection, exact_fit, values_of
+from unirender_evaluation.comparisons import Selection, exact_fit, over_lights, values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.protocol import protocol_line
 from unirender_evaluation.published import PublishedRow, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.results_data import Lights
 from unirender_evaluation.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
 from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.table_counts import short_cells
@@ -103,6 +105,7 @@ def build_table(
     protocol: str,
     variant: Variant = DEFAULT_VARIANT,
     subset: str = "main",
+    lights: Lights | None = None,
 ) -> Table:
     """Aggregates records to one table.
 
@@ -113,9 +116,11 @@ def build_table(
         protocol: key of `PROTOCOLS`. Published values appear only where it carries them, under `PUBLISHED_VARIANT`.
         variant: how numbers are taken, where a column does not pin it.
         subset: population.
+        lights: of all samples: intervals are over objects and lights. None: over objects.
 
     Raises:
-        UnirenderError: if the protocol is not one of the table's, or a record's method is not described in `run`.
+        UnirenderError: if the protocol is not one of the table's, a record's method is not described in `run`, or the
+            lights of a sample are asked for and not named.
     """
     if protocol not in spec.protocols:
         raise UnirenderError(f"table {spec.name!r}: got protocol {protocol!r}, expected one of {spec.protocols}")
@@ -125,7 +130,7 @@ def build_table(
     show_published = declared.published and variant == PUBLISHED_VARIANT and subset == "main"
     spec = _answered(spec, chosen, show_published)
     published_in = spec.name if show_published and spec.name in published_tables() else None
-    measured = {info.key: _measured_row(spec, chosen, run, info, variant) for info in methods}
+    measured = {info.key: _measured_row(spec, chosen, run, info, variant, lights) for info in methods}
     rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
     total = max((row.n for row in rows), default=0)
     rows = _rank(spec, rows, variant)
@@ -138,8 +143,8 @@ def build_table(
         variant=variant,
         columns=spec.columns,
         rows=tuple(rows),
-        protocol=protocol_line(declared, variant, run, methods, chosen, published_in),
-        notes=table_notes(spec, chosen, rows, variant),
+        protocol=protocol_line(declared, variant, run, methods, chosen, published_in, lights is not None),
+        notes=table_notes(spec, chosen, rows, variant, lights is not None),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
     )
@@ -150,6 +155,7 @@ def build_tables(
     run: RunInfo,
     specs: Mapping[str, TableSpec] | None = None,
     variants: Sequence[Variant] | None = None,
+    lights: Lights | None = None,
 ) -> list[Table]:
     """Every table, protocol and subset that has records.
 
@@ -160,6 +166,7 @@ def build_tables(
         variants: each table in each of these; where two differ only on axes that no column of a table has (as in the
             physics table), it appears once. None: masked, which is what we believe, and before it, where published
             values stand, the whole frame that they were taken on.
+        lights: as `build_table` takes them.
     """
     tables = []
     for spec in (TABLES if specs is None else specs).values():
@@ -171,7 +178,8 @@ def build_tables(
                 carries = PROTOCOLS[protocol].published and subset == "main"
                 usual = (PUBLISHED_VARIANT, DEFAULT_VARIANT) if carries else (DEFAULT_VARIANT,)
                 for variant in usual if variants is None else _telling(spec, variants):
-                    tables.append(build_table(spec, records, run, protocol=protocol, variant=variant, subset=subset))
+                    which: dict[str, Any] = {"protocol": protocol, "variant": variant, "subset": subset}
+                    tables.append(build_table(spec, records, run, **which, lights=lights))
     return tables
 
 
@@ -189,7 +197,9 @@ def _answered(spec: TableSpec, records: Sequence[Record], show_published: bool) 
     return dataclasses.replace(spec, columns=tuple(kept))
 
 
-def _measured_row(spec: TableSpec, records: Sequence[Record], run: RunInfo, info: MethodInfo, variant: Variant) -> Row:
+def _measured_row(
+    spec: TableSpec, records: Sequence[Record], run: RunInfo, info: MethodInfo, variant: Variant, lights: Lights | None
+) -> Row:
     objects = {record.sample: record.object for record in records}
     answered = {key.partition(".")[0] for record in records if record.method == info.key for key in record.values}
     cells, n = [], 0
@@ -199,7 +209,10 @@ def _measured_row(spec: TableSpec, records: Sequence[Record], run: RunInfo, info
         asked_for = column.metric.name.startswith("lpips_") and column.variant(variant).scale in LPIPS_SCALES
         missing = asked_for and backbone not in run.lpips
         if values:
-            estimate = mean_estimate(list(values.values()), [objects[sample] for sample in values])
+            if lights is None:
+                estimate = mean_estimate(list(values.values()), [objects[sample] for sample in values])
+            else:
+                estimate = over_lights(values, records, lights)
             cells.append(Cell(measured=estimate))
             n = max(n, estimate.n)
         else:

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
-from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
+from unirender_evaluation.comparisons import Comparison, Selection, compare, difference_over_lights, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import FEW, holm, paired_difference, paired_p_value
+from unirender_evaluation.results_data import Lights
+from unirender_evaluation.statistics import FEW, Estimate, holm, light_count, paired_difference, paired_p_value
 from unirender_evaluation.task import LIGHT
 
 
@@ -15,13 +16,21 @@ from unirender_evaluation.task import LIGHT
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
     stated, for one object, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
-    has this number, since a row may answer the easy ones alone."""
+    has this number, since a row may answer the easy ones alone. `over_lights`: the difference again, with its interval
+    over objects and lights; None where the lights of the samples, of which there are `lights`, are not known."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
     why: str = "not run "
     asked: int = 0
+    over_lights: Estimate | None = None
+    lights: int = 0
+
+    @property
+    def word(self) -> str:
+        """What a line of the verdict begins with, where something was compared."""
+        return "open" if self.is_open else {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
 
     @property
     def is_open(self) -> bool:
@@ -29,23 +38,58 @@ class Finding:
         found = self.comparison
         return self.holds is False and found is not None and not found.b_beats_a and found.difference.clusters < FEW
 
+    @property
+    def other_lights(self) -> str:
+        """What is known of the claim under other lights: holds, open, fails, stated; "not told" of too few lights;
+        empty where nothing is."""
+        found, compared = self.over_lights, self.comparison
+        if found is None or compared is None or not compared.decided:
+            return ""
+        if not math.isfinite(found.low):
+            return "not told"
+        if self.holds is None:
+            return "stated"
+        above, below = (found.low > 0, found.high < 0) if not compared.equal else (False, False)
+        if (above, below)[not self.claim.kind.higher_is_better]:
+            return "holds"
+        return "open" if not (above or below) and min(found.clusters, self.lights) < FEW else "fails"
+
+    @property
+    def times_as_wide(self) -> float:
+        """The interval over objects and lights against that over objects; NaN where one lacks, or has no width."""
+        own, both = self.comparison, self.over_lights
+        width = own.difference.half_width if own is not None else 0.0
+        return both.half_width / width if both is not None and width > 0 else math.nan
+
+    @property
+    def number(self) -> str:
+        """Which number it is about."""
+        c = self.claim
+        return f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}"
+
     def __str__(self) -> str:
         c = self.claim
         if self.comparison is None:
-            what = f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}"
-            return f"{self.why}{what}: {c.a} against {c.b}"
+            return f"{self.why}{self.number}: {c.a} against {c.b}"
         d = self.comparison.difference
-        sign = "open" if self.is_open else {True: "HOLDS", False: "FAILS", None: "stated"}[self.holds]
         unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
         interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""  # one object has none
         objects = f"{d.clusters} object{'s' * (d.clusters != 1)}"
         n = f"{d.n} of {self.asked}" if d.n < self.asked else f"{d.n}"
         return (
-            f"{sign:7s}{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}: "
-            f"{c.a} {self.comparison.verdict} {c.b}, "
-            f"difference {d.mean:+.4g} {interval}{unit} (n {n}, {objects}{remark})"
+            f"{self.word:7s}{self.number}: {c.a} {self.comparison.verdict} {c.b}, "
+            f"difference {d.mean:+.4g} {interval}{unit} (n {n}, {objects}{remark}){self._other_lights_text()}"
         )
+
+    def _other_lights_text(self) -> str:
+        word, found = self.other_lights, self.over_lights
+        if not word or found is None:
+            return ""
+        if word == "not told":
+            return f"; under other lights: not told by {self.lights} light{'s' * (self.lights != 1)}"
+        said = "" if word == "stated" else f"{word} "
+        return f"; under other lights: {said}[{found.low:+.4g}, {found.high:+.4g}]"
 
 
 def _scale(claim: Claim) -> str:
@@ -54,9 +98,11 @@ def _scale(claim: Claim) -> str:
     return "" if unsaid else f" ({claim.scale})"
 
 
-def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) -> list[Finding]:
+def findings(
+    records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS, lights: Lights | None = None
+) -> list[Finding]:
     """Every claim; without a comparison where its two rows share no sample, or where they are not to be compared: a
-    picture that is the truth to the bit has an infinite PSNR."""
+    picture that is the truth to the bit has an infinite PSNR. `lights`: of all samples, or None."""
     found = []
     for claim in claims:
         chosen = Selection(claim.table, claim.protocol).of(records)
@@ -66,7 +112,11 @@ def findings(records: Sequence[Record], claims: Sequence[Claim] = OUR_CLAIMS) ->
             comparison = compare(chosen, claim.kind, claim.key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
             asked = len({record.sample for record in chosen if claim.key in record.values})
-            found.append(Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked))
+            finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
+            if lights:
+                other = difference_over_lights(chosen, claim.key, claim.a, claim.b, lights)
+                finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
+            found.append(finding)
         else:
             found.append(Finding(claim, None, None, "infinite PSNR, not compared " if common else "not run "))
     return found
@@ -116,43 +166,78 @@ def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
     return breaches
 
 
-def verdict_text(records: Sequence[Record], run: RunInfo, check: dict) -> str:
-    """The verdict section: claims, ceiling, truth check; one line each."""
-    head = (
-        "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, under these "
-        "lights, each by itself"
-    )
-    lines = [f"Verdict on suite {run.suite} ({head})"]
-    found = findings(records, run_claims(records, run))
+UNNAMED = "what holds under other lights is not told: the lights of the samples are not named"
+HEAD = (
+    "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, under these lights, "
+    "each by itself; under other lights: over objects and lights, both as draws"
+)
+
+
+def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, lights: Lights | None = None) -> str:
+    """The verdict section: claims, ceiling, truth check; one line each.
+
+    Args:
+        records: of the run.
+        run: its description.
+        check: what the truth check found; None where that is not known.
+        lights: of the samples; without those of all, nothing is said of other lights.
+    """
+    lines = [f"Verdict on suite {run.suite} ({HEAD})"]
+    found = judged(records, run, lights)
     lines += [f"  {finding}" for finding in found]
-    lines += _corrected_lines(records, found)
+    lines += [f"  ({line})" for line in summary(records, found)]
     breaches = ceiling_breaches(records)
     lines += [f"  FAILS  {breach}" for breach in breaches] or [
         "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
     ]
-    lines += _truth_lines(check)
+    lines += _truth_lines(check) if check else ["  open   truth: what its check found stands in the run's verdict.txt"]
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def judged(records: Sequence[Record], run: RunInfo, lights: Lights | None) -> list[Finding]:
+    """The claims of a run; without the lights of all samples nothing is said of other lights."""
+    named = lights if lights and all(record.sample in lights for record in records) else None
+    return findings(records, run_claims(records, run), named)
+
+
+def summary(records: Sequence[Record], found: Sequence[Finding]) -> list[str]:
+    """How many of the claims that hold are certain together, and how many hold under other lights."""
+    return [*_corrected_lines(records, found), *_other_lights_lines(found)] if any(f.comparison for f in found) else []
 
 
 def _corrected_lines(records: Sequence[Record], found: Sequence[Finding]) -> list[str]:
     """How many of the claims that hold would do so if all claims were one question; nothing where none holds."""
     claimed = [finding for finding in found if finding.holds is not None]
     sure = holm([_p_value(records, finding.claim) for finding in claimed])
-    holding = [(f.claim, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
+    holding = [(f, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
     if not holding:
         return []
-    unsure = [
-        f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)} of {c.a} against {c.b}"
-        for c, certain in holding
-        if not certain
-    ]
+    unsure = [f"{f.number} of {f.claim.a} against {f.claim.b}" for f, certain in holding if not certain]
     but = f"; not {', '.join(unsure)}" if unsure else ""
     return [
-        f"  (of {len(holding)} claims that hold {len(holding) - len(unsure)} also do after Holm's correction for all "
-        f"{len(claimed)}, by Student's t over objects{but})"
+        f"of {len(holding)} claims that hold {len(holding) - len(unsure)} also do after Holm's correction for all "
+        f"{len(claimed)}, by Student's t over objects{but}"
     ]
+
+
+def _other_lights_lines(found: Sequence[Finding]) -> list[str]:
+    """How many of the claims that hold also do under other lights, and which do not; nothing where none holds."""
+    if all(finding.over_lights is None for finding in found):
+        return [UNNAMED]
+    holding = [finding for finding in found if finding.holds]
+    if not holding:
+        return []
+    named = {
+        word: [f"{f.number} of {f.claim.a} against {f.claim.b}" for f in holding if f.other_lights in words]
+        for word, words in (("not", ("open", "fails")), ("not told of", ("not told",)))
+    }
+    but = "".join(f"; {word} {', '.join(names)}" for word, names in named.items() if names)
+    also = sum(finding.other_lights == "holds" for finding in holding)
+    wider = sorted(ratio for finding in holding if math.isfinite(ratio := finding.times_as_wide))
+    grown = f"; their intervals are {wider[0]:.2f} to {wider[-1]:.2f} times as wide" if wider else ""
+    return [f"of {len(holding)} claims that hold {also} also do under other lights{but}{grown}"]
 
 
 def _p_value(records: Sequence[Record], claim: Claim) -> float:

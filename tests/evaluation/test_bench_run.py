@@ -22,6 +22,8 @@ from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import ALL_VARIANTS
 from unirender_evaluation.prediction_check import PredictionError
+from unirender_evaluation.results_file import read_results
+from unirender_evaluation.results_lights import sample_lights
 from unirender_evaluation.rows import make_row, trivial_rows
 from unirender_evaluation.run_command import BenchRun
 from unirender_evaluation.suites import Suite, load_suite
@@ -225,6 +227,9 @@ def test_run_end_to_end_and_again(
     assert "against noise-ceiling" not in first.verdict
     assert "noise-ceiling, difference" in first.verdict
     assert "ours" not in first.verdict
+    assert "under other lights: not told by 2 lights" in first.verdict
+    stored = read_results(out)
+    assert stored.lights == {s: own for s, own in sample_lights(tiny).items() if s in {r.sample for r in first.records}}
     with (out / "records.csv").open(newline="") as file:
         lines = [(row["method"], row["sample"], row["metric"], float(row["value"])) for row in csv.DictReader(file)]
     assert lines == [(r.method, r.sample, *item) for r in first.records for item in sorted(r.values.items())]

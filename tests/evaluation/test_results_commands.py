@@ -88,6 +88,41 @@ def test_tables_in_every_format(bench, files: tuple[Path, Path]) -> None:
     assert "Inverse rendering" in bench("tables", files[0])[1]
 
 
+def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Path]) -> None:
+    asked = ("tables", files[0], "--table", "relighting", "--format", "markdown")
+    assert "interval: 95% over objects, under these lights: bootstrap" in bench(*asked)[1]
+    status, out, _ = bench(*asked, "--interval", "objects-and-lights")
+    assert status == 0
+    assert "interval: 95% over objects and lights, both as draws: two-way clusters, Student's t" in out
+    assert "or under fewer than 5 lights, have no ±" in out
+    older = small_document()
+    del older["lights"]
+    path = written(files[0].with_name("older.json"), older)
+    status, out, err = bench("tables", path, "--interval", "objects-and-lights")
+    assert (status, out) == (1, "")
+    assert "samples are not named; `python -m unirender_evaluation.results_lights SUITE results.json` names them" in err
+
+
+def test_verdict_in_every_format(bench, files: tuple[Path, Path]) -> None:
+    status, out, _ = bench("verdict", files[0])
+    assert status == 0
+    claim = "HOLDS  inverse/single-image albedo PSNR: ours-mean beats input-as-albedo, difference +8 [+8, +8] dB"
+    assert f"{claim} (n 4, 2 objects); under other lights: not told by 4 lights" in out
+    assert "open   truth: what its check found stands in the run's verdict.txt" in out
+    made = json.loads(bench("verdict", files[0], "--format", "json")[1])
+    found = next(
+        c for c in made["claims"] if (c["quantity"], c["b"], c["scale"]) == ("albedo", "input-as-albedo", "raw")
+    )
+    assert found["other_lights"] == {"state": "not told", "lights": 4, "low": None, "high": None}
+    assert (found["state"], found["difference"], found["objects"]) == ("holds", 8, 2)
+    assert {c["state"] for c in made["claims"]} == {"holds", "not run"}
+    said = "| +8 dB | holds [+8, +8] | not told | 4 (2, 4) |"
+    assert said in bench("verdict", files[0], "--format", "markdown")[1].replace("\N{NO-BREAK SPACE}", " ")
+    latex = bench("verdict", files[0], "--format", "latex")[1]
+    assert r"ours-mean & input-as-albedo & +8 dB & holds [+8, +8] & not told & 4 (2, 4) \\" in latex
+    assert r"\end{table*}" in latex
+
+
 @pytest.mark.parametrize(
     ("words", "status", "said"),
     [

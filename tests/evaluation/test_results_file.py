@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from small_results import RUN, small_document, small_records, small_results, written
+from small_results import RUN, small_document, small_lights, small_records, small_results, written
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.records import write_records, write_run
 from unirender_evaluation.results_check import content_problems, remarks
 from unirender_evaluation.results_data import Results, definitions
 from unirender_evaluation.results_file import from_document, read_results, write_results
+from unirender_evaluation.results_lights import sample_lights
 from unirender_evaluation.suites import Scene, load_suite, material_key
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 
@@ -33,9 +34,9 @@ def test_what_is_written_comes_back(tmp_path: Path) -> None:
     path.parent.mkdir()
     records = small_records()
     records[0] = replace(records[0], values={PSNR: float("inf")}, seconds=0.25)
-    write_results(path, RUN, records)
+    write_results(path, RUN, records, {**small_lights(), "another": ("y",)})
     found = read_results(path)
-    assert (found.run, list(found.records)) == (RUN, records)
+    assert (found.run, list(found.records), found.lights) == (RUN, records, small_lights())
     assert found.label == "run"
     assert read_results(str(path)) == found
     assert read_results(path.parent) == replace(found, source=str(path.parent))
@@ -43,6 +44,7 @@ def test_what_is_written_comes_back(tmp_path: Path) -> None:
     assert found.definitions.protocols["single-image"] == "one image and its mask"
     lines = path.read_text().splitlines()
     assert sum('"sample"' in line for line in lines) == len(records)  # one a line
+    assert '  "ball-0_l0_to_x": ["ball-0_l0", "x"],' in lines
     assert "Infinity" not in path.read_text()
 
 
@@ -60,6 +62,14 @@ def test_the_folder_of_a_run_needs_no_file_of_results(tmp_path: Path) -> None:
     write_run(tmp_path / "run.json", RUN)
     write_records(tmp_path / "records.jsonl", small_records())
     assert list(read_results(tmp_path).records) == small_records()
+
+
+def test_a_file_that_names_no_lights_is_read_and_a_reader_told() -> None:
+    older = small_document()
+    del older["lights"]
+    found = from_document(older, "a.json")
+    assert found.lights == {}
+    assert remarks(found) == ["the lights of its samples are not named: what holds under other lights, it cannot tell"]
 
 
 def test_nothing_invalid_is_written(tmp_path: Path) -> None:
@@ -147,6 +157,9 @@ CONTRADICTIONS = {
     "twice": (lambda d: d["records"].append(d["records"][0]), r"records\[20\]: the same measurement as records\[0\]"),
     "rows twice": (lambda d: d["run"]["methods"].append(d["run"]["methods"][0]), "'ours-mean' occurs 2 times"),
     "changed": (definition("protocols", "single-image", "all"), "'single-image' is 'all' in the file, and 'one image"),
+    "unlit": (lambda d: d["lights"].pop("ball-0_l0"), "lights: names no light of the sample 'ball-0_l0'"),
+    "dark": (lambda d: d["lights"].update({"ball-0_l0": []}), "lights: names no light of the sample 'ball-0_l0'"),
+    "nameless": (lambda d: d["lights"].update({"ball-0_l0": [""]}), r"lights\['ball-0_l0'\]\[0\]: got ''"),
     "gone": (lambda d: d["definitions"]["metrics"].pop("psnr"), "definitions.metrics: 'psnr' is missing, but records"),
 }  # fmt: skip
 
@@ -203,13 +216,16 @@ def inverse_sample(scene: Scene) -> str:
 def test_samples_are_looked_up_in_the_suite_that_is_installed() -> None:
     suite = load_suite("tiny")
     scene, other = suite.scenes[0], suite.scenes[-1]
-    base = small_results(suite="tiny", suite_hash=suite.sha256, resolution=suite.spec.resolution)
+    base = replace(small_results(suite="tiny", suite_hash=suite.sha256, resolution=suite.spec.resolution), lights={})
 
-    def at(sample: str, owner: str) -> list[str]:
+    def at(sample: str, owner: str, **lights: tuple[str, ...]) -> list[str]:
         records = (replace(base.records[0], sample=sample, object=owner),)
-        return [str(problem) for problem in content_problems(replace(base, records=records))]
+        return [str(problem) for problem in content_problems(replace(base, records=records, lights=lights))]
 
     assert at(inverse_sample(scene), scene.object) == []
+    assert at(inverse_sample(scene), scene.object, **{inverse_sample(scene): (scene.light,)}) == []
+    (wrong,) = at(inverse_sample(scene), scene.object, **{inverse_sample(scene): ("sun",)})
+    assert wrong.endswith(f"got ('sun',), expected ('{scene.light}',), those of the suite")
     several = replace(base.records[0], table="multi-view", protocol="8-views", sample=scene.object, object=scene.object)
     assert not any("sample" in str(problem) for problem in content_problems(replace(base, records=(several,))))
     assert "suite 'tiny' has no sample" in at(f"{scene.key}_m010_r031", scene.object)[0], "not asked of that scene"
@@ -229,7 +245,7 @@ def of_tiny(scenes: Mapping[str, Sequence[Scene]], **changes: Any) -> Results:
         for method, shown in scenes.items()
         for scene in shown
     )
-    return replace(base, records=records, definitions=definitions(records))
+    return replace(base, records=records, definitions=definitions(records), lights=sample_lights(suite))
 
 
 def test_pictures_of_another_size_than_the_suites_are_refused() -> None:

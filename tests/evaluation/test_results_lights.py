@@ -1,29 +1,54 @@
-"""Differences over objects and lights: which light a sample counts for, and both intervals side by side."""
+"""The lights of samples: from the suite, into files that do not name them, and what is read from them."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from small_results import small_results
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results_findings import NOT_RUN, Question
-from unirender_evaluation.results_lights import light_of, over_lights
+from unirender_evaluation.comparisons import Selection, difference_over_lights, over_lights
+from unirender_evaluation.merge import merged_lights
+from unirender_evaluation.results_file import read_results, write_results
+from unirender_evaluation.results_lights import main, sample_lights, with_lights
+from unirender_evaluation.suites import load_suite, material_key
 
-LIGHTS = {"ball-0_l0": "sun", "ball-0_l1": "sky", "ball-1_l0": "sky", "ball-1_l1": "lamp", "ball-1_l0_l0": "moon"}
-
-
-def test_a_sample_counts_for_the_light_of_what_is_scored() -> None:
-    samples = ["ball-0_l0", "ball-0_l0_m050_r010", "ball-0_l0_to_l1", "ball-1_l1_to_l0", "ball-1_l0_l0_textured"]
-    assert [light_of(sample, LIGHTS) for sample in samples] == ["sun", "sun", "sky", "sky", "moon"]
-    for stranger in ("ball-0_l01", "cup_l0_m050_r010", "ball-0_l0_to_l7"):
-        with pytest.raises(UnirenderError, match=f"{stranger!r} belongs to none of the 5 scenes"):
-            light_of(stranger, LIGHTS)
+PSNR = "albedo.psnr@masked-srgb-raw"
 
 
-def test_both_intervals_stand_beside_the_difference() -> None:
-    asked = [
-        Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-mean", "input-as-albedo"),
-        Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-mean", "nobody"),
-    ]
-    line, other = over_lights(small_results(), asked, LIGHTS).splitlines()[2:]
-    cells = [cell.strip() for cell in line.replace("\N{NO-BREAK SPACE}", " ").strip("|").split("|")]
-    assert cells[1:] == ["Ours (mean)", "input as albedo", "+8.00", *["[+8.00, +8.00]"] * 2, "4 (2, 3)"]
-    assert NOT_RUN in other
+def test_a_sample_has_the_light_of_its_scene_and_that_which_it_is_relit_by() -> None:
+    suite = load_suite("tiny")
+    lights, first = sample_lights(suite), suite.scenes[0]
+    other = suite.other_light(first)
+    assert other.light != first.light
+    assert lights[f"{first.key}_{material_key(first.materials[0])}"] == (first.light,)
+    assert lights[f"{first.key}_to_{other.key.rpartition('_')[2]}"] == (first.light, other.light)
+    assert lights[other.key] == (other.light, first.light), "what is asked of a scene as a whole relights it, too"
+
+
+def test_a_file_without_lights_gets_those_of_its_suite_and_stays_as_it_is_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite = load_suite("tiny")
+    scene, path = suite.scenes[0], tmp_path / "results.json"
+    of_tiny = small_results(suite="tiny", suite_hash=suite.sha256, resolution=64, methods=("ours-mean",))
+    record = replace(of_tiny.records[0], sample=f"{scene.key}_{material_key(scene.materials[0])}", object=scene.object)
+    write_results(path, of_tiny.run, [record])
+    before = read_results(path)
+    assert before.lights == {}
+    assert main(["tiny", str(path)]) == 0
+    assert read_results(path) == replace(before, lights={record.sample: (scene.light,)})
+    assert capsys.readouterr().out == f"{path}: the lights of 1 samples\n"
+    with pytest.raises(UnirenderError, match="is of suite ball 0123456789ab, expected tiny"):
+        with_lights(small_results(), suite)
+    assert (main(["tiny"]), main(["tiny", str(tmp_path / "gone.json")])) == (1, 1)
+    assert "gone.json: no such file" in capsys.readouterr().err
+
+
+def test_values_of_samples_whose_lights_are_not_named_have_no_interval_over_them() -> None:
+    results = small_results()
+    albedo = Selection("inverse", "single-image").of(results.records)
+    found = difference_over_lights(albedo, PSNR, "ours-mean", "input-as-albedo", merged_lights([results]))
+    assert (found.mean, found.n, found.clusters) == (8, 4, 2)
+    with pytest.raises(UnirenderError, match="the lights of 'ball-0_l0' and 1 more samples are not named; `python -m"):
+        over_lights({"ball-0_l0": 1.0, "ball-1_l1": 2.0}, albedo, {})

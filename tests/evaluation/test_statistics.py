@@ -7,12 +7,15 @@ import pytest
 import scipy.stats
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.results_coverage import TAILS, of_few_lights, tails
+from unirender_evaluation.results_coverage import coverage as coverage_of
 from unirender_evaluation.statistics import (
     FEW,
     UNPRINTED,
     beats,
-    crossed_interval,
+    crossed_estimate,
     holm,
+    light_count,
     mean_estimate,
     paired_difference,
     paired_p_value,
@@ -61,29 +64,57 @@ def test_of_few_objects_with_a_sample_each_it_is_students() -> None:
     assert estimate.half_width == pytest.approx(scipy.stats.sem(values) * scipy.stats.t.ppf(0.975, 3))
 
 
-def test_where_lights_are_shared_only_the_crossed_interval_holds_the_mean_as_often_as_it_says() -> None:
-    """48 objects under 2 of 16 lights each, as suites are; lights differ as much as objects."""
-    rng = np.random.default_rng(0)
-    objects = np.repeat(np.arange(48), 2)
-    hits = np.zeros(2)
-    for _ in range(300):
-        lights = np.concatenate([rng.permutation(16) for _ in range(6)])
-        values = 20 + rng.normal(size=48)[objects] + rng.normal(size=16)[lights] + rng.normal(size=96)
-        crossed = crossed_interval(values, objects.tolist(), lights.tolist())
-        alone = mean_estimate(values, objects.tolist(), resamples=400)
-        hits += [low <= 20 <= high for low, high in (crossed, (alone.low, alone.high))]
-    assert 0.92 <= hits[0] / 300 <= 0.985
-    assert hits[1] / 300 < 0.87  # the twin: lights that are in every draw
+@pytest.mark.parametrize("relit", [False, True])
+def test_where_lights_are_shared_only_the_interval_over_both_holds_the_mean_as_often_as_it_says(relit: bool) -> None:
+    """24 objects under 2 of 8 lights each, also relit by the other; lights differ twice as much as objects."""
+    alone, both = coverage_of(of_few_lights(24, 8, relit), 1, 2, trials=100)
+    assert both >= 0.9
+    assert alone < 0.75  # the twin: lights that are in every draw
+    assert coverage_of(of_few_lights(24, 8, relit), 1, 0, trials=40)[1] >= 0.9, "lights that make no difference"
 
 
-def test_where_no_light_is_shared_the_crossed_interval_is_that_over_objects() -> None:
+def one_each(lights: str) -> list[tuple[str, ...]]:
+    return [(light,) for light in lights]
+
+
+def test_where_no_light_is_shared_the_interval_over_both_is_that_over_objects() -> None:
     values, objects = [1.0, 2.0, 4.0, 7.0, 3.0, 3.5], ["a", "a", "b", "b", "c", "c"]
     alone = mean_estimate(values, objects)
-    assert crossed_interval(values, objects, list("stuvwx")) == pytest.approx((alone.low, alone.high))
-    assert all(math.isnan(end) for end in crossed_interval(values, objects, ["s"] * 6))
-    for wrong in (values[:-1], [*values[:-1], math.inf]):
-        with pytest.raises(UnirenderError, match="over objects and lights"):
-            crossed_interval(wrong, objects, list("stuvwx"))
+    found = crossed_estimate(values, objects, one_each("stuvwx"))
+    assert (found.low, found.high) == pytest.approx((alone.low, alone.high))
+    assert (found.mean, found.n, found.clusters) == (alone.mean, 6, 3)
+
+
+def test_over_lights_alone_it_is_that_over_clusters_of_their_samples() -> None:
+    """Each object under one light that others share, as many samples of each."""
+    values, lights = [1.0, 1.5, 4.0, 4.5, 7.0, 6.0, 9.0, 9.5, 0.5, 1.0], "ssttuuvvww"
+    found, alone = crossed_estimate(values, list("abcdefghij"), one_each(lights)), mean_estimate(values, list(lights))
+    assert (found.low, found.high) == pytest.approx((alone.low, alone.high))
+
+
+def test_what_few_lights_or_one_that_all_share_do_not_tell_has_no_interval() -> None:
+    values, objects = [1.0, 2.0, 4.0, 7.0, 3.0, 3.5], list("aabbcc")
+    for lights in (one_each("stuvst"), one_each("ssssss"), [("x", light) for light in "stuvwy"]):
+        found = crossed_estimate(values, objects, lights)
+        assert math.isnan(found.low)
+        assert found.mean == pytest.approx(np.mean(values))
+    assert math.isnan(crossed_estimate(values, ["a"] * 6, one_each("stuvwx")).high)
+    assert math.isnan(crossed_estimate([*values[:-1], math.inf], objects, one_each("stuvwx")).high)
+    assert light_count([("s", "x"), ("t", "x"), ("u", "y")]) == 2
+
+
+@pytest.mark.parametrize("wrong", [[1.0], [1.0, 2.0, 4.0, 7.0, 3.0, math.nan]])
+def test_values_without_their_objects_and_lights_are_refused(wrong: list[float]) -> None:
+    with pytest.raises(UnirenderError, match="over objects and lights"):
+        crossed_estimate(wrong, list("aabbcc"), one_each("stuvwx"))
+    with pytest.raises(UnirenderError, match="got 0 values"):
+        crossed_estimate([], [], [])
+
+
+def test_of_heavy_tails_the_bootstrap_of_few_more_objects_holds_the_mean_less_often_than_students() -> None:
+    """What `FEW` decides: above it, the bootstrap."""
+    bootstrap, student = tails(TAILS["Student's t, 3"], FEW + 1, trials=150)
+    assert 0.84 <= bootstrap < student - 0.01 < 0.98
 
 
 def test_of_many_objects_it_is_as_wide_as_their_spread_says() -> None:

@@ -179,6 +179,50 @@ def test_the_verdict_says_which_claims_hold_by_themselves_alone() -> None:
     )
 
 
+def test_the_verdict_says_which_claims_hold_under_other_lights() -> None:
+    """Gains of which one is as large under all lights, one as large as two of six lights make it; and of few lights."""
+    rng = np.random.default_rng(0)
+    level, scenes = rng.uniform(15, 20, 48), np.arange(48)
+    lights = {f"s{i}": (f"l{i // 2 % 3 + 3 * (i % 2)}",) for i in scenes}  # 6 lights of 24 objects
+    of_light = np.where(scenes // 2 % 3 == 0, 4.0, -0.5)
+    records = rows("theirs", ALBEDO, level)
+    records += rows("input-as-albedo", ALBEDO, level - 2 + rng.normal(size=48))
+    records += rows("mean-albedo", ALBEDO, level - of_light + 0.2 * rng.normal(size=48))
+    run = run_of(theirs="external", **{"input-as-albedo": "trivial", "mean-albedo": "trivial"})
+    text = verdict_text(records, run, CHECK, lights)
+    found = {f.claim.b: f for f in findings(records, run_claims(records, run), lights) if f.comparison}
+    assert [found[b].other_lights for b in ("input-as-albedo", "mean-albedo")] == ["holds", "open"]
+    assert (found["mean-albedo"].word, found["mean-albedo"].lights) == ("HOLDS", 6)
+    other = found["mean-albedo"].over_lights
+    assert other is not None
+    assert f"24 objects); under other lights: open [{other.low:+.4g}, {other.high:+.4g}]\n" in text
+    assert (
+        "  (of 2 claims that hold 1 also do under other lights; not inverse/single-image albedo PSNR of theirs against "
+        "mean-albedo; their intervals are " in text
+    )
+    assert f" to {found['mean-albedo'].times_as_wide:.2f} times as wide)" in text
+    assert found["mean-albedo"].times_as_wide > 1.5
+    few = verdict_text(records, run, CHECK, {sample: (own[0].replace("5", "4"),) for sample, own in lights.items()})
+    assert "under other lights: holds" in few, "of five it is told"
+    few = verdict_text(records, run, CHECK, {f"s{i}": (f"l{i % 4}",) for i in scenes})
+    assert few.count("under other lights: not told by 4 lights") == 2
+    assert "0 also do under other lights; not told of inverse/single-image albedo PSNR of theirs against input" in few
+    for unknown in (None, {}, {"s0": ("l0",)}):
+        unsaid = verdict_text(records, run, CHECK, unknown)
+        assert "  (what holds under other lights is not told: the lights of the samples are not named)" in unsaid
+        assert "under other lights: [" not in unsaid
+
+
+def test_what_is_level_does_not_hold_under_other_lights_either() -> None:
+    """However sure the sign of its rounding is."""
+    level = np.full(24, 18.0)
+    records = rows("a", ALBEDO, level * (1 + 1e-7)) + rows("b", ALBEDO, level)
+    lights = {f"s{i}": (f"l{i % 8}",) for i in range(24)}
+    claim = Claim("inverse", "single-image", "albedo", "psnr", "a", "b")
+    (found,) = findings(records, [claim], lights)
+    assert (found.word, found.other_lights) == ("open", "open")
+
+
 def test_our_claims_are_made_where_our_rows_ran() -> None:
     records = rows("ours-mean", ALBEDO, np.linspace(15, 20, 4))
     run = run_of(**{"ours-mean": "ours", "theirs": "external"})

@@ -7,7 +7,7 @@ from typing import Any
 
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results_data import Results, definitions
+from unirender_evaluation.results_data import Lights, Results, definitions
 from unirender_evaluation.results_file import to_document
 
 HASH = "0123456789abcdef" * 4
@@ -20,6 +20,12 @@ LEVELS = {"ours-mean": 20.0, "input-as-albedo": 12.0, "noise-ceiling": 46.0}
 RUN = RunInfo(
     "ball", HASH, 32, METHODS, coverage=0.3, mitsuba="3.9.1", truth_spp=64, code="abc", date="2026-01-31", seeds=(0,)
 )
+
+
+def small_lights() -> Lights:
+    """Each scene has a light of its own; all are relit by the same."""
+    scenes = [f"ball-{i // 2}_l{i % 2}" for i in range(4)]
+    return {name: own for scene in scenes for name, own in ((scene, (scene,)), (f"{scene}_to_x", (scene, "x")))}
 
 
 def small_records() -> list[Record]:
@@ -42,13 +48,13 @@ def small_results(source: str = "a.json", methods: tuple[str, ...] = tuple(LEVEL
     """Results of some of the rows; `changes` are fields of the run."""
     records = tuple(record for record in small_records() if record.method in methods)
     run = replace(RUN, methods=tuple(info for info in METHODS if info.key in methods), **changes)
-    return Results(run, records, definitions(records), source)
+    return Results(run, records, definitions(records), source, small_lights())
 
 
 def small_document() -> dict[str, Any]:
     """The JSON document of a whole run."""
     results = small_results()
-    return to_document(results.run, results.records, results.definitions)
+    return to_document(results.run, results.records, results.definitions, results.lights)
 
 
 def written(path: Path, document: Any) -> Path:
