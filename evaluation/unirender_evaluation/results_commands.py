@@ -105,7 +105,8 @@ class BenchVerdict:
     files: Files
     """`results.json`, packed by gzip or not, or folders of runs, of one suite."""
     format: Format = "text"
-    """What is printed: the lines of `verdict.txt`, or a table or list of the claims."""
+    """What is printed: the lines of `verdict.txt`, or its claims as a table (in LaTeX without distances that are only
+    stated) or list."""
 
     def run(self) -> int:
         """Prints the verdict."""

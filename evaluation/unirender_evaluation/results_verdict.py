@@ -47,10 +47,11 @@ def _plain(finding: Finding) -> dict[str, Any]:
     return plain
 
 
-def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights) -> TextTable:
-    """The claims of a run that were compared, a row each."""
+def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights, stated: bool = True) -> TextTable:
+    """The claims of a run that were compared, a row each; `stated`: and the distances that are only stated."""
     found = judged(records, run, lights)
-    rows = tuple(_cells(finding) for finding in found if finding.comparison is not None)
+    shown = [finding for finding in found if finding.comparison is not None and (stated or finding.holds is not None)]
+    rows = tuple(map(_cells, shown))
     limit = () if run.limit is None else (f"--limit {run.limit}: a partial run, not a result",)
     notes = (f"{HEAD}.", *(f"{line[0].upper()}{line[1:]}." for line in summary(records, found)), *limit)
     return TextTable(f"Verdict on suite {run.suite}", COLUMNS, (rows,), notes)
@@ -73,8 +74,8 @@ def _markdown(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
 
 
 def _latex(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
-    """A booktabs `table*`, scaled to the page where it is wider."""
-    table = claims_table(run, records, lights)
+    """A booktabs `table*`, scaled to the page where it is wider; with the stated distances it would be longer, too."""
+    table = claims_table(run, records, lights, stated=False)
     rows = [tex_row(map(tex_text, row)) for section in table.sections for row in section]
     below = " ".join(map(tex_text, table.notes))
     lines = [
