@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.results_data import Lights
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.results.data import Lights
 from unirender_evaluation.statistics import Estimate, beats, crossed_estimate, paired_difference
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
 OTHERS = ("trivial", "baseline", "optimisation")  # kinds of rows that ours are held against
@@ -85,7 +85,7 @@ def over_lights(values: Mapping[str, float], records: Iterable[Record], lights: 
     if unnamed := sorted(values.keys() - lights.keys()):
         raise UnirenderError(
             f"interval over objects and lights: the lights of {unnamed[0]!r} and {len(unnamed) - 1} more samples are "
-            "not named; `python -m unirender_evaluation.results_lights SUITE results.json` names them"
+            "not named; `python -m unirender_evaluation.results.lights SUITE results.json` names them"
         )
     objects = {record.sample: record.object for record in records}
     return crossed_estimate(

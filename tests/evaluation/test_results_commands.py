@@ -10,10 +10,10 @@ from small_results import HASH, small_document, small_results, written
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
-from unirender_evaluation.bench_config import GROUPS
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
-from unirender_evaluation.results_compare import Rank, chosen_pairs, compare_pair, rank
-from unirender_evaluation.results_listing import LISTINGS, METHOD_GROUPS
+from unirender_evaluation.results.compare import Rank, chosen_pairs, compare_pair, rank
+from unirender_evaluation.results.listing import LISTINGS, METHOD_GROUPS
+from unirender_evaluation.runs.config import GROUPS
 from unirender_evaluation.statistics import paired_difference
 from unirender_evaluation.table_list import ALL_TABLES
 
@@ -100,7 +100,7 @@ def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Pa
     path = written(files[0].with_name("older.json"), older)
     status, out, err = bench("tables", path, "--interval", "objects-and-lights")
     assert (status, out) == (1, "")
-    assert "samples are not named; `python -m unirender_evaluation.results_lights SUITE results.json` names them" in err
+    assert "samples are not named; `python -m unirender_evaluation.results.lights SUITE results.json` names them" in err
 
 
 def test_verdict_in_every_format(bench, files: tuple[Path, Path]) -> None:

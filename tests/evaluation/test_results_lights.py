@@ -8,10 +8,10 @@ from small_results import small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, difference_over_lights, over_lights
-from unirender_evaluation.merge import merged_lights
-from unirender_evaluation.results_file import read_results, write_results
-from unirender_evaluation.results_lights import main, sample_lights, with_lights
-from unirender_evaluation.suites import load_suite, material_key
+from unirender_evaluation.results.file import read_results, write_results
+from unirender_evaluation.results.lights import main, sample_lights, with_lights
+from unirender_evaluation.results.merge import merged_lights
+from unirender_evaluation.suites.suite import load_suite, material_key
 
 PSNR = "albedo.psnr@masked-srgb-raw"
 

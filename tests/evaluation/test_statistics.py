@@ -7,8 +7,8 @@ import pytest
 import scipy.stats
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results_coverage import TAILS, of_few_lights, tails
-from unirender_evaluation.results_coverage import coverage as coverage_of
+from unirender_evaluation.results.coverage import TAILS, of_few_lights, tails
+from unirender_evaluation.results.coverage import coverage as coverage_of
 from unirender_evaluation.statistics import (
     FEW,
     UNPRINTED,

@@ -1,0 +1,103 @@
+"""`unirender bench verdict`: the claims of stored results, over objects and under other lights, in four formats."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.results.data import Lights
+from unirender_evaluation.tables.formats import MISSING, json_number, json_text
+from unirender_evaluation.tables.latex import tex_needs, tex_row, tex_text
+from unirender_evaluation.tables.text import TextTable
+from unirender_evaluation.verdict import HEAD, Finding, ceiling_breaches, judged, summary, verdict_text
+
+COLUMNS = ("number", "A", "B", "A - B", "over objects", "under other lights", "n (objects, lights)")
+
+
+def _text(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
+    return verdict_text(records, run, None, lights) + "\n"
+
+
+def _json(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
+    found = judged(records, run, lights)
+    content = {
+        "suite": run.suite,
+        "suite_hash": run.suite_hash,
+        "limit": run.limit,
+        "how": HEAD,
+        "claims": [_plain(finding) for finding in found],
+        "summary": summary(records, found),
+        "ceiling_breaches": list(map(str, ceiling_breaches(records))),
+    }
+    return json_text(content)
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    """A finding as JSON; what was not compared has no difference, of lights that are not known nothing is said."""
+    claim, compared, over_lights = finding.claim, finding.comparison, finding.over_lights
+    names = ("table", "protocol", "quantity", "metric", "scale", "a", "b", "expected", "remark")
+    plain: dict[str, Any] = {name: getattr(claim, name) for name in names}
+    if compared is None:
+        return plain | {"state": finding.why.strip(" ,")}
+    own = compared.difference
+    plain |= {"state": finding.word.lower(), "difference": own.mean, "n": own.n, "asked": finding.asked}
+    plain |= {"objects": own.clusters, "low": json_number(own.low), "high": json_number(own.high)}
+    if over_lights is not None:
+        ends = {"low": json_number(over_lights.low), "high": json_number(over_lights.high)}
+        plain["other_lights"] = {"state": finding.other_lights, "lights": finding.lights, **ends}
+    return plain
+
+
+def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights, stated: bool = True) -> TextTable:
+    """The claims of a run that were compared, a row each; `stated`: and the distances that are only stated."""
+    found = judged(records, run, lights)
+    shown = [finding for finding in found if finding.comparison is not None and (stated or finding.holds is not None)]
+    rows = tuple(map(_cells, shown))
+    limit = () if run.limit is None else (f"--limit {run.limit}: a partial run, not a result",)
+    notes = (f"{HEAD}.", *(f"{line[0].upper()}{line[1:]}." for line in summary(records, found)), *limit)
+    return TextTable(f"Verdict on suite {run.suite}", COLUMNS, (rows,), notes)
+
+
+def _cells(finding: Finding) -> tuple[str, ...]:
+    claim, compared, over_lights = finding.claim, finding.comparison, finding.over_lights
+    if compared is None:
+        return (finding.number, claim.a, claim.b, *[MISSING] * 4)
+    own, unit = compared.difference, f" {claim.kind.unit}" if claim.kind.unit else ""
+    alone = f"{finding.word.lower()} [{own.low:+.4g}, {own.high:+.4g}]" if compared.decided else MISSING
+    other, counts = finding.other_lights or MISSING, f"{own.n} ({own.clusters}, {finding.lights or MISSING})"
+    if over_lights is not None and other not in (MISSING, "not told"):
+        other += f" [{over_lights.low:+.4g}, {over_lights.high:+.4g}]"
+    return (finding.number, claim.a, claim.b, f"{own.mean:+.4g}{unit}", alone, other, counts)
+
+
+def _markdown(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
+    return claims_table(run, records, lights).markdown()
+
+
+def _latex(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
+    """A booktabs `table*`, scaled to the page where it is wider; with the stated distances it would be longer, too."""
+    table = claims_table(run, records, lights, stated=False)
+    rows = [tex_row(map(tex_text, row)) for section in table.sections for row in section]
+    below = " ".join(map(tex_text, table.notes))
+    lines = [
+        r"\begin{table*}[t]",
+        r"\centering",
+        rf"\caption{{\textbf{{{tex_text(table.title)}.}}}}",
+        r"\label{tab:verdict}",
+        r"\setlength{\tabcolsep}{4pt}",
+        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+        r"\begin{tabular}{lllrrrr}",
+        r"\toprule",
+        tex_row(map(tex_text, table.columns)),
+        *(r"\midrule", *rows, r"\bottomrule", r"\end{tabular}}"),
+        *(r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {below}}}", r"\end{table*}"),
+    ]
+    text = "\n".join(lines) + "\n"
+    return tex_needs(text) + text
+
+
+VERDICTS: Mapping[str, Callable[[RunInfo, Sequence[Record], Lights], str]] = {
+    "text": _text,
+    "markdown": _markdown,
+    "latex": _latex,
+    "json": _json,
+}
