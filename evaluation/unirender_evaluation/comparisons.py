@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.results.data import Lights
 from unirender_evaluation.statistics import Estimate, beats, crossed_estimate, paired_difference
 from unirender_evaluation.tables.specs import Column, TableSpec
 
+Lights = Mapping[str, tuple[str, ...]]  # sample -> the lights that its values depend on
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
 OTHERS = ("trivial", "baseline", "optimisation")  # kinds of rows that ours are held against
 ZERO = 1e-6  # and the absolute one, of values near zero

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
-from unirender_evaluation.comparisons import Comparison, Selection, compare, difference_over_lights, values_of
+from unirender_evaluation.comparisons import Comparison, Lights, Selection, compare, difference_over_lights, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.results.data import Lights
 from unirender_evaluation.statistics import FEW, Estimate, holm, light_count, paired_difference, paired_p_value
 from unirender_evaluation.task import LIGHT
 

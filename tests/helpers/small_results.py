@@ -5,9 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results.data import Lights, Results, definitions
+from unirender_evaluation.results.data import Results, definitions
 from unirender_evaluation.results.file import to_document
 
 HASH = "0123456789abcdef" * 4

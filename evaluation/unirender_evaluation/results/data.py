@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.metrics import Metric
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.table_list import ALL_METRICS
 from unirender_evaluation.tables.specs import PROTOCOLS
 
 NAME = "results.json"
-Lights = Mapping[str, tuple[str, ...]]  # sample -> the lights that its values depend on
 PACKED = ".gz"  # what the name of a file that gzip has packed ends in
 
 

@@ -32,7 +32,8 @@ from unirender_evaluation.records import (
     run_from_plain,
 )
 from unirender_evaluation.results.check import content_problems
-from unirender_evaluation.results.data import NAME, PACKED, Definitions, Lights, Results, definitions
+from unirender_evaluation.comparisons import Lights
+from unirender_evaluation.results.data import NAME, PACKED, Definitions, Results, definitions
 from unirender_evaluation.results.schema import FORMAT, json_schema
 from unirender_evaluation.results.schema_check import Problem, quoted, schema_problems
 

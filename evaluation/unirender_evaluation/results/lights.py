@@ -11,7 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results.data import Lights, Results
+from unirender_evaluation.comparisons import Lights
+from unirender_evaluation.results.data import Results
 from unirender_evaluation.results.file import read_results, write_results
 from unirender_evaluation.suites.suite import Suite, load_suite
 from unirender_evaluation.task import PROTOCOLS

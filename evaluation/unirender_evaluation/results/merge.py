@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import agree
+from unirender_evaluation.comparisons import Lights, agree
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results.data import Lights, Results
+from unirender_evaluation.results.data import Results
 from unirender_evaluation.rows import slug
 from unirender_evaluation.tables.protocol import doubts
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import Selection, exact_fit, over_lights, values_of
+from unirender_evaluation.comparisons import Lights, Selection, exact_fit, over_lights, values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results.data import Lights
 from unirender_evaluation.statistics import Estimate, mean_estimate
 from unirender_evaluation.tables.counts import short_cells
 from unirender_evaluation.tables.notes import table_notes
