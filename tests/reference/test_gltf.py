@@ -298,6 +298,15 @@ def test_a_quaternion_of_another_length_is_refused(tmp_path):
     assert face_areas(rounded).sum() / 2 == pytest.approx(2.0, rel=1e-3)
 
 
+def test_that_texels_are_not_sharp_is_told(tmp_path):
+    def fill(w: GltfWriter) -> None:
+        texture = w.texture(random_pixels(0, 4, 4), (10497, 10497))
+        w.json["samplers"][0]["magFilter"] = 9728
+        w.mesh(w.quad(w.material(pbrMetallicRoughness={"baseColorTexture": {"index": texture}})))
+
+    assert load_mesh(quad_glb(tmp_path, fill)).provenance["ignored"] == "sharp texels of textures"
+
+
 class TwoRoots(GltfWriter):
     """Nodes beyond the second are children."""
 

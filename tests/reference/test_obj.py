@@ -64,6 +64,17 @@ def test_pbr_keywords(tmp_path):
     assert obj.normal_map[1:-1, 1:-1] == pytest.approx(tilt, abs=1e-5)
 
 
+def test_a_library_whose_materials_no_face_uses_may_be_missing(tmp_path):
+    (tmp_path / "here.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    model = tmp_path / "quad.obj"
+    for libraries in ("mtllib here.mtl\nmtllib gone.mtl\n", "mtllib gone.mtl here.mtl\n"):
+        model.write_text(f"{libraries}{QUAD}usemtl red\nf 1 2 3 4\n")
+        assert load_mesh(model).albedo == pytest.approx([1, 0, 0])
+        model.write_text(f"{libraries}{QUAD}usemtl blue\nf 1 2 3 4\n")  # which may stand in the other one
+        with pytest.raises(UnirenderError, match=r"material library 'gone\.mtl' is missing"):
+            load_mesh(model)
+
+
 def test_a_packed_picture_says_which_channel_counts(tmp_path):
     """The first one did, of occlusion, roughness and metallic in one picture, whatever `-imfchan` said."""
     (tmp_path / "orm.png").write_bytes(png(np.full((4, 4, 3), (250, 100, 30), np.uint8)))

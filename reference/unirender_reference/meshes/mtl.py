@@ -6,6 +6,7 @@ read (`-bm` of `norm`, `-imfchan` of map_Pr and map_Pm, too); bump maps (`map_Bu
 
 import io
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +16,7 @@ from unirender.color import luminance, srgb_decode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.images import Decode, ImageBudget, linear, texels_of
-from unirender_reference.meshes.limits import check_materials, texture_side
+from unirender_reference.meshes.limits import MAX_TEXT_BYTES, check_materials, texture_side
 from unirender_reference.meshes.surface import Channel, Material, Texture, tangent_normals
 
 DEFAULT_ALBEDO = 0.5
@@ -64,6 +65,40 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
             except ValueError:  # "Kd spectral file.rfl" and the like
                 entry.ignored.add(f"{keyword} {rest[:20]}")
     return entries
+
+
+def read_libraries(folder: ModelFolder, names: Iterable[str], used: set[str]) -> dict[str, MtlEntry]:
+    """The materials of several files by name; none where none is used.
+
+    Raises:
+        UnirenderError: a file cannot be read and a material that is used stands in no other, or there are too many.
+    """
+    entries: dict[str, MtlEntry] = {}
+    missing: UnirenderError | None = None
+    for name in names if used else ():
+        texts, lost = _library_texts(folder, name)
+        missing = missing or lost
+        for text in texts:
+            entries |= parse_mtl(text.decode("utf-8", "surrogateescape"))
+            check_materials(len(entries))
+    if missing is not None and used - entries.keys():
+        raise missing
+    return entries
+
+
+def _library_texts(folder: ModelFolder, name: str) -> tuple[list[bytes], UnirenderError | None]:
+    """A file, whose name may hold spaces, or else several in a line; and why the last one that is lost is so."""
+    parts, texts, missing = name.split(), [], None
+    for some in ([name], parts) if len(parts) > 1 else ([name],):
+        missing = None
+        for part in some:
+            try:
+                texts.append(folder.read(part, "material library", limit=MAX_TEXT_BYTES))
+            except UnirenderError as error:
+                missing = error
+        if texts:
+            break
+    return texts, missing
 
 
 def _map(rest: str) -> tuple[str, dict[str, list[str]]]:
