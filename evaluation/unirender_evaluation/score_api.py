@@ -45,6 +45,8 @@ def score(
 
     Returns:
         Metric key -> value: `albedo.psnr@masked-srgb-raw`, `normal.cosine`, ... The PSNR of identical pictures is inf.
+        Two lights have the values of the benchmark's table of lights (`light_metrics.score_light`), which do not depend
+        on how many texels a map has; a black one has none.
 
     Raises:
         UnirenderError: the two are of different kinds or sizes, a picture is not finite linear floats with the channels
@@ -67,7 +69,8 @@ def score(
     if isinstance(prediction, Intrinsics):
         if mask is not None:
             raise UnirenderError("score: got maps and mask=, expected the coverage in the truth's own mask")
-        values = score_maps(prediction, truth, **options)
+        maps = (each.replace(environment=None) for each in (prediction, truth))
+        values = score_maps(*maps, **options) | _light_values(prediction, truth)
     else:
         values = score_image(*_checked_pictures(prediction, truth, mask), quantity=quantity, **options)
     chosen = values if variant is None else {key: value for key, value in values.items() if _is_of(key, variant)}
@@ -109,10 +112,19 @@ def _networks(backbones: Sequence[str]) -> "list[Lpips]":
     return [load(name) for name in backbones]
 
 
+def _light_values(found: Intrinsics, true: Intrinsics) -> dict[str, float]:
+    """Values of the light, where both have one that is not black."""
+    from unirender_evaluation.light_metrics import score_light
+
+    lights = [each.environment for each in (found, true)]
+    return score_light(found, true) if all(light is not None and light.max() > 0 for light in lights) else {}
+
+
 def _is_of(key: str, variant: Variant) -> bool:
     """Whether a metric key is how its quantity and metric are named under a variant."""
     quantity, _, rest = key.partition(".")
-    return metric_key(quantity, METRICS[rest.partition("@")[0]], variant) == key
+    name, _, axes = rest.partition("@")
+    return not axes or metric_key(quantity, METRICS[name], variant) == key
 
 
 def _picture(value: Any, what: str) -> Picture:

@@ -47,7 +47,7 @@ def score_maps(
     lpips: Sequence[Lpips] = (),
     lpips_scales: Sequence[Scale] = LPIPS_SCALES,
 ) -> dict[str, float]:
-    """Scores every map that prediction and truth both have.
+    """Scores every map, but for the light, that prediction and truth both have.
 
     Args:
         prediction: one picture's intrinsics `[h, w, c]`; maps that are None get no values.
@@ -56,8 +56,8 @@ def score_maps(
         lpips_scales: scale alignments for which LPIPS is computed.
 
     Returns:
-        Metric key -> value, for the quantities albedo, specular, diffuse, roughness, metallic, normal, environment; and
-        mask, where the prediction has one of its own.
+        Metric key -> value, for the quantities albedo, specular, diffuse, roughness, metallic, normal; and mask, where
+        the prediction has one of its own. Lights have metrics of their own (`light_metrics.score_light`).
 
     Raises:
         UnirenderError: if the truth has no mask or an empty one, or sizes differ.
@@ -93,8 +93,6 @@ def score_maps(
         cosine = metrics.cosine(prediction.normal, truth.normal)
         values[metric_key("normal", "cosine")] = metrics.weighted_mean(cosine, w)
         values[metric_key("normal", "angle_deg")] = metrics.weighted_mean(np.degrees(np.arccos(cosine)), w)
-    if prediction.environment is not None and truth.environment is not None:
-        values |= _score_environment(prediction.environment, truth.environment)
     return values
 
 
@@ -192,21 +190,6 @@ def _lpips_values(
 def _display(linear: Float[np.ndarray, "*n h w 3"], space: Space) -> Float[np.ndarray, "*n h w 3"]:
     clipped = np.clip(linear, 0, 1)
     return srgb_encode(clipped) if space == "srgb" else clipped
-
-
-def _score_environment(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "th tw 3"]) -> dict[str, float]:
-    """log-RMSE weighted by solid angle, at the prediction's resolution."""
-    from unirender.lighting import resample_environment, texel_solid_angles
-
-    if p.shape != t.shape:
-        t = resample_environment(t, p.shape[:2])
-    w = texel_solid_angles(*p.shape[:2])[..., None]
-    return {
-        metric_key("environment", "log_rmse", Variant(scale=scale)): metrics.log_rmse(
-            metrics.align_scale(p, t, w, scale), t, w
-        )
-        for scale in SCALES
-    }
 
 
 def _truth_mask(mask: Weights | None) -> Weights:

@@ -59,11 +59,12 @@ def check_pose(pose: Any, name: str = "pose") -> None:
         UnirenderError: it is no (4, 4) matrix of a rotation and a position.
     """
     matrix = as_numbers(name, pose).astype(np.float64)
-    turn = matrix[:3, :3] if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((3, 3))
-    if np.abs(turn.T @ turn - np.eye(3)).max() >= ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+    matrix = matrix if matrix.shape == (4, 4) and np.isfinite(matrix).all() else np.zeros((4, 4))
+    turn, off = matrix[:3, :3], np.abs(matrix[3] - [0, 0, 0, 1]).max()
+    if max(off, np.abs(turn.T @ turn - np.eye(3)).max()) >= ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
         raise UnirenderError(
             f"{name}: the pose is no rotation and position; expected a (4, 4) camera-to-world matrix without scale or "
-            "mirroring"
+            "mirroring, and the position in its last column"
         )
 
 

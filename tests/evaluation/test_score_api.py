@@ -12,6 +12,7 @@ import unirender_evaluation
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import Variant, lpips, score
+from unirender_evaluation.light_metrics import score_light
 from unirender_evaluation.scoring import score_image, score_maps
 
 rng = np.random.default_rng(0)
@@ -57,6 +58,21 @@ def test_a_protocol_chooses_among_the_same_numbers() -> None:
         "normal.cosine",
         "normal.angle_deg",
     }
+
+
+def test_a_light_is_scored_as_the_benchmark_scores_it_and_not_by_the_texels_of_its_map() -> None:
+    light = np.full((16, 32, 3), 0.1, np.float32)
+    light[4, 9] = 50
+    true = TRUE.replace(environment=light)
+    flat = {shape: FOUND.replace(environment=np.full((*shape, 3), 0.4, np.float32)) for shape in ((2, 2), (16, 32))}
+    coarse, fine = (score(found, true) for found in flat.values())
+    assert fine == score(FOUND, TRUE) | score_light(flat[16, 32], true)
+    assert coarse == pytest.approx(fine, rel=0.02)  # 0.51 and 0.79 where each was compared on its own map
+    assert score(flat[2, 2], true, "aligned").keys() - score(FOUND, TRUE, "aligned").keys() == {
+        *("environment.log_rmse_scaled", "environment.peak_deg"),
+        *("ball_matte.rmse_relative@aligned", "ball_glossy.rmse_relative@aligned"),
+    }
+    assert score(FOUND.replace(environment=0 * light), true) == score(FOUND, TRUE)  # black
 
 
 def test_the_methods_own_mask_counts_in_the_whole_frame() -> None:

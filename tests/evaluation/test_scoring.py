@@ -8,12 +8,11 @@ import pytest
 from unirender.color import image_srgb, srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import texel_solid_angles
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import load
 from unirender_evaluation.methods.plausible import facing_away, picture_doubt, range_doubt
 from unirender_evaluation.methods.suspicions import decoding_gain, suspicions, turning_gain
-from unirender_evaluation.metrics import FACING_AWAY, LOG_EPSILON, OWN_MASK, SCALES, TURNED, metric_key
+from unirender_evaluation.metrics import FACING_AWAY, OWN_MASK, SCALES, TURNED, metric_key
 from unirender_evaluation.scoring import MATERIALS, score_colour, score_image, score_maps
 from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.task import Asked, Task
@@ -189,7 +188,7 @@ def test_lpips_by_hand(own: np.ndarray | None) -> None:
     assert (masked == whole) == (own is None)
 
 
-def test_materials_normals_and_light_by_hand() -> None:
+def test_materials_and_normals_by_hand() -> None:
     prediction, truth, w, own = intrinsics(1).maps, intrinsics(0).maps, disc(), disc(6)
     values = score_maps(intrinsics(1).replace(mask=own), intrinsics(0))
     for name in MATERIALS:
@@ -202,12 +201,6 @@ def test_materials_normals_and_light_by_hand() -> None:
     assert values["normal.cosine"] == pytest.approx(np.average(cosine, weights=w[..., 0]), rel=1e-5)
     angle = np.average(np.degrees(np.arccos(cosine)), weights=w[..., 0])
     assert values["normal.angle_deg"] == pytest.approx(angle, rel=1e-4)
-    p, t = prediction["environment"].astype(float), truth["environment"].astype(float)
-    solid = np.repeat(texel_solid_angles(16, 32)[..., None], 3, axis=-1)
-    factor = {"raw": 1, "aligned": (solid * p * t).sum() / (solid * p * p).sum()}
-    for scale, k in factor.items():
-        error = np.average(np.log((k * p + LOG_EPSILON) / (t + LOG_EPSILON)) ** 2, weights=solid)
-        assert values[f"environment.log_rmse@{scale}"] == pytest.approx(math.sqrt(error), rel=1e-4)
 
 
 def test_a_mask_of_ones_own_changes_the_whole_frame_and_not_the_masked_figures() -> None:
@@ -271,13 +264,6 @@ def test_a_tinted_picture_is_right_up_to_a_factor_per_channel() -> None:
     raw, aligned, per_channel = (values[f"relit.psnr@whole-linear-{scale}"] for scale in SCALES)
     assert raw < aligned < 30 < 100 < per_channel
     assert len([key for key in values if key.startswith("relit.ssim@")]) == 2 * 2 * len(SCALES)
-
-
-def test_environment_is_compared_at_the_predictions_resolution() -> None:
-    flat = np.full((32, 64, 3), 0.7, np.float32)
-    prediction = Intrinsics(environment=flat[:16, :32], mask=disc())
-    values = score_maps(prediction, Intrinsics(environment=flat, mask=disc()))
-    assert values["environment.log_rmse@raw"] == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.parametrize("mask", [None, np.zeros((SIZE, SIZE, 1), np.float32)])

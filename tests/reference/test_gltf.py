@@ -290,6 +290,40 @@ def test_a_node_turns_by_its_quaternion(tmp_path):
     assert obj.normals == pytest.approx(np.tile(turned.apply([0, 0, 1]), (4, 1)), abs=1e-5)
 
 
+def test_a_quaternion_of_another_length_is_refused(tmp_path):
+    """It sheared and turned by another angle: 131 degrees for these 90."""
+    with pytest.raises(UnirenderError, match=r"rotation has the length 2\.83, expected a unit quaternion"):
+        load_mesh(quad_glb(tmp_path, lambda w: w.mesh(w.quad(None), rotation=[0, 0, 2, 2])))
+    rounded = load_mesh(quad_glb(tmp_path, lambda w: w.mesh(w.quad(None), rotation=[0, 0, 0.707, 0.707])))
+    assert face_areas(rounded).sum() / 2 == pytest.approx(2.0, rel=1e-3)
+
+
+def test_that_texels_are_not_sharp_is_told(tmp_path):
+    def fill(w: GltfWriter) -> None:
+        texture = w.texture(random_pixels(0, 4, 4), (10497, 10497))
+        w.json["samplers"][0]["magFilter"] = 9728
+        w.mesh(w.quad(w.material(pbrMetallicRoughness={"baseColorTexture": {"index": texture}})))
+
+    assert load_mesh(quad_glb(tmp_path, fill)).provenance["ignored"] == "sharp texels of textures"
+
+
+class TwoRoots(GltfWriter):
+    """Nodes beyond the second are children."""
+
+    def document(self) -> dict[str, Any]:
+        return super().document() | {"scenes": [{"nodes": [0, 1]}]}
+
+
+def test_hidden_nodes_and_what_is_below_them_are_left_out(tmp_path):
+    """They were drawn."""
+    writer = TwoRoots()
+    for y, node in enumerate(({}, {"children": [2]}, {})):
+        extension = {"KHR_node_visibility": {"visible": y != 1}}
+        writer.mesh(writer.quad(None), translation=[0, 5 * y, 0], extensions=extension, **node)
+    writer.json["extensionsUsed"] = writer.json["extensionsRequired"] = ["KHR_node_visibility"]
+    assert len(load_mesh(writer.glb(tmp_path / "hidden.glb")).faces) == 2
+
+
 def test_a_texture_is_refined_to_the_nearest_texels():
     texels = np.arange(6, dtype=np.float32).reshape(2, 3, 1)
     np.testing.assert_array_equal(images.nearest(texels, 4, 9), texels.repeat(2, axis=0).repeat(3, axis=1))

@@ -48,6 +48,8 @@ def test_no_pbr_keywords_no_maps(tmp_path):
 def test_pbr_keywords(tmp_path):
     pictures = {name: random_pixels(i, 8, 8) for i, name in enumerate(("color", "rough", "metal", "bumps"))}
     pictures["bumps"][..., 2] = 255
+    for name in ("rough", "metal"):
+        pictures[name][..., 1:] = pictures[name][..., :1]
     for name, pixels in pictures.items():
         (tmp_path / f"{name} map.png").write_bytes(png(pixels))
     lines = "map_Kd color map.png\nPr 0.9\nmap_Pr rough map.png\nmap_Pm metal map.png\nnorm -bm 0.5 bumps map.png"
@@ -60,6 +62,33 @@ def test_pbr_keywords(tmp_path):
     tilt = (pictures["bumps"] / 255 * 2 - 1) * [0.5, 0.5, 1]
     tilt /= np.linalg.norm(tilt, axis=-1, keepdims=True)
     assert obj.normal_map[1:-1, 1:-1] == pytest.approx(tilt, abs=1e-5)
+
+
+def test_a_library_whose_materials_no_face_uses_may_be_missing(tmp_path):
+    (tmp_path / "here.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    model = tmp_path / "quad.obj"
+    for libraries in ("mtllib here.mtl\nmtllib gone.mtl\n", "mtllib gone.mtl here.mtl\n"):
+        model.write_text(f"{libraries}{QUAD}usemtl red\nf 1 2 3 4\n")
+        assert load_mesh(model).albedo == pytest.approx([1, 0, 0])
+        model.write_text(f"{libraries}{QUAD}usemtl blue\nf 1 2 3 4\n")  # which may stand in the other one
+        with pytest.raises(UnirenderError, match=r"material library 'gone\.mtl' is missing"):
+            load_mesh(model)
+
+
+def test_a_packed_picture_says_which_channel_counts(tmp_path):
+    """The first one did, of occlusion, roughness and metallic in one picture, whatever `-imfchan` said."""
+    (tmp_path / "orm.png").write_bytes(png(np.full((4, 4, 3), (250, 100, 30), np.uint8)))
+    obj = write(tmp_path, "map_Pr -imfchan g orm.png\nmap_Pm -imfchan B -mm 0 0.5 orm.png")
+    assert obj.roughness == pytest.approx(np.full((6, 6), 100 / 255), abs=1e-6)
+    assert obj.metallic == pytest.approx(np.full((6, 6), 30 / 255), abs=1e-6)
+    assert obj.provenance["ignored"] == "-mm of a map"
+    obj = write(tmp_path, "Pc 0.5\nPs 0\nmap_Pr -mm 0 1 -imfchan l orm.png")
+    assert obj.roughness is not None
+    assert obj.roughness[0, 0] == pytest.approx((0.2126 * 250 + 0.7152 * 100 + 0.0722 * 30) / 255, abs=1e-6)
+    assert obj.provenance["ignored"] == "clearcoat"
+    for options, said in (("", "is in colour .* expected one value a texel"), ("-imfchan z ", "got -imfchan z")):
+        with pytest.raises(UnirenderError, match=f"texture 'orm.png' of metallic: {said}"):
+            write(tmp_path, f"map_Pm {options}orm.png")
 
 
 def test_normals_of_a_map_that_point_into_the_surface_count_as_flat(tmp_path):

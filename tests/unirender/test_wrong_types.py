@@ -126,6 +126,7 @@ CASES = {
     "renderer.specular(light, '0.5', 16)": "roughness: got '0.5', expected a value in [0, 1]",
     "renderer.image(light, 0.5, 0.5, 64.0)": "spp: got 64.0, expected a whole number of samples",
     "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
+    "renderer.image(light, 0.5, 0.5, 16, pose=np.insert(np.eye(4)[:3], 3, [0, 0, 4, 1], 0))": "pose: the pose is no",
     "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
     "Renderer(make_object(1, 'train'), resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
     "make_light('a', 'train')": "make_light: got seed 'a', split 'train'; expected seed >= 0",

@@ -15,6 +15,7 @@ READABLE = {
     "KHR_draco_mesh_compression",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
+    "KHR_node_visibility",
     "KHR_texture_transform",
     "EXT_texture_avif",
     "EXT_texture_webp",

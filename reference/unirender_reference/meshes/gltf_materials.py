@@ -20,6 +20,8 @@ from unirender_reference.meshes.surface import BARE, IDENTITY, Channel, Material
 
 WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 IMAGE_EXTENSIONS = ("EXT_texture_webp", "EXT_texture_avif")
+NEAREST = 9728
+SHARP_TEXELS = "sharp texels of textures"  # between which renders interpolate
 GLOSS, UNLIT, TRANSFORM = "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit", "KHR_texture_transform"
 GLOSS_TEXTURE = "specularGlossinessTexture"
 
@@ -150,6 +152,8 @@ class Materials:
             texture.get("source"),
         )
         transform = info.get("extensions", {}).get(TRANSFORM, {})
+        if sampler.get("magFilter") == NEAREST:
+            self.ignored.add(SHARP_TEXELS)
         return Texture(
             texels=self._linear(source, mode, curve),
             texcoord=_texcoord(info),

@@ -18,6 +18,8 @@ from unirender_reference.meshes.polygons import strip
 from unirender_reference.meshes.surface import Model, Piece
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
+UNIT_TOLERANCE = 0.01  # of a quaternion's squared length: what few digits leave; beyond, it would shear
+VISIBILITY = "KHR_node_visibility"
 INSTANCING = "EXT_mesh_gpu_instancing"  # where no reader must have it, its mesh stands once, where its node is
 
 
@@ -69,7 +71,7 @@ def read_gltf(path: Path, folder: ModelFolder) -> Model:
 
 
 def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
-    """Each mesh of the scene with its place in the world; a tree, as the specification has it."""
+    """Each mesh of the scene that is visible, with its place in the world; a tree, as the specification has it."""
     nodes = document.json.get("nodes", [])
     if len(nodes) > MAX_NODES:
         raise UnirenderError(f"has {len(nodes):,} nodes, expected at most {MAX_NODES:,}; merge its meshes")
@@ -86,6 +88,8 @@ def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4
         if index in seen:
             raise UnirenderError(f"nodes[{index}] has two parents or is its own, expected a tree; export it again")
         seen.add(index)
+        if node.get("extensions", {}).get(VISIBILITY, {}).get("visible") is False:
+            continue  # it and all below it
         matrix = parent @ _local(node)
         if "mesh" in node:
             yield node["mesh"], matrix
@@ -95,7 +99,12 @@ def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4
 def _local(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     if "matrix" in node:
         return vector(node, "matrix", [0.0] * 16).reshape(4, 4).T
-    x, y, z, w = vector(node, "rotation", [0, 0, 0, 1])
+    x, y, z, w = quaternion = vector(node, "rotation", [0, 0, 0, 1])
+    if abs(quaternion @ quaternion - 1) > UNIT_TOLERANCE:
+        raise UnirenderError(
+            f"a node's rotation has the length {np.linalg.norm(quaternion):.3g}, expected a unit quaternion; export it "
+            "again"
+        )
     rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -1,29 +1,34 @@
 """Wavefront MTL: colours and textures of the classic format and of its PBR extension (Pr, Pm, map_Pr, map_Pm, norm).
 
 Kd counts only without a map_Kd, as Blender reads it; both are sRGB. Of a map's options `-clamp`, `-o` and `-s` are
-read (`-bm` of `norm`, too); bump maps (`map_Bump`) are heights and are ignored.
+read (`-bm` of `norm`, `-imfchan` of map_Pr and map_Pm, too); bump maps (`map_Bump`) are heights and are ignored.
 """
 
 import io
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
-from unirender.color import srgb_decode
+from unirender.color import luminance, srgb_decode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.images import Decode, ImageBudget, linear, texels_of
-from unirender_reference.meshes.limits import check_materials, texture_side
+from unirender_reference.meshes.limits import MAX_TEXT_BYTES, check_materials, texture_side
 from unirender_reference.meshes.surface import Channel, Material, Texture, tangent_normals
 
 DEFAULT_ALBEDO = 0.5
 DEFAULT_ROUGHNESS, DEFAULT_METALLIC = 0.5, 0.0  # beside materials that have them
 OPTIONS = {"-blendu": 1, "-blendv": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-texres": 1, "-type": 1, "-bm": 1}
 OPTIONS |= {"-boost": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
+UNHEEDED = {"-mm": (0.0, 1.0), "-t": (0.0, 0.0, 0.0)}  # options that would change a map, with what changes nothing
+COLOURED = 0.1  # mean difference of the channels, from which a picture is no grey one
 MAPS = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
 IGNORED = {"map_d": "alpha", "map_bump": "bump", "bump": "bump", "map_ke": "emission", "disp": "displacement"}
+IGNORED |= {"map_pc": "clearcoat", "map_ps": "sheen"}
+BEYOND = {"ke": "emission", "pc": "clearcoat", "ps": "sheen", "aniso": "anisotropy"}  # numbers, ignored where not 0
 
 
 @dataclass
@@ -54,12 +59,46 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
             entry.maps[MAPS[keyword]] = _map(rest)
         elif keyword in IGNORED:
             entry.ignored.add(IGNORED[keyword])
-        elif keyword in ("kd", "pr", "pm", "d", "tr", "ke"):
+        elif keyword in ("kd", "pr", "pm", "d", "tr", *BEYOND):
             try:
                 entry.numbers[keyword] = [float(value) for value in rest.split()]
             except ValueError:  # "Kd spectral file.rfl" and the like
                 entry.ignored.add(f"{keyword} {rest[:20]}")
     return entries
+
+
+def read_libraries(folder: ModelFolder, names: Iterable[str], used: set[str]) -> dict[str, MtlEntry]:
+    """The materials of several files by name; none where none is used.
+
+    Raises:
+        UnirenderError: a file cannot be read and a material that is used stands in no other, or there are too many.
+    """
+    entries: dict[str, MtlEntry] = {}
+    missing: UnirenderError | None = None
+    for name in names if used else ():
+        texts, lost = _library_texts(folder, name)
+        missing = missing or lost
+        for text in texts:
+            entries |= parse_mtl(text.decode("utf-8", "surrogateescape"))
+            check_materials(len(entries))
+    if missing is not None and used - entries.keys():
+        raise missing
+    return entries
+
+
+def _library_texts(folder: ModelFolder, name: str) -> tuple[list[bytes], UnirenderError | None]:
+    """A file, whose name may hold spaces, or else several in a line; and why the last one that is lost is so."""
+    parts, texts, missing = name.split(), [], None
+    for some in ([name], parts) if len(parts) > 1 else ([name],):
+        missing = None
+        for part in some:
+            try:
+                texts.append(folder.read(part, "material library", limit=MAX_TEXT_BYTES))
+            except UnirenderError as error:
+                missing = error
+        if texts:
+            break
+    return texts, missing
 
 
 def _map(rest: str) -> tuple[str, dict[str, list[str]]]:
@@ -104,8 +143,9 @@ class MtlMaterials:
         self.ignored = {what for entry in here for what in entry.ignored}
         if any(_opacity(entry) < 1 for entry in here):
             self.ignored.add("alpha")
-        if any(max(entry.numbers.get("ke", [0.0]), default=0.0) > 0 for entry in here):
-            self.ignored.add("emission")
+        for keyword, what in BEYOND.items():
+            if any(max(entry.numbers.get(keyword, [0.0]), default=0.0) > 0 for entry in here):
+                self.ignored.add(what)
 
     def make(self, name: str | None, textured: bool, colored: bool) -> Material:
         """A material on faces that have texture coordinates or not, and colours of their own or not.
@@ -153,7 +193,9 @@ class MtlMaterials:
             texels, buried = tangent_normals(texels, _number(options.get("-bm"), 1.0))
             self.ignored |= buried
         elif channel != "albedo":
-            texels = texels[..., :1]
+            which = (options.get("-imfchan") or [""])[0].lower()
+            texels = _one_channel(texels, which, f"texture {file!r} of {channel}")
+        self.ignored |= {f"{name} of a map" for name in UNHEEDED if _is_unheeded(name, options.get(name, []))}
         # OBJ counts v from below: v_down = 1 - (s v_up + o), in terms of the 1 - v_up that the reader stores
         (su, sv), (ou, ov) = _pair(options.get("-s"), 1.0), _pair(options.get("-o"), 0.0)
         transform = np.array([[su, 0, ou], [0, sv, 1 - sv - ov]])
@@ -166,6 +208,32 @@ def _opacity(entry: MtlEntry) -> float:
     if entry.numbers.get("d"):
         return entry.numbers["d"][0]
     return 1 - (entry.numbers.get("tr") or [0.0])[0]
+
+
+def _one_channel(texels: Float[np.ndarray, "h w 3"], which: str, what: str) -> Float[np.ndarray, "h w 1"]:
+    """The values of a texture of numbers, from the channel that `-imfchan` names; "" where all are alike.
+
+    Raises:
+        UnirenderError: nothing says which channel of a picture in colour, or another one than r, g and b is named.
+    """
+    if which in ("r", "g", "b"):
+        return texels[..., ["r", "g", "b"].index(which)][..., None]
+    if which == "l":
+        return luminance(texels)[..., None]
+    if which:
+        raise UnirenderError(f"{what}: got -imfchan {which}, expected r, g, b or l; correct the MTL")
+    if (difference := float(np.ptp(texels, axis=-1).mean())) > COLOURED:
+        raise UnirenderError(
+            f"{what}: is in colour (its channels differ by {difference:.2g} in the mean), expected one value a texel; "
+            "name the channel in front of the file, as -imfchan g, or save it as grey"
+        )
+    return texels[..., :1]
+
+
+def _is_unheeded(name: str, words: list[str]) -> bool:
+    """Whether an option that is not read would change its map."""
+    values = [float(word) for word in words if _is_number(word)]
+    return (*values, *UNHEEDED[name][len(values) :]) != UNHEEDED[name]
 
 
 def _number(words: list[str] | None, default: float) -> float:

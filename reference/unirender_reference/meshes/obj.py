@@ -8,7 +8,7 @@ import codecs
 import io
 import re
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -22,14 +22,13 @@ from unirender_reference.meshes.colors import unit_colors
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.limits import (
     MAX_LINE_BYTES,
-    MAX_TEXT_BYTES,
     MAX_VERTICES,
     check_bytes,
     check_faces,
     check_geometry,
     check_materials,
 )
-from unirender_reference.meshes.mtl import MtlEntry, MtlMaterials, parse_mtl
+from unirender_reference.meshes.mtl import MtlMaterials, read_libraries
 from unirender_reference.meshes.normals import piece_normals
 from unirender_reference.meshes.polygons import fans, triangulate
 from unirender_reference.meshes.surface import BARE, Material, Model, Piece
@@ -161,7 +160,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
     mesh = _Corners(lines)
     names = list(lines.names)
     used = [names[i] for i in np.unique(mesh.owner)]
-    entries = _libraries(folder, lines.libraries) if any(name is not None for name in used) else {}
+    entries = read_libraries(folder, lines.libraries, {name for name in used if name is not None})
     mapped = np.array([bool(name in entries and entries[name].maps) for name in names])
     materials = MtlMaterials(folder, entries, used)
     made: dict[tuple[str | None, bool, bool], Material] = {}
@@ -270,21 +269,6 @@ def _colors(lines: _Lines, count: int) -> Float[np.ndarray, "n 3"] | None:
     colors = np.full((count, 3), np.nan)
     colors[np.array(lines.colored)] = srgb_decode(unit_colors(np.array(lines.colors).reshape(-1, 3)))
     return colors
-
-
-def _libraries(folder: ModelFolder, names: Iterable[str]) -> dict[str, MtlEntry]:
-    entries: dict[str, MtlEntry] = {}
-    for name in names:
-        try:
-            texts = [folder.read(name, "material library", limit=MAX_TEXT_BYTES)]
-        except UnirenderError:
-            if len(name.split()) < 2:
-                raise
-            texts = (folder.read(part, "material library", limit=MAX_TEXT_BYTES) for part in name.split())  # several
-        for text in texts:
-            entries |= parse_mtl(text.decode("utf-8", "surrogateescape"))
-            check_materials(len(entries))
-    return entries
 
 
 def _lacking(index: Int[np.ndarray, "m 3"], values: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " m"]:
