@@ -68,6 +68,13 @@ def spaced(found: Table) -> str:
     return to_markdown(found).replace(NO_BREAK, " ")
 
 
+def printed(found: Table, width: int = 200) -> str:
+    """What a terminal shows."""
+    buffer = StringIO()
+    print_table(Console(file=buffer, width=width), found)
+    return buffer.getvalue()
+
+
 def row(found: Table, label: str) -> Row:
     return next(r for r in found.rows if r.label.startswith(label))
 
@@ -164,9 +171,7 @@ def test_a_cell_on_fewer_samples_than_its_columns_fullest_says_so_and_is_not_ran
     assert [r.cells[albedo].measured_rank for r in found.rows] == [1, 1, None]
     assert [r.cells[metallic].measured_rank for r in found.rows] == [1, 1, 1]
     assert fewer(found) == "c (Albedo n = 2)."
-    buffer = StringIO()
-    print_table(Console(file=buffer, width=200), found)
-    for text in (spaced(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+    for text in (spaced(found), to_latex(found), printed(found).partition("Protocol")[0]):
         (line,) = (line for line in text.splitlines() if re.match(r"(\| )? ?c ", line))
         assert line.count("(n = 2)") == 1
         assert text.count("n = 2") == 1 + (text.count("Albedo n = 2"))
@@ -195,9 +200,7 @@ def test_a_cell_on_the_same_share_of_its_column_has_its_own_n() -> None:
     found = counted({"a": 8, "b": 4}, {"a": 4, "b": 2})
     assert labels(found) == ["a", "b (n = 4)"]
     assert fewer(found) == "b (n = 4, Metallic n = 2)."
-    buffer = StringIO()
-    print_table(Console(file=buffer, width=200), found)
-    for text in (spaced(found), to_latex(found), buffer.getvalue().partition("Protocol")[0]):
+    for text in (spaced(found), to_latex(found), printed(found).partition("Protocol")[0]):
         (full,) = (line for line in text.splitlines() if re.match(r"(\| )? ?a ", line))
         (half,) = (line for line in text.splitlines() if re.match(r"(\| )? ?b ", line))
         assert "n =" not in full
@@ -231,9 +234,7 @@ def test_absurd_numbers_take_no_more_room_than_others() -> None:
 
 def test_a_limited_run_is_watermarked_in_every_format() -> None:
     found = table(run=replace(RUN, limit=3))
-    buffer = StringIO()
-    print_table(Console(file=buffer, width=100), found)
-    for text in (to_markdown(found), to_latex(found), to_json([found]), buffer.getvalue()):
+    for text in (to_markdown(found), to_latex(found), to_json([found]), printed(found, 100)):
         assert re.search(r"-?-limit 3: a partial run, not a result", text)
     assert "partial run" not in to_markdown(table())
 
@@ -253,10 +254,7 @@ def test_the_protocol_is_printed_with_every_format() -> None:
     assert {"resolution", "n", "coverage", "steps x samples", "seeds", "LPIPS", "interval", "suite", "truth"} <= set(
         names
     )
-    buffer = StringIO()
-    print_table(Console(file=buffer, width=90), found)
-    flat = " ".join(buffer.getvalue().split())
-    for text in (to_markdown(found), flat):
+    for text in (to_markdown(found), " ".join(printed(found, 90).split())):
         assert "resolution: 64 x 64" in text
         assert "own mask: Ours (sample)" in text
         assert "8 samples of 4 objects" in text
@@ -377,9 +375,7 @@ def test_in_a_narrow_cell_what_belongs_together_stays_on_a_line() -> None:
 def test_means_of_two_objects_have_no_interval_in_any_format() -> None:
     records = [record for record in RECORDS if record.object in ("o0", "o1")]
     of_two = build_table(TABLES["inverse"], records, RUN, protocol="single-image", variant=Variant("masked"))
-    printed = StringIO()
-    print_table(Console(file=printed, width=200), of_two)
-    for text in (to_markdown(of_two), to_latex(of_two), printed.getvalue()):
+    for text in (to_markdown(of_two), to_latex(of_two), printed(of_two)):
         assert "21.15" in text
         assert "±" not in text.replace(UNPRINTED, "")
         assert "pm$" not in text.replace(r"no $\pm$", "")
@@ -506,17 +502,13 @@ def test_json_is_strict_and_whole() -> None:
 
 def test_terminal_output_keeps_its_width() -> None:
     for width in (80, 200):
-        buffer = StringIO()
-        print_table(Console(file=buffer, width=width), table())
-        assert max(map(len, buffer.getvalue().splitlines())) <= width
+        assert max(map(len, printed(table(), width).splitlines())) <= width
 
 
 @pytest.mark.parametrize("width", [60, 80, 100])
 def test_a_narrow_terminal_cuts_no_number_short(width: int) -> None:
     """A group of columns that is too wide is split, and every block names its methods."""
-    buffer = StringIO()
-    print_table(Console(file=buffer, width=width), table())
-    text = buffer.getvalue().partition("Protocol")[0]
+    text = printed(table(), width).partition("Protocol")[0]
     assert "…" not in text
     blocks = text.split("Method")[1:]
     assert len(blocks) > 1 or width == 100

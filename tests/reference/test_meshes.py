@@ -3,13 +3,12 @@
 Every file is written here, most of them byte by byte: the loader must not be tested with its own library alone.
 """
 
-import json
 import re
-import struct
 
 import numpy as np
 import pytest
 import trimesh
+from gltf_files import CORNERS, QUAD_FACES, QUAD_UV, GltfWriter
 from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
@@ -21,9 +20,7 @@ from unirender_reference.meshes.limits import texture_side
 from unirender_reference.shapes import MeshObject, signed_volume
 from unirender_reference.shapes.surface import face_normals
 
-QUAD = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
-QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.uint16)
-CORNERS = {
+COLORS = {
     "top-left": (255, 0, 0),
     "top-right": (0, 255, 0),
     "bottom-left": (0, 0, 255),
@@ -35,54 +32,9 @@ def four_colors(size: int = 8) -> Image.Image:
     """Red, green / blue, grey quarters, seen with the first row on top."""
     picture = np.zeros((size, size, 3), np.uint8)
     half = size // 2
-    picture[:half, :half], picture[:half, half:] = CORNERS["top-left"], CORNERS["top-right"]
-    picture[half:, :half], picture[half:, half:] = CORNERS["bottom-left"], CORNERS["bottom-right"]
+    picture[:half, :half], picture[:half, half:] = COLORS["top-left"], COLORS["top-right"]
+    picture[half:, :half], picture[half:, half:] = COLORS["bottom-left"], COLORS["bottom-right"]
     return Image.fromarray(picture)
-
-
-def write_glb(path, uv, image_bytes=None, factor=None, colors=None):
-    """A quad as binary glTF 2.0, from the specification."""
-    blobs = [QUAD.tobytes(), QUAD_FACES.tobytes(), np.asarray(uv, np.float32).tobytes()]
-    accessors = [
-        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3", "min": [-1, -1, 0], "max": [1, 1, 0]},
-        {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
-        {"bufferView": 2, "componentType": 5126, "count": 4, "type": "VEC2"},
-    ]
-    attributes = {"POSITION": 0, "TEXCOORD_0": 2}
-    material: dict = {"metallicFactor": 0.0}
-    header: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
-    if factor is not None:
-        material["baseColorFactor"] = [*factor, 1.0]
-    if image_bytes is not None:
-        material["baseColorTexture"] = {"index": 0}
-        header |= {"textures": [{"source": 0}], "images": [{"bufferView": len(blobs), "mimeType": "image/png"}]}
-        blobs.append(image_bytes)
-    if colors is not None:
-        attributes["COLOR_0"] = len(accessors)
-        accessors.append({"bufferView": len(blobs), "componentType": 5126, "count": 4, "type": "VEC4"})
-        blobs.append(np.asarray(colors, np.float32).tobytes())
-    body, views = b"", []
-    for blob in blobs:
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(blob)})
-        body += blob + b"\0" * (-len(blob) % 4)
-    primitive = {"attributes": attributes, "indices": 1, "material": 0}
-    header |= {
-        "materials": [{"pbrMetallicRoughness": material}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(body)}],
-    }
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-    return path
-
-
-def png_bytes(tmp_path, image: Image.Image) -> bytes:
-    image.save(tmp_path / "texture.png")
-    return (tmp_path / "texture.png").read_bytes()
 
 
 def lookup(obj: MeshObject, x: float, y: float) -> np.ndarray:
@@ -99,55 +51,32 @@ def lookup(obj: MeshObject, x: float, y: float) -> np.ndarray:
     raise AssertionError("outside the quad")
 
 
-def assert_four_colors(obj: MeshObject, factor=(1.0, 1.0, 1.0)):
+def assert_four_colors(obj: MeshObject):
     for name, (x, y) in {
         "top-left": (-0.5, 0.6),
         "top-right": (0.5, 0.6),
         "bottom-left": (-0.5, -0.6),
         "bottom-right": (0.5, -0.6),
     }.items():
-        linear = srgb_decode(np.array(CORNERS[name], np.float32) / 255) * np.array(factor)
+        linear = srgb_decode(np.array(COLORS[name], np.float32) / 255)
         assert lookup(obj, x, y) == pytest.approx(linear, abs=5e-3), name
 
 
-GLTF_UV = [[0, 1], [1, 1], [1, 0], [0, 0]]  # glTF: v = 0 is the first row
-
-
-def test_glb_with_texture_and_factor(tmp_path):
-    path = write_glb(tmp_path / "quad.v2.glb", GLTF_UV, png_bytes(tmp_path, four_colors()), factor=(0.5, 1.0, 0.25))
-    obj = load_mesh(path)
-    assert obj.name == "quad-v2"
-    assert obj.family == "mesh"
-    assert obj.normals == pytest.approx(np.tile([0, 0, 1], (4, 1)), abs=1e-6)
-    assert np.linalg.norm(obj.vertices, axis=1) == pytest.approx(1, abs=1e-5)
-    assert_four_colors(obj, factor=(0.5, 1.0, 0.25))
-
-
-def test_glb_factor_is_linear(tmp_path):
-    obj = load_mesh(write_glb(tmp_path / "quad.glb", GLTF_UV, factor=(0.5, 0.2, 0.8)))
-    assert obj.albedo == pytest.approx([0.5, 0.2, 0.8], abs=1e-6)
-
-
-def test_glb_vertex_colors_interpolate(tmp_path):
-    colors = [[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0.5, 0.5, 0.5, 1]]
-    obj = load_mesh(write_glb(tmp_path / "quad.glb", GLTF_UV, colors=colors))
-    assert obj.uv is not None
-    # bilinear lookup at each corner gives back that corner's colour
-    h, w, _ = obj.albedo.shape
-    for vertex, uv in zip(obj.vertices, obj.uv, strict=True):
-        corner = int(np.argmin(np.linalg.norm(QUAD / np.sqrt(2) - vertex, axis=1)))
-        texel = obj.albedo[int(uv[1] * h), int(uv[0] * w)]
-        assert texel == pytest.approx(colors[corner][:3], abs=1 / 128)
+def write_textured(path, uv):
+    writer = GltfWriter()
+    base = {"index": writer.texture(np.asarray(four_colors()))}
+    writer.mesh(writer.quad(writer.material(pbrMetallicRoughness={"baseColorTexture": base}), uv=uv))
+    return writer.glb(path)
 
 
 def write_obj(tmp_path, uv, material: str) -> None:
-    lines = ["mtllib quad.mtl", *[f"v {x} {y} {z}" for x, y, z in QUAD], *[f"vt {u} {v}" for u, v in uv]]
+    lines = ["mtllib quad.mtl", *[f"v {x} {y} {z}" for x, y, z in CORNERS], *[f"vt {u} {v}" for u, v in uv]]
     (tmp_path / "quad.obj").write_text("\n".join([*lines, "usemtl m", "f 1/1 2/2 3/3", "f 1/1 3/3 4/4", ""]))
     (tmp_path / "quad.mtl").write_text(f"newmtl m\n{material}\n")
 
 
 def test_obj_with_texture_counts_v_from_below_and_ignores_kd(tmp_path):
-    png_bytes(tmp_path, four_colors())
+    four_colors().save(tmp_path / "texture.png")
     write_obj(tmp_path, [[0, 0], [1, 0], [1, 1], [0, 1]], "Kd 0.2 0.2 0.2\nmap_Kd texture.png")
     assert_four_colors(load_mesh(tmp_path / "quad.obj"))
 
@@ -158,13 +87,13 @@ def test_obj_kd_is_srgb(tmp_path):
 
 
 def test_repeating_texture_is_unrolled(tmp_path):
-    uv = np.array(GLTF_UV) * 3 - 1  # nine copies, from -1 to 2
-    obj = load_mesh(write_glb(tmp_path / "quad.glb", uv, png_bytes(tmp_path, four_colors())))
+    obj = load_mesh(write_textured(tmp_path / "quad.v2.glb", QUAD_UV * 3 - 1))  # nine copies, from -1 to 2
+    assert (obj.name, obj.family) == ("quad-v2", "mesh")
     for x in (-1, 0, 1):
         for y in (-1, 0, 1):
             point = np.array([x, y]) * 2 / 3 + np.array([-1, 1]) / 6  # the red quarter of each copy
             assert lookup(obj, *point) == pytest.approx([1, 0, 0], abs=5e-3)
-    far = load_mesh(write_glb(tmp_path / "far.glb", np.array(GLTF_UV) * 50, png_bytes(tmp_path, four_colors())))
+    far = load_mesh(write_textured(tmp_path / "far.glb", QUAD_UV * 50))
     assert far.provenance["textures_averaged"] == "1"
     assert far.albedo == pytest.approx(load_linear_mean(), abs=5e-3)
 
@@ -363,8 +292,8 @@ def test_names_of_colors_in_ply_files(tmp_path, names, binary):
     head += [*(f"property uchar {name}" for name in names), "element face 2"]
     head += ["property list uchar int vertex_indices", "end_header", ""]
     if binary:
-        body = b"".join(point.tobytes() + bytes([128, 64, 255]) for point in QUAD)
-        body += b"".join(b"\3" + face.astype("<i4").tobytes() for face in QUAD_FACES)
+        body = b"".join(point.tobytes() + bytes([128, 64, 255]) for point in CORNERS)
+        body += b"".join(b"\3" + face.astype("<i4").tobytes() for face in QUAD_FACES.reshape(2, 3))
     else:
         body = "\n".join([*(f"{line} 128 64 255" for line in CORNER_LINES), "3 0 1 2", "3 0 2 3", ""]).encode()
     (tmp_path / "a.ply").write_bytes("\n".join(head).encode() + body)

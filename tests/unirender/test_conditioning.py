@@ -150,12 +150,6 @@ def test_priors_agree_with_their_numpy_originals(name: str) -> None:
 
 
 def test_an_unknown_prior_is_refused(cond: c.Conditioning) -> None:
-    config = {"hdr_curves": None, "environment_size": (16, 32), "physics_prior": "phong", "light": "latent"}
+    config = {"hdr_curves": None, "environment_size": (16, 32), "physics_prior": "phong"}
     with pytest.raises(UnirenderError, match="physics_prior: got 'phong'"):
-        c.Conditioning.of(config, cond.codec)
-
-
-def test_an_unknown_way_of_the_light_is_refused(cond: c.Conditioning) -> None:
-    config = {"hdr_curves": None, "environment_size": (16, 32), "physics_prior": "none", "light": "sixth"}
-    with pytest.raises(UnirenderError, match="light: got 'sixth', expected one of: latent, encoder"):
         c.Conditioning.of(config, cond.codec)

@@ -76,9 +76,8 @@ def test_exchange_happens_before_fusion() -> None:
         for p in bridge.parameters():
             p.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
     a, i, t_a, t_i = inputs(model)
-    context = model.context(a, i, None)
-    e_a = model.encode(model.attribute_unet, a, t_a, context, None, None)
-    e_i = model.encode(model.image_unet, i, t_i, context, None, None)
+    e_a = model.encode(model.attribute_unet, a, t_a, None, None)
+    e_i = model.encode(model.image_unet, i, t_i, None, None)
     assert [f.shape[1] for f in e_a.features] == pyramid_channels(model.attribute_unet)
     fused = [
         mine + conv(theirs)

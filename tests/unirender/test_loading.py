@@ -125,6 +125,7 @@ def test_a_config_of_another_network_is_refused(folder: Path) -> None:
     ("file", "options", "says"),
     [
         (CONFIG, {"lamps": 3}, r"config\.json: options lamps are not known to this DualStreamModel.*update unirender"),
+        (CONFIG, {"light": "encoder"}, r"config\.json: has light 'encoder', which is gone, expected 'latent'"),
         ("model_index.json", {"gamma": 2}, r"model_index\.json: options gamma are not known to this UniRenderPipeline"),
         ("model_index.json", {"material": "both"}, "material: got 'both', expected 'scalar' or 'map'"),
         (CONFIG, {"hdr_curves": {"specular": [10, 20]}}, "hdr_curves: got specular, expected one of each of: specular"),

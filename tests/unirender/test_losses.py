@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any, Literal
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from unirender.camera import Camera
 from unirender.diffusion import inference
-from unirender.diffusion.inference import infer_attributes
 from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.build import build_model
@@ -24,7 +23,7 @@ from unirender.training import consistency as consistency_module
 from unirender.training import loss_terms
 from unirender.training.config import LossConfig
 from unirender.training.consistency import Consistency
-from unirender.training.loss_terms import Errors, compressed, timestep_weights
+from unirender.training.loss_terms import Errors, compressed
 from unirender.training.losses import DROPPABLE, LossFunction
 
 T = 999
@@ -149,24 +148,6 @@ def test_albedo_and_light_are_compressed_picture_by_picture_and_nothing_else_is(
     assert floored["albedo"] < squared["albedo"]
 
 
-def test_compressed_errors_are_weighted_by_timestep_too() -> None:
-    errors = Errors(loss_function().conditioning, background=0.02)
-    mask, clean, rows = make_batch()["mask"], torch.zeros(4, 72, 16, 16), torch.tensor([1.0, 2.0, 0.0, 5.0])
-    predicted = clean + torch.linspace(0.1, 0.5, 4)[:, None, None, None]
-    for found, alone in (
-        (
-            errors.image(predicted[:, :12], clean[:, :12], mask, rows, 0.02),
-            lambda x, m: errors.image(x, 0 * x, m, None, 0.02),
-        ),
-        (
-            errors.attributes(predicted, clean, mask, rows, 0.02)["albedo"],
-            lambda x, m: errors.attributes(x.repeat(1, 6, 1, 1), 0 * x.repeat(1, 6, 1, 1), m, None, 0.02)["albedo"],
-        ),
-    ):
-        each = [float(alone(predicted[i : i + 1, :12], mask[i : i + 1])) for i in range(4)]
-        assert float(found) == pytest.approx(sum(w * e for w, e in zip(rows.tolist(), each, strict=True)) / 4, rel=1e-5)
-
-
 def test_total_is_the_weighted_sum() -> None:
     loss = loss_function(albedo=3.0, cycle=2.0)
     loss.cycle_scale = 0.5
@@ -191,73 +172,6 @@ def test_any_timesteps_are_compared_where_they_are_noisy() -> None:
         assert same & {"albedo", "image", "composite"} == kept & {"albedo", "image", "composite"}, changed
 
 
-# --- weights by timestep
-
-
-def test_timestep_weights_are_the_closed_forms() -> None:
-    scheduler = make_scheduler()
-    t = torch.tensor([1, 10, 150, 300, 500, 998, T])
-    alpha_bar = scheduler.alphas_cumprod.double()[t]
-    snr = alpha_bar / (1 - alpha_bar)
-    v, min_snr = (timestep_weights(kind, 5.0, scheduler, t) for kind in ("v", "min_snr"))
-    assert v is not None
-    assert min_snr is not None
-    torch.testing.assert_close(v.double(), 1 / (1 - alpha_bar), rtol=1e-3, atol=0)
-    torch.testing.assert_close(min_snr.double(), snr.clamp(1, 5), rtol=1e-3, atol=0)
-    assert min_snr[0] == 5
-    assert v[-1] == min_snr[-1] == 1  # pure noise: as without weights
-    assert 1 < min_snr[3] < 5  # neither bound
-    assert timestep_weights("none", 5.0, scheduler, t) is None
-
-
-def test_the_v_weight_is_the_error_of_v() -> None:
-    scheduler = make_scheduler()
-    t = torch.tensor([1, 100, 500, 900, T])
-    alpha_bar = scheduler.alphas_cumprod.double()[t]
-    clean, noise, predicted = torch.randn(3, 5, dtype=torch.float64, generator=generator())
-    x_t = alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * noise
-
-    def v_of(x_0: Tensor) -> Tensor:
-        eps = (x_t - alpha_bar.sqrt() * x_0) / (1 - alpha_bar).sqrt()
-        return alpha_bar.sqrt() * eps - (1 - alpha_bar).sqrt() * x_0
-
-    weights = timestep_weights("v", 5.0, scheduler, t)
-    assert weights is not None
-    expected = (v_of(clean) - v_of(predicted)).square()
-    torch.testing.assert_close(weights.double() * (clean - predicted).square(), expected, rtol=1e-3, atol=0)
-
-
-@pytest.mark.parametrize("kind", ["v", "min_snr"])
-def test_each_row_is_weighted_by_its_own_timestep(kind: Literal["v", "min_snr"]) -> None:
-    """In both streams: the terms of a batch are the means of its rows' terms, times the weights of their timesteps."""
-    t = Timesteps(torch.tensor([0, 0, 100, 600]), torch.tensor([150, T, 0, 0]))
-    loss = loss_function(cycle=0.0, timestep_weight=kind)
-    plain = Errors(loss.conditioning, 0.02)
-    mask, noise = make_batch()["mask"], torch.randn(4, 72, 16, 16, generator=generator())
-    for stream, error in (
-        (t.image[:2], lambda rows, w: plain.image(noise[rows, :12], 0 * noise[rows, :12], mask[rows], w)),
-        (t.attributes[2:], lambda rows, w: plain.attributes(noise[rows], 0 * noise[rows], mask[rows], w)["albedo"]),
-        (
-            t.attributes[2:],
-            lambda rows, w: plain.attributes(noise[rows], 0 * noise[rows], mask[rows], w)["environment"],
-        ),
-    ):
-        weights = timestep_weights(kind, 5.0, loss.scheduler, stream)
-        assert weights is not None
-        by_hand = sum(float(w) * float(error(slice(i, i + 1), None)) for i, w in enumerate(weights)) / 2
-        assert float(error(slice(0, 2), weights)) == pytest.approx(by_hand, rel=1e-5)
-        assert float(error(slice(0, 2), weights.flip(0))) != pytest.approx(by_hand, rel=1e-3)
-    without = loss_function(cycle=0.0)
-    batch = {name: value[:1] for name, value in make_batch().items()}
-    for row in (0, 2):  # one of each direction
-        one = Timesteps(t.attributes[row : row + 1], t.image[row : row + 1])
-        weight = timestep_weights(kind, 5.0, loss.scheduler, one.attributes + one.image)
-        assert weight is not None
-        expected = {name: float(weight) * value for name, value in values(without, one, batch).items()}
-        assert values(loss, one, batch) == pytest.approx(expected, rel=1e-5)
-    assert values(loss, inverse()) == values(without, inverse())  # pure noise: bit for bit
-
-
 # --- cycle
 
 
@@ -270,11 +184,8 @@ def gradients(loss: LossFunction, term: str, dtype: torch.dtype = torch.float32)
     return {name: g for name, g in zip(names, found, strict=True) if g is not None and g.any()}
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_cycle_gradient_into_the_renderer_is_a_switch(steps: int) -> None:
-    detached, attached = (
-        gradients(loss_function(cycle_into_renderer=into, cycle_steps=steps), "cycle") for into in (False, True)
-    )
+def test_cycle_gradient_into_the_renderer_is_a_switch() -> None:
+    detached, attached = (gradients(loss_function(cycle_into_renderer=into), "cycle") for into in (False, True))
     decoder = "image_unet.up_blocks"
     assert any(name.startswith(decoder) for name in attached)
     assert not any(name.startswith(decoder) for name in detached)  # the inverse pass decodes attributes only
@@ -349,51 +260,9 @@ def test_the_cycle_asks_the_network_what_a_rendering_asks_it(monkeypatch: pytest
         torch.testing.assert_close(one.detach(), other, rtol=0, atol=1e-4)
 
 
-def test_the_cycle_of_a_sample_is_that_of_a_sample() -> None:
-    """Its attributes are those of inference with as many steps; the step's own prediction plays no part in it."""
-    loss, batch = loss_function(cycle_steps=3), make_batch()
-    clean_i, mask = loss.conditioning.encode_image(batch["image"]), batch["mask"]
-    drawn = consistency(loss).sample(clean_i, mask, generator())
-    parts = (loss.model, loss.conditioning, loss.scheduler, batch["image"], mask)
-    for steps, same in ((3, True), (2, False)):
-        maps = infer_attributes(*parts, steps=steps, generator=generator())
-        assert torch.allclose(loss.conditioning.decode_attributes(drawn)["albedo"], maps["albedo"], atol=1e-5) == same
-    predicted = torch.zeros(4, 72, 16, 16)
-    for steps, same in ((3, True), (1, False)):
-        each = consistency(loss_function(cycle_steps=steps))
-        a, b = (float(each.cycle(x, clean_i, mask, generator()).detach()) for x in (predicted, predicted + 0.5))
-        assert (a == b) == same
-
-
-def test_only_the_last_step_of_a_sample_has_a_gradient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gradient on the weights is that of one pass from the state that the other steps led to."""
-    loss, batch = loss_function(cycle_steps=2), make_batch(2)
-    clean_i = loss.conditioning.encode_image(batch["image"])
-    inputs: list[tuple[Any, Any]] = []
-    forward = loss.model.forward
-
-    def record(*args: Any, **kwargs: Any) -> DualStreamOutput:
-        inputs.append((args, kwargs))
-        return forward(*args, **kwargs)
-
-    monkeypatch.setattr(loss.model, "forward", record)
-    weight = loss.model.attribute_unet.conv_in.weight
-    drawn = consistency(loss).sample(clean_i, batch["mask"], generator())
-    (found,) = torch.autograd.grad(drawn.square().sum(), weight)
-    assert len(inputs) == 2
-    args, kwargs = inputs[-1]
-    last = forward(*args, **kwargs).attributes
-    assert last is not None
-    (expected,) = torch.autograd.grad(last.square().sum(), weight)
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("steps", [1, 2])
-def test_under_autocast_the_cycle_has_the_same_gradients(steps: int) -> None:
+def test_under_autocast_the_cycle_has_the_same_gradients() -> None:
     """Autocast keeps the casts of weights: one made without a gradient must not serve a pass that needs it."""
-    plain, cast = (
-        gradients(loss_function(cycle_steps=steps), "cycle", dtype) for dtype in (torch.float32, torch.bfloat16)
-    )
+    plain, cast = (gradients(loss_function(), "cycle", dtype) for dtype in (torch.float32, torch.bfloat16))
     # The attention to one token of a prompt has none but of rounding, which bfloat16 may have at zero.
     size = {name: float(g.abs().max()) for name, g in plain.items()}
     plainly = {name for name, largest in size.items() if largest > 1e-6 * max(size.values())}

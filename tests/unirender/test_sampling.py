@@ -220,7 +220,7 @@ def test_both_directions_see_through_the_camera() -> None:
 NETWORKS: dict[str, dict[str, Any]] = {
     "unified": {},
     "split": {"unified": False},
-    "light-encoder": {"light": "encoder", "physics_prior": "none"},
+    "no prior": {"physics_prior": "none"},
 }
 
 
@@ -271,13 +271,13 @@ def loop(
     clean = conditioning.encode_attributes(batch) if rendering else conditioning.encode_image(batch["image"])
     if rendering:
         unknown, noise = noise.split((72, 12), dim=1)
-        clean = torch.where(conditioning.by_triplet(conditioning.in_latents(given)), clean, unknown)
+        clean = torch.where(conditioning.by_triplet(given), clean, unknown)
     zero = torch.zeros(len(clean), dtype=torch.long)
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
         streams = (clean, x_t, zero, t) if rendering else (x_t, clean, t, zero)
         other: Any = {"attribute_rows" if rendering else "image_rows": None}
-        output = model(*streams, extras.attributes, extras.image, extras.prior, extras.light, **other)
+        output = model(*streams, extras.attributes, extras.image, extras.prior, **other)
         x_0 = output.image if rendering else output.attributes
         assert x_0 is not None
         return x_0

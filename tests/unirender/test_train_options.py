@@ -10,7 +10,6 @@ from synthetic_shards import write_dataset
 
 from unirender import cli
 from unirender.errors import UsageError
-from unirender.training.checkpoint import STATE_FILE
 from unirender.training.command import Train
 from unirender.training.config import RunConfig
 from unirender.training.presets import PRESETS
@@ -48,8 +47,6 @@ def test_options_count_in_python_as_in_the_command(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match=message):
             train(options, own, tmp_path / "run")
-    with pytest.raises(UsageError, match=r"it trains a part of a network .* expected --init with a trained one"):
-        train(Train(tmp_path), PRESETS["tiny_inverse"], tmp_path / "run")
 
 
 def test_every_option_of_a_run_reaches_it(tmp_path: Path) -> None:
@@ -62,15 +59,6 @@ def test_every_option_of_a_run_reaches_it(tmp_path: Path) -> None:
     assert found == RunConfig(tmp_path / "run", **given, parallel=8, preset="tiny", scored_on=scored)
     unlimited = run_config(Train(tmp_path), PRESETS["tiny"], tmp_path, 1)
     assert unlimited == RunConfig(tmp_path, steps=PRESETS["tiny"].steps, preset="tiny")
-
-
-def test_a_run_of_a_part_goes_on_without_what_it_began_with(tmp_path: Path) -> None:
-    """Its state has all weights, and the folder that it began with may be gone."""
-    run = Train(Path("data"), preset="tiny_inverse", out=tmp_path)
-    with pytest.raises(UsageError, match="expected --init with a trained one"):
-        run.check()
-    (tmp_path / STATE_FILE).touch()
-    assert run.check().trains == "inverse"
 
 
 @pytest.mark.parametrize(("command", "result"), [("train", "pipeline"), ("train-visibility", "visibility.safetensors")])

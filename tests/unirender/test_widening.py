@@ -74,14 +74,6 @@ def test_the_old_channels_of_a_block_go_on_alone(block: str) -> None:
     assert (wrong - expected).square().mean() > 0.5 * expected.var()
 
 
-def test_a_part_of_a_network_is_not_widened(tmp_path: Path) -> None:
-    model = dataclasses.replace(MODEL, **NARROW | WIDE)
-    config = dataclasses.replace(TRAIN, model=model, trains="renderer", p_render=1.0)
-    run = Trainer(config, RunConfig(tmp_path, steps=1), torch.device("cpu"), torch.float32)
-    with pytest.raises(UnirenderError, match="trains its renderer alone"):
-        begin_with_network(run, make_model(**NARROW)[0])
-
-
 def test_a_run_begins_with_a_narrower_network(tmp_path: Path) -> None:
     config = dataclasses.replace(TRAIN, model=dataclasses.replace(MODEL, **NARROW | WIDE))
     run = Trainer(config, RunConfig(tmp_path, steps=1), torch.device("cpu"), torch.float32)

@@ -11,7 +11,6 @@ from unirender_reference.measure.contact_sheet import Sheet
 from unirender_reference.measure.cost import Cost
 from unirender_reference.measure.exposure import Exposure
 from unirender_reference.measure.noise_floor import NoiseFloor
-from unirender_reference.measure.overhead import Overhead
 from unirender_reference.measure.passes import Passes
 from unirender_reference.measure.shade_ceiling import ShadeCeiling
 from unirender_reference.measure.shape import ShapeMeasure
@@ -30,7 +29,6 @@ class Reference:
         | Annotated[Passes, tyro.conf.subcommand("passes")]
         | Annotated[ShadeCeiling, tyro.conf.subcommand("shade-ceiling")]
         | Annotated[Cost, tyro.conf.subcommand("cost")]
-        | Annotated[Overhead, tyro.conf.subcommand("overhead")]
         | Annotated[Exposure, tyro.conf.subcommand("exposure")]
         | Annotated[Sheet, tyro.conf.subcommand("sheet")]
         | Annotated[ShapeMeasure, tyro.conf.subcommand("shape")]

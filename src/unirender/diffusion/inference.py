@@ -67,7 +67,6 @@ def infer_attributes(
             clean,
             extras.attributes,
             extras.image,
-            light=extras.light,
             image_rows=None,
         )
         condition = output.encoded_image  # the same at every step
@@ -114,7 +113,7 @@ def infer_image(
     channels = (latents.shape[1], conditioning.codec.channels)
     noise = draw_noise((len(latents), sum(channels), *latents.shape[-2:]), latents, generator)
     unknown, x_T = noise.split(channels, dim=1)
-    shown = conditioning.by_triplet(conditioning.in_latents(given))
+    shown = conditioning.by_triplet(given)
     attributes = torch.where(shown, latents, unknown).to(model.dtype)
     extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera, derived).to(attributes)
     clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
@@ -130,7 +129,6 @@ def infer_image(
             extras.attributes,
             extras.image,
             image_prior=extras.prior,
-            light=extras.light,
             attribute_rows=None,
         )
         condition = output.encoded_attributes  # the same at every step
@@ -169,10 +167,8 @@ def extras_by_camera(
         for i, own in enumerate(camera)
     ]
     priors = [row.prior for row in rows if row.prior is not None]
-    lights = [row.light for row in rows if row.light is not None]
     return Extras(
         torch.cat([row.attributes for row in rows]),
         torch.cat([row.image for row in rows]),
         torch.cat(priors) if priors else None,
-        torch.cat(lights) if lights else None,
     )

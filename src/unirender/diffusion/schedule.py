@@ -52,9 +52,3 @@ def add_noise(
     """x_t; exactly `clean` at 0 and exactly `noise` at T."""
     alpha_bar = scheduler.alphas_cumprod.to(clean.device)[timestep][:, None, None, None]
     return alpha_bar.sqrt() * clean + (1 - alpha_bar).sqrt() * noise
-
-
-def signal_to_noise(scheduler: DDIMScheduler, timestep: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
-    """SNR = alpha_bar / (1 - alpha_bar): infinite at 0, exactly 0 at T."""
-    alpha_bar = scheduler.alphas_cumprod.to(timestep.device)[timestep]
-    return alpha_bar / (1 - alpha_bar)

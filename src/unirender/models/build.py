@@ -20,7 +20,6 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         "hdr_curves": HDR_CURVES,
         "environment_size": ENVIRONMENT_SIZE,
         "physics_prior": config.physics_prior,
-        "light": config.light,
         "derived_light": config.derived_light,
     }
     conditioning = Conditioning.of(recorded, codec)
@@ -42,7 +41,6 @@ def build_model(config: ModelConfig, vae: nn.Module | None = None) -> tuple[Dual
         linear_projection=config.linear_projection,
         codec=config.codec,
         patch=config.patch,
-        picture_features=config.picture_features,
         **recorded,
     )
     if config.physics_prior != "none":

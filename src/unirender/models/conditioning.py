@@ -1,9 +1,7 @@
 """From maps to everything that the two streams see, and back.
 
 `unirender.models.packing` says what the six attribute pictures are. Whatever else a stream sees (presence flags, mask,
-rays, prior) enters as *extra* channels, beside the latents. A network may see a given light through an encoder of its
-own *instead* of as the sixth picture. That picture then holds noise in rendering; the network still predicts the light
-there.
+rays, prior) enters as *extra* channels, beside the latents.
 
 Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
 """
@@ -19,19 +17,11 @@ from unirender.camera import Camera
 from unirender.color import HdrCurve
 from unirender.errors import UnirenderError
 from unirender.models.codec import Codec
-from unirender.models.light_encoder import CHANNELS
 from unirender.models.packing import HDR_CURVES, TRIPLETS, Packing, pack_image, unpack_image
 from unirender.models.priors import PRIORS, Maps, Prior
 
-LIGHT = TRIPLETS.index("environment")
-LIGHTS = ("latent", "encoder")  # how a given light enters a network
 DERIVED_FLAG = 0.5  # between given and not given
 RAY_SCALE = 3.0  # brings the default camera's ray slopes to about [-1, 1]
-
-
-def coverage_of(extra: Float[Tensor, "b e h w"], factor: int) -> Float[Tensor, "b 1 H W"]:
-    """The mask in extra inputs that `Conditioning.extras` made, `factor` that of the codec."""
-    return F.pixel_shuffle(extra[:, len(TRIPLETS) : len(TRIPLETS) + factor**2], factor)
 
 
 def prior_picture(prior: Prior, maps: Maps, mask: Float[Tensor, "b 1 H W"], camera: Camera) -> Float[Tensor, "b 3 H W"]:
@@ -47,18 +37,15 @@ class Extras:
         attributes: of the attribute stream.
         image: of the image stream.
         prior: latents to which the image stream's output is added.
-        light: of the light's own encoder.
     """
 
     attributes: Float[Tensor, "b ea h w"]
     image: Float[Tensor, "b ei h w"]
     prior: Float[Tensor, "b c h w"] | None
-    light: Float[Tensor, "b 4 eh ew"] | None
 
     def to(self, like: Tensor) -> "Extras":
         """In dtype and on the device of `like`, but for the prior: the sum keeps its precision."""
-        light = None if self.light is None else self.light.to(like)
-        return Extras(self.attributes.to(like), self.image.to(like), self.prior, light)
+        return Extras(self.attributes.to(like), self.image.to(like), self.prior)
 
 
 @dataclass(frozen=True)
@@ -69,14 +56,12 @@ class Conditioning:
         codec: pictures <-> latents.
         packing: maps <-> pictures.
         physics_prior: the closed-form image that the image stream corrects.
-        light_encoder: whether a given light enters by an encoder of its own, not as the sixth picture.
         derived_light: whether the network is told which of s and d were derived from a light, without shadows.
     """
 
     codec: Codec
     packing: Packing
     physics_prior: Prior | None
-    light_encoder: bool
     derived_light: bool = False
 
     @classmethod
@@ -84,7 +69,7 @@ class Conditioning:
         """The conditioning that a model's config describes.
 
         Raises:
-            UnirenderError: an unknown physics prior, or way of the light, or other maps with a tone curve.
+            UnirenderError: an unknown physics prior, or other maps with a tone curve.
         """
         if set(config["hdr_curves"] or HDR_CURVES) != set(HDR_CURVES):
             got = ", ".join(config["hdr_curves"])
@@ -94,9 +79,7 @@ class Conditioning:
         name = config["physics_prior"]
         if name != "none" and name not in PRIORS:
             raise UnirenderError(f"physics_prior: got {name!r}, expected 'none' or one of: {', '.join(PRIORS)}")
-        if config["light"] not in LIGHTS:
-            raise UnirenderError(f"light: got {config['light']!r}, expected one of: {', '.join(LIGHTS)}")
-        return cls(codec, packing, PRIORS.get(name), config["light"] == "encoder", config["derived_light"])
+        return cls(codec, packing, PRIORS.get(name), config["derived_light"])
 
     @property
     def attribute_channels(self) -> int:
@@ -139,12 +122,7 @@ class Conditioning:
 
         No more than that: an autoencoder decodes slowly.
         """
-        if self.physics_prior:
-            return self.decode_attributes(latents)
-        if self.light_encoder:
-            light = latents.chunk(len(TRIPLETS), dim=1)[LIGHT]
-            return {"environment": self.packing.unpack_light(self.codec.decode(light))}
-        return None
+        return self.decode_attributes(latents) if self.physics_prior else None
 
     def encode_image(self, image_linear: Float[Tensor, "b 3 H W"]) -> Float[Tensor, "b c h w"]:
         """Premultiplied linear image -> latents of the image stream."""
@@ -153,12 +131,6 @@ class Conditioning:
     def decode_image(self, latents: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 3 H W"]:
         """Latents of the image stream -> premultiplied linear image in [0, 1]."""
         return unpack_image(self.codec.decode(latents))
-
-    def in_latents(self, given: Bool[Tensor, "b 6"]) -> Bool[Tensor, "b 6"]:
-        """Which pictures of a rendering's attribute latents hold what is given; the others hold noise."""
-        if not self.light_encoder:
-            return given
-        return given & (torch.arange(len(TRIPLETS), device=given.device) != LIGHT)
 
     def by_triplet(self, flags: Bool[Tensor, "b 6"]) -> Bool[Tensor, "b nc 1 1"]:
         """Flags of the six pictures -> flags of their latent channels."""
@@ -177,28 +149,26 @@ class Conditioning:
         Args:
             mask: coverage; always known.
             given: which of the six pictures are given clean as a condition (none in inverse rendering).
-            maps: the given maps, from which the physics prior is made where `given` has all that it needs, and the
-                input of the light's encoder where the light is given.
+            maps: the given maps, from which the physics prior is made where `given` has all that it needs.
             camera: gives the rays; the contract's default if None.
             derived: which of the given pictures were derived from a light, without shadows: their flag is 1/2, if the
                 network is told. None: none was.
         """
-        light = self._light(given, maps, mask) if self.light_encoder else None
         spatial = F.pixel_unshuffle(mask, self.codec.factor)
         b, _, h, w = spatial.shape
         camera = camera or Camera()
         rays = torch.from_numpy(camera.rays(h, w)[..., :2].copy()).to(mask) * RAY_SCALE
-        flags = self.in_latents(given).to(mask)
+        flags = given.to(mask)
         if derived is not None and self.derived_light:
             flags = torch.where(derived, DERIVED_FLAG * flags, flags)
         flags = flags[..., None, None].expand(-1, -1, h, w)
         common = torch.cat([flags, spatial, rays.permute(2, 0, 1).expand(b, -1, -1, -1)], dim=1)
         if not self.physics_prior:
-            return Extras(common, common, None, light)
+            return Extras(common, common, None)
         known = given[:, [TRIPLETS.index(name) for name in self.physics_prior.triplets]].all(dim=1)
         prior = self._prior(self.physics_prior, known, maps, mask, camera)
         flag = known.to(mask)[:, None, None, None].expand(-1, -1, h, w)
-        return Extras(common, torch.cat([common, prior, flag], dim=1), prior, light)
+        return Extras(common, torch.cat([common, prior, flag], dim=1), prior)
 
     def _prior(
         self, prior: Prior, known: Bool[Tensor, " b"], maps: Maps | None, mask: Float[Tensor, "b 1 H W"], camera: Camera
@@ -214,14 +184,3 @@ class Conditioning:
         of_rows = {name: value[rows] for name, value in maps.items()}
         encoded = self.codec.encode(prior_picture(prior, of_rows, mask[rows], camera))
         return latents.index_copy(0, rows, encoded.to(latents))
-
-    def _light(self, given: Bool[Tensor, "b 6"], maps: Maps | None, like: Tensor) -> Float[Tensor, "b 4 eh ew"]:
-        """What the light's encoder sees: the packed light and a flag; zeros for a light that is not given."""
-        known = given[:, LIGHT]
-        if maps is None:
-            if known.any():
-                raise ValueError("extras: the flags say that the light is given, but maps is None")
-            return like.new_zeros(len(given), CHANNELS, *self.packing.environment_size)
-        packed = self.packing.pack_light(maps["environment"])
-        flagged = torch.cat([packed, torch.ones_like(packed[:, :1])], dim=1)
-        return torch.where(known[:, None, None, None], flagged, 0)

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal
 
-ENCODER_SIDE = 64  # pixels along each side of the picture that a picture encoder sees
+# Options of earlier versions' networks, each with the value that means what a network is without it.
+GONE = {"light": "latent", "picture_features": "none"}
 ENVIRONMENT_SIZE = (16, 32)  # rows, columns of the light that every model predicts; whole pixels make up a texel
 
 
@@ -24,9 +25,5 @@ class ModelConfig:
     linear_projection: bool = False  # attention's projections are linear layers, not 1x1 convolutions
     # the closed-form image to which the image stream adds what it leaves out
     physics_prior: Literal["none", "composite", "split_sum"] = "split_sum"
-    # a light that is given to the renderer: the sixth attribute picture, or tokens of an encoder of its own
-    light: Literal["latent", "encoder"] = "latent"
     derived_light: bool = False  # the network is told which of s and d were derived from a light and lack shadows
-    # a clean image also enters through frozen features of ImageNet, or through an encoder of its own
-    picture_features: Literal["none", "vgg16", "encoder"] = "none"
     unified: bool = True  # False: a network for each direction, and the widths are those of each

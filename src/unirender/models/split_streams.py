@@ -31,8 +31,6 @@ class SplitDualStreamModel(DualStreamModel):
         remove_decoder(self.attribute_unet)
         self.inverse.attributes_to_image = nn.ModuleList()
         remove_decoder(self.inverse.image_unet)
-        self.inverse.light_encoder = None  # no light is given where it is asked for
-        self.vgg, self.encoder = None, None  # and where an image is asked for, none is clean
 
     def forward(
         self,
@@ -43,11 +41,10 @@ class SplitDualStreamModel(DualStreamModel):
         attribute_extra: Float[Tensor, "b ea h w"] | None = None,
         image_extra: Float[Tensor, "b ei h w"] | None = None,
         image_prior: Float[Tensor, "b ci h w"] | None = None,
-        light: Float[Tensor, "b 4 eh ew"] | None = None,
         attribute_rows: slice | None = ALL_ROWS,
         image_rows: slice | None = ALL_ROWS,
     ) -> DualStreamOutput:
-        """As `DualStreamModel.forward`: attributes by the one network, images by the other, which sees the light."""
+        """As `DualStreamModel.forward`: attributes by the one network, images by the other."""
         inputs = (attributes, image, attributes_timestep, image_timestep, attribute_extra, image_extra, image_prior)
 
         def rows_of(rows: slice) -> list[Any]:
@@ -57,8 +54,5 @@ class SplitDualStreamModel(DualStreamModel):
         if attribute_rows is not None:
             inverse = self.inverse(*rows_of(attribute_rows), image_rows=None)
         if image_rows is not None:
-            lit = None if light is None else light[image_rows]
-            rendered = super().forward(*rows_of(image_rows), light=lit, attribute_rows=None)
-        return DualStreamOutput(
-            inverse.attributes, rendered.image, rendered.encoded_attributes, inverse.encoded_image, inverse.answers
-        )
+            rendered = super().forward(*rows_of(image_rows), attribute_rows=None)
+        return DualStreamOutput(inverse.attributes, rendered.image, rendered.encoded_attributes, inverse.encoded_image)

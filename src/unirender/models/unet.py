@@ -52,15 +52,6 @@ def pyramid_channels(unet: UNet2DConditionModel) -> list[int]:
     return [*channels, widths[-1]]
 
 
-def pyramid_strides(unet: UNet2DConditionModel, patch: int) -> list[int]:
-    """Pixels of the picture, one way, for each pixel of each entry; `patch`: the same of the finest level."""
-    levels, layers = len(tuple(unet.config["block_out_channels"])), unet.config["layers_per_block"]
-    strides = [patch]
-    for level in range(levels):
-        strides += [patch << level] * layers + [patch << level + 1] * (level < levels - 1)
-    return [*strides, patch << levels - 1]
-
-
 def remove_decoder(unet: UNet2DConditionModel) -> None:
     """Takes the layers behind the mid block out of a U-Net."""
     unet.up_blocks = nn.ModuleList()

@@ -5,12 +5,14 @@ import inspect
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from diffusers.configuration_utils import ConfigMixin, FrozenDict
 from safetensors import SafetensorError, safe_open
 
 from unirender.errors import UnirenderError
+from unirender.models.config import GONE
 from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
 from unirender.system_errors import out_of_memory
@@ -87,7 +89,7 @@ def check_complete(model: torch.nn.Module, folder: Path) -> None:
 
 def check_options(part: ConfigMixin, file: Path) -> None:
     """Of options that a class does not know diffusers only warns, and answers as if they were not there. They are a
-    newer version's, or misspelt.
+    newer version's, an older one's, or misspelt.
 
     Args:
         part: as it was read.
@@ -97,7 +99,13 @@ def check_options(part: ConfigMixin, file: Path) -> None:
         UnirenderError: there are such options.
     """
     known = OF_DIFFUSERS | inspect.signature(type(part).__init__).parameters.keys()
-    unknown = sorted(name for name in json.loads(file.read_text(encoding="utf-8")).keys() - known if name[0] != "_")
+    config: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    unknown = sorted(n for n in config.keys() - known if n[0] != "_" and (n not in GONE or config[n] != GONE[n]))
+    if gone := [name for name in unknown if name in GONE]:
+        raise UnirenderError(
+            f"{file}: has {gone[0]} {config[gone[0]]!r}, which is gone, expected {GONE[gone[0]]!r}; choose another "
+            "checkpoint, or use it with the version that it was trained with"
+        )
     if unknown:
         raise UnirenderError(
             f"{file}: options {', '.join(unknown)} are not known to this {type(part).__name__}, whose answers may "

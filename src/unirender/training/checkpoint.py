@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from unirender.errors import UnirenderError
+from unirender.models.config import GONE as GONE_FROM_NETWORKS
 from unirender.training.card import OF_A_RUN
 from unirender.training.config import TrainConfig
 from unirender.whole_files import whole_file
@@ -18,6 +19,14 @@ from unirender.writing import writing
 STATE_FILE = "state.pt"
 PICTURES = "pictures"
 PROLONGABLE = "steps"  # a resumed run may be given another length
+# Entries of earlier versions that are gone, each with the value that means what a run is without it.
+GONE = {f"model.{name}": value for name, value in GONE_FROM_NETWORKS.items()} | {
+    "loss.answers": 0.0,
+    "loss.cycle_steps": 1,
+    "loss.snr_bound": 5.0,
+    "loss.timestep_weight": "none",
+    "trains": "all",
+}
 
 
 def save_state(folder: Path, state: dict[str, Any]) -> Path:
@@ -92,6 +101,7 @@ def with_defaults(stored: dict[str, Any]) -> dict[str, Any]:
 def differences(stored: dict[str, Any], config: TrainConfig) -> list[str]:
     """What a state's plain config has instead of `config`, by dotted names; the length of a run is no difference."""
     theirs, own = (dict(_leaves(tree)) for tree in (with_defaults(stored), plain(config)))
+    theirs = {name: value for name, value in theirs.items() if name not in GONE or value != GONE[name]}
     names = sorted((theirs.keys() | own.keys()) - {PROLONGABLE})
     return [f"{n} {theirs.get(n)!r} instead of {own.get(n)!r}" for n in names if theirs.get(n) != own.get(n)]
 

@@ -122,7 +122,7 @@ class Train:
         config = self.resolved(config)
         with usage():
             check_config(config)
-        self.check_start(config, self.folder)
+        self.check_start(config)
         return config
 
     def resolved(self, config: TrainConfig) -> TrainConfig:
@@ -147,24 +147,14 @@ class Train:
             config = dataclasses.replace(config, model=dataclasses.replace(config.model, resolution=self.resolution))
         return config
 
-    def check_start(self, config: TrainConfig, folder: Path) -> None:
-        """Looks whether a run of a configuration can begin, or go on in its folder.
+    def check_start(self, config: TrainConfig) -> None:
+        """Looks whether a run of a configuration can begin.
 
         Raises:
             UsageError: it lacks weights to begin with, or has some that it cannot begin with.
         """
         if self.init is not None and self.init_from is not None:
             raise UsageError("--init and --init-from: both say what to begin with, expected one of them")
-        if config.trains != "all" and self.init is None and not _is_saved(folder):
-            raise UsageError(
-                f"--preset {self.preset}: it trains a part of a network and leaves the others as they are, expected "
-                "--init with a trained one (the name of a shipped checkpoint, or a pipeline folder)"
-            )
-        if config.trains == "encoder" and self.validate:
-            raise UsageError(
-                f"--validate {self.validate}: nothing that is scored changes while the picture encoder is trained by "
-                f"itself (--preset {self.preset}), expected 0"
-            )
         if config.model.codec == "pixel" and self.init_from is not None:
             raise UsageError(
                 f"--preset {self.preset}: its network works on pixels and cannot begin with Stable Diffusion's "
@@ -198,10 +188,3 @@ class Train:
         if pipeline is not None:
             print(f"{pipeline}: use it with --checkpoint {pipeline}")
         return 0
-
-
-def _is_saved(folder: Path) -> bool:
-    """Whether there is a run to go on with, which has all weights."""
-    from unirender.training.checkpoint import STATE_FILE
-
-    return (folder / STATE_FILE).is_file()

@@ -29,12 +29,7 @@ class LossConfig:
     cycle_share: float = 0.25  # share of the inverse samples of a batch that are rendered again; 0: none
     cycle_into_renderer: bool = True  # the cycle's gradient also reaches the weights of the rendering pass
     cycle_warmup: float = 0.1  # share of the training before the cycle sets in
-    cycle_steps: int = 1  # 1: what is rendered again is the step's own prediction; more: a sample of so many steps
-    answers: float = 0.0  # weight of what the picture encoder's heads say; 0: not compared
     composite: float = 0.0  # weight of the closed-form image of the predicted maps; 0: none
-    # how the squared error of x0 counts by its timestep; see `unirender.training.loss_terms.timestep_weights`
-    timestep_weight: Literal["none", "v", "min_snr"] = "none"
-    snr_bound: float = 5.0  # of min_snr
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,6 @@ class TrainConfig:
     batch_size: int = 16
     group_size: int = 1  # pictures side by side in a batch that differ in one thing only; 1: they may differ in all
     steps: int = 20_000  # length of a run where neither steps nor minutes are asked for; a resumed run may be prolonged
-    trains: Literal["all", "encoder", "inverse", "renderer"] = "all"  # which weights; see `unirender.training.trained`
     timestep_rule: Literal["conditional", "algorithm1"] = "conditional"
     p_render: float = 0.5  # share of rendering; the paper's p_direction
     p_t: float = 0.5  # share of random t instead of T

@@ -5,7 +5,6 @@ import operator
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
-from unirender.models.config import ENCODER_SIDE
 from unirender.training.config import TrainConfig
 
 
@@ -30,8 +29,6 @@ class Range:
         return f"{above} and {'less than' if self.high_open else 'at most'} {self.high:g}"
 
 
-ENCODER_RESOLUTIONS = (ENCODER_SIDE // 2, *(ENCODER_SIDE << n for n in range(5)))
-
 _COUNT = Range(1)
 _NOT_NEGATIVE = Range(0)
 _POSITIVE = Range(0, low_open=True)
@@ -39,23 +36,13 @@ _SHARE = Range(0, 1)
 _DECAY = Range(0, 1, high_open=True)
 
 RANGES: dict[str, Range] = {
-    **dict.fromkeys(("batch_size", "group_size", "steps", "loss.cycle_steps", "augmentation.max_lights"), _COUNT),
+    **dict.fromkeys(("batch_size", "group_size", "steps", "augmentation.max_lights"), _COUNT),
     **dict.fromkeys(("p_render", "p_t", "map_dropout", "loss.cycle_share", "loss.cycle_warmup"), _SHARE),
     **{f"loss.{name}": _NOT_NEGATIVE for name in ("material", "albedo", "normal", "specular", "diffuse")},
     **{
         f"loss.{name}": _NOT_NEGATIVE
-        for name in (
-            "environment",
-            "image",
-            "image_floor",
-            "colour_floor",
-            "background",
-            "cycle",
-            "answers",
-            "composite",
-        )
+        for name in ("environment", "image", "image_floor", "colour_floor", "background", "cycle", "composite")
     },
-    "loss.snr_bound": Range(1),  # the weight's floor
     **dict.fromkeys(("optimizer.learning_rate", "optimizer.clip_norm"), _POSITIVE),
     **dict.fromkeys(("optimizer.beta1", "optimizer.beta2", "optimizer.ema_decay"), _DECAY),
     **dict.fromkeys(("seed", "optimizer.weight_decay", "optimizer.warmup_steps", "augmentation.tint"), _NOT_NEGATIVE),
@@ -77,25 +64,3 @@ def check_config(config: TrainConfig) -> None:
         value = operator.attrgetter(name)(config)
         if value not in allowed:
             raise UnirenderError(f"training config: {name} is {value!r}, expected {allowed}; correct it in the preset")
-    encoder = config.model.picture_features == "encoder"
-    if config.trains == "encoder" and not (encoder and config.loss.answers):
-        raise UnirenderError(
-            "training config: trains is 'encoder', expected picture_features 'encoder' and loss.answers above 0"
-        )
-    if encoder and config.model.resolution not in ENCODER_RESOLUTIONS:
-        sizes = ", ".join(map(str, ENCODER_RESOLUTIONS))
-        raise UnirenderError(
-            f"training config: pictures of {config.model.resolution} pixels, expected one of {sizes}: the picture "
-            f"encoder sees them at {ENCODER_SIDE}"
-        )
-    conditional = config.timestep_rule == "conditional"
-    if config.trains == "renderer" and not (config.p_render == 1 and conditional):
-        raise UnirenderError(
-            "training config: trains is 'renderer', which renders alone; expected p_render 1 and the conditional rule "
-            "of timesteps"
-        )
-    if config.trains in ("encoder", "inverse") and (config.p_render or not conditional):
-        raise UnirenderError(
-            f"training config: trains is {config.trains!r}, which renders nothing; expected p_render 0 and the "
-            "conditional rule of timesteps"
-        )

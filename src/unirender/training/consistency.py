@@ -3,13 +3,8 @@
 `cycle` (paper Eq. 5, "cycle-consistent constraint"): the network renders them again, from pure noise in one step.
 `composite` (ours): their closed-form image; no network takes part, so nothing can learn to accept wrong maps, but
 shadowed highlights and interreflection are then explained by the maps.
-
-Both terms ask that an answer looks like the picture. But the prediction at much noise is a mean of answers, which need
-not look like it. `cycle_steps` > 1 therefore renders a few-step sample of the inverse direction, which is one answer,
-at the cost of that many more passes.
 """
 
-import contextlib
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import denoise, make_sampler
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import Conditioning
@@ -59,19 +53,18 @@ class Consistency:
         them, but not the weights of the rendering pass.
 
         Args:
-            predicted: of the training step; with `cycle_steps` > 1 a sample is drawn instead.
+            predicted: of the training step.
             clean_i: latents of the true image.
             mask: coverage.
             generator: CPU generator of the noise.
         """
-        rows = predicted if self.config.cycle_steps == 1 else self.sample(clean_i, mask, generator)
         if self.config.cycle_into_renderer:
-            return self._rendered(rows, clean_i, mask, generator)
-        leaf = rows.detach().requires_grad_()
+            return self._rendered(predicted, clean_i, mask, generator)
+        leaf = predicted.detach().requires_grad_()
         error = self._rendered(leaf, clean_i, mask, generator)
         (gradient,) = gradients(error, [leaf], self.scale)
         assert gradient is not None, "what is rendered comes of it"
-        return _with_gradient(error.detach(), rows, gradient)
+        return _with_gradient(error.detach(), predicted, gradient)
 
     def composite(
         self,
@@ -96,33 +89,11 @@ class Consistency:
         error = (2 * shown - 2 * srgb_encode(image_linear.clamp(0, 1))).square()
         return weighted_mean(error, self.errors.pixel_weights(mask).expand_as(error))
 
-    def sample(
-        self, clean_i: Float[Tensor, "b c h w"], mask: Float[Tensor, "b 1 H W"], generator: torch.Generator
-    ) -> Float[Tensor, "b nc h w"]:
-        """Attributes by `cycle_steps` steps of DDIM from pure noise; only the last step has a gradient."""
-        scheduler = make_sampler("ddim", self.scheduler)  # its own: passes run side by side
-        given = torch.zeros(len(clean_i), len(TRIPLETS), dtype=torch.bool, device=clean_i.device)
-        extras = self.conditioning.extras(mask, given)
-
-        def step(x_t: Tensor, t: Tensor) -> Tensor:
-            clean = torch.zeros_like(t)
-            with contextlib.nullcontext() if t[0] == scheduler.timesteps[-1] else torch.no_grad():
-                output = predict(self.model, x_t, clean_i, Timesteps(t, clean), extras, ALL, None)
-            assert output.attributes is not None
-            return output.attributes.float()
-
-        shape = (len(clean_i), self.conditioning.attribute_channels, *clean_i.shape[-2:])
-        noise = noise_like(clean_i.new_empty(shape), generator)
-        return denoise(step, noise, scheduler, self.config.cycle_steps)
-
     def _rendered(
         self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
     ) -> Float[Tensor, ""]:
         given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
         extras = self.conditioning.extras(mask, given, self.conditioning.decode_given(attributes))
-        if self.conditioning.light_encoder:  # the predicted light is seen by its own encoder alone
-            shown = self.conditioning.by_triplet(self.conditioning.in_latents(given))
-            attributes = torch.where(shown, attributes, noise_like(attributes, generator))
         t = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)
         timesteps = Timesteps(torch.zeros_like(t), t)
         output = predict(self.model, attributes, noise_like(clean_i, generator), timesteps, extras, None, ALL)

@@ -1,18 +1,15 @@
-"""What the losses are made of: one pass through both streams, and squared errors weighted by pixel and by timestep.
+"""What the losses are made of: one pass through both streams, and squared errors weighted by pixel.
 
 Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
-from unirender.diffusion.schedule import signal_to_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
@@ -40,32 +37,9 @@ def predict(
         extras.attributes,
         extras.image,
         image_prior=extras.prior,
-        light=extras.light,
         attribute_rows=rows_a,
         image_rows=rows_i,
     )
-
-
-def timestep_weights(
-    kind: Literal["none", "v", "min_snr"],
-    snr_bound: float,
-    scheduler: DDIMScheduler,
-    timestep: Int[Tensor, " b"],
-) -> Float[Tensor, " b"] | None:
-    """Weights of the squared x0 error at timesteps in [1, T]. None: all alike.
-
-        v         SNR + 1
-        min_snr   max(1, min(SNR, snr_bound))
-
-    The first makes it the squared error of v = sqrt(alpha_bar) eps - sqrt(1 - alpha_bar) x0. It has no bound: 1090 at
-    timestep 1. Min-SNR (Hang et al. 2023) weighs the x0 error by min(SNR, bound). At zero terminal SNR that is nothing
-    at T, the only timestep of one-step inference, which would never be trained. The floor of 1 (Salimans & Ho 2022,
-    "truncated SNR") gives it, and all timesteps with more noise than signal, the weight they have without weighting.
-    """
-    if kind == "none":
-        return None
-    snr = signal_to_noise(scheduler, timestep)
-    return snr + 1 if kind == "v" else snr.clamp(1, snr_bound)
 
 
 @dataclass(frozen=True)
@@ -88,41 +62,37 @@ class Errors:
         predicted: Float[Tensor, "b c h w"],
         clean: Float[Tensor, "b c h w"],
         mask: Float[Tensor, "b 1 H W"],
-        rows: Float[Tensor, " b"] | None = None,
         floor: float = 0.0,
     ) -> Float[Tensor, ""]:
-        """Of the image; `rows` multiplies the error of each sample.
+        """Of the image.
 
         Args:
             predicted: by the network.
             clean: the truth.
             mask: coverage.
-            rows: weights of the samples.
             floor: E of `compressed`; 0: the squared error itself.
         """
         weights = self.conditioning.codec.weights(self.pixel_weights(mask))
         error = (predicted.float() - clean).square()
-        return _decibels(error, weights, rows, floor) if floor else weighted_mean(_by_row(error, rows), weights)
+        return _decibels(error, weights, floor) if floor else weighted_mean(error, weights)
 
     def attributes(
         self,
         predicted: Float[Tensor, "b nc h w"],
         clean: Float[Tensor, "b nc h w"],
         mask: Float[Tensor, "b 1 H W"],
-        rows: Float[Tensor, " b"] | None = None,
         floor: float = 0.0,
     ) -> LossTerms:
         """Of each of the six pictures; the light's pixels all count alike.
 
-        `rows` is as in `image`, and so is `floor`, for the pictures in `COLOURS` only.
+        `floor` is as in `image`, for the pictures in `COLOURS` only.
         """
         weights = self.conditioning.codec.weights(self.pixel_weights(mask))
-        error = (predicted.float() - clean).square()
-        squares = _by_picture(_by_row(error, rows))
+        squares = _by_picture((predicted.float() - clean).square())
         lit = squares.pop("environment").mean()
         terms = {name: weighted_mean(e, weights) for name, e in squares.items()}
         if floor:
-            terms |= {name: _decibels(_by_picture(error)[name], weights, rows, floor) for name in COLOURS}
+            terms |= {name: _decibels(squares[name], weights, floor) for name in COLOURS}
         return terms | {"environment": lit}
 
 
@@ -140,15 +110,9 @@ def weighted_mean(error: Float[Tensor, "b c h w"], weights: Float[Tensor, "b c h
     return (error * weights).sum() / weights.sum()
 
 
-def _decibels(
-    error: Float[Tensor, "b c h w"],
-    weights: Float[Tensor, "b c h w"],
-    rows: Float[Tensor, " b"] | None,
-    floor: float,
-) -> Float[Tensor, ""]:
+def _decibels(error: Float[Tensor, "b c h w"], weights: Float[Tensor, "b c h w"], floor: float) -> Float[Tensor, ""]:
     """The mean of the samples' errors, each of them `compressed`."""
-    own = compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor)
-    return (own if rows is None else own * rows).mean()
+    return compressed((error * weights).sum(dim=(1, 2, 3)) / weights.sum(dim=(1, 2, 3)), floor).mean()
 
 
 def gradients(loss: Float[Tensor, ""], inputs: Sequence[Tensor], scale: float = 1.0) -> list[Tensor | None]:
@@ -176,10 +140,6 @@ def noise_like(x: Tensor, generator: torch.Generator) -> Tensor:
         return torch.randn(x.shape, generator=generator).to(x)
     own = torch.Generator(x.device).manual_seed(int(torch.randint(2**62, (), generator=generator)))
     return torch.randn(x.shape, generator=own, device=x.device, dtype=torch.float32).to(x)
-
-
-def _by_row(error: Float[Tensor, "b c h w"], rows: Float[Tensor, " b"] | None) -> Float[Tensor, "b c h w"]:
-    return error if rows is None else error * rows[:, None, None, None]
 
 
 def _by_picture(x: Float[Tensor, "b nc h w"]) -> dict[str, Float[Tensor, "b c h w"]]:

@@ -13,22 +13,19 @@ from dataclasses import dataclass
 
 import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
-from unirender.models.added import Answers
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.models.packing import TRIPLETS, pack_image
-from unirender.models.picture_encoder import answers_error, truth_of
+from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
 from unirender.pipelines.inputs import told_derived
 from unirender.training.config import LossConfig
 from unirender.training.consistency import Consistency
-from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict, timestep_weights
-from unirender.training.trained import encoder_of
+from unirender.training.loss_terms import Errors, LossTerms, noise_like, predict
 
 DROPPABLE = ("albedo", "specular", "diffuse", "environment")  # maps that a renderer must be able to do without
 
@@ -38,7 +35,6 @@ class LossFunction:
     """The loss of a model under a config.
 
     Attributes:
-        encoder_alone: whether only what the picture encoder's heads say is compared; nothing goes through the streams.
         cycle_scale: multiplies the cycle's weight; the trainer raises it from 0 after the warm-up.
         scale: of the loss while its gradient is taken (`unirender.training.loss_scale`); the terms are without it.
     """
@@ -49,7 +45,6 @@ class LossFunction:
     config: LossConfig
     map_dropout: float = 0.0
     cycle_scale: float = 1.0
-    encoder_alone: bool = False
     scale: float = 1.0
 
     def terms(self, batch: Maps, timesteps: Timesteps, generator: torch.Generator) -> LossTerms:
@@ -64,8 +59,6 @@ class LossFunction:
                 do not stand together; under Section 3.2's rule they do.
             generator: CPU generator of noise and dropped maps.
         """
-        if self.encoder_alone:
-            return self._encoder_terms(batch)
         clean_a, clean_i = self._encode(batch)
         noisy_a, noisy_i = (t.cpu() > 0 for t in (timesteps.attributes, timesteps.image))  # a GPU is waited for once
         attributes, image, extras = self._noised(batch, clean_a, clean_i, timesteps, noisy_a, generator)
@@ -76,15 +69,15 @@ class LossFunction:
         if span_i is not None:
             assert output.image is not None
             rows = _Rows(span_i, noisy_i)
-            truth, mask, t = (rows.of(x) for x in (clean_i, batch["mask"], timesteps.image))
+            truth, mask = (rows.of(x) for x in (clean_i, batch["mask"]))
             predicted = rows.of_decoded(output.image)
-            terms["image"] = errors.image(predicted, truth, mask, self._timestep_weights(t), self.config.image_floor)
+            terms["image"] = errors.image(predicted, truth, mask, self.config.image_floor)
         if span_a is not None:
             assert output.attributes is not None
             rows = _Rows(span_a, noisy_a)
-            truth, mask, t = (rows.of(x) for x in (clean_a, batch["mask"], timesteps.attributes))
+            truth, mask = (rows.of(x) for x in (clean_a, batch["mask"]))
             predicted = rows.of_decoded(output.attributes)
-            terms |= errors.attributes(predicted, truth, mask, self._timestep_weights(t), self.config.colour_floor)
+            terms |= errors.attributes(predicted, truth, mask, self.config.colour_floor)
             inverse = _Rows(span_a, noisy_a & ~noisy_i)
             terms |= self._inverse_terms(output, clean_i, batch, inverse, errors, generator)
         return terms
@@ -108,7 +101,7 @@ class LossFunction:
         seen, derived = self._seen(batch, timesteps.attributes == 0)
         shown_a = clean_a if seen is batch else self._encode_attributes(seen)
         given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
-        known = self.conditioning.by_triplet(self.conditioning.in_latents(given) | noisy_a[:, None]).to(clean_a.device)
+        known = self.conditioning.by_triplet(given | noisy_a[:, None]).to(clean_a.device)
         given = given.to(clean_a.device)
         noise_a = noise_like(clean_a, generator)
         attributes = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
@@ -122,19 +115,6 @@ class LossFunction:
     @torch.no_grad()
     def _encode_attributes(self, batch: Maps) -> Tensor:
         return self.conditioning.encode_attributes(batch)
-
-    def _encoder_terms(self, batch: Maps) -> LossTerms:
-        """Of the picture encoder by itself: every image is clean."""
-        encoder = encoder_of(self.model)
-        assert encoder is not None, "the config was checked"
-        return {"answers": self._answers_error(encoder.look(pack_image(batch["image"]), batch["mask"])[2], batch)}
-
-    def _answers_error(self, said: Answers, batch: Maps) -> Float[Tensor, ""]:
-        packing, cells = self.conditioning.packing, (said.cells.shape[-2], said.cells.shape[-1])
-        with torch.no_grad():
-            light = packing.pack_light(batch["environment"])
-            truth, covered = truth_of(packing.pack(batch), batch["mask"], light, cells)
-        return answers_error(said, truth, covered)
 
     def _seen(self, batch: Maps, clean: Bool[Tensor, " b"]) -> tuple[Maps, Bool[Tensor, "b 6"] | None]:
         """The maps that a renderer sees, in which s and d may have been derived from the light; and which lack shadows.
@@ -163,8 +143,7 @@ class LossFunction:
         errors: Errors,
         generator: torch.Generator,
     ) -> LossTerms:
-        """What the attributes predicted of clean images render to (the cycle: of a share of the rows), and the answers
-        of the picture encoder's heads."""
+        """What the attributes predicted of clean images render to; the cycle: of a share of the rows."""
         assert output.attributes is not None
         predicted = inverse.of_decoded(output.attributes).float()
         truth, image, mask = (inverse.of(x) for x in (clean_i, batch["image"], batch["mask"]))
@@ -176,13 +155,7 @@ class LossFunction:
         count = min(max(1, round(share * len(predicted))), len(predicted)) if share else 0  # one even of few rows
         if self.config.cycle and self.cycle_scale and count:
             terms["cycle"] = consistency.cycle(predicted[:count], truth[:count], mask[:count], generator)
-        if output.answers is not None and self.config.answers and len(predicted):
-            answers = output.answers.each(inverse.of_decoded)
-            terms["answers"] = self._answers_error(answers, {name: inverse.of(x) for name, x in batch.items()})
         return terms
-
-    def _timestep_weights(self, timestep: Int[Tensor, " b"]) -> Float[Tensor, " b"] | None:
-        return timestep_weights(self.config.timestep_weight, self.config.snr_bound, self.scheduler, timestep)
 
     def _draw_given(self, batch: int, generator: torch.Generator) -> Bool[Tensor, "b 6"]:
         kept = torch.rand(batch, len(TRIPLETS), generator=generator) >= self.map_dropout

@@ -6,7 +6,7 @@
 columns)) the step's root mean square is that of AdamW's, so that both can have one learning rate (Liu et al. 2025,
 "Muon is scalable for LLM training"). A convolution's kernel is the matrix (out, in x rows x columns). AdamW keeps what
 carries numbers from outside or to it, or begins at zero (first and last convolutions, the embedding of time, the
-connections between streams, a picture encoder's first layer, heads and ways out), small matrices, and all vectors.
+connections between streams), small matrices, and all vectors.
 
 U V' comes from five steps of a Newton-Schulz iteration, X <- a X + b X X' X + c (X X')^2 X, which takes singular values
 of [0.01, 1] to about [0.7, 1.2]: near enough. Each step multiplies X from the left by a polynomial of X X', so the
@@ -32,14 +32,13 @@ STEPS, A, B, C = 5, 3.4445, -4.775, 2.0315  # of the iteration; Jordan et al.
 STEP_RMS = 0.2  # of AdamW's update; Liu et al.
 LEAST_SIDE = 32  # smaller matrices have few directions
 KEPT = frozenset(("conv_in", "conv_out", "time_embedding", "attribute_extra", "image_extra"))
-KEPT_IN_ENCODER = frozenset(("stem", "heads", "adapters", "summary"))
 KEPT_BETWEEN = frozenset(("attributes_to_image", "image_to_attributes"))
 
 
 def is_hidden_matrix(name: str, parameter: Tensor) -> bool:
     """Whether Muon takes a network's parameter."""
     parts = set(name.split("."))
-    if parameter.dim() < 2 or (KEPT | KEPT_BETWEEN) & parts or ("encoder" in parts and KEPT_IN_ENCODER & parts):
+    if parameter.dim() < 2 or (KEPT | KEPT_BETWEEN) & parts:
         return False
     return min(matrix_shape(parameter)) >= LEAST_SIDE
 

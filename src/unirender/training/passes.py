@@ -32,7 +32,7 @@ from unirender.training.loss_terms import COLOURS, Errors, LossTerms, gradients
 from unirender.training.losses import LossFunction
 from unirender.training.processes import ALONE, Processes
 
-OWN_ROWS = ("image", "environment", "composite", "cycle", "answers")  # terms whose means have weights of their own
+OWN_ROWS = ("image", "environment", "composite", "cycle")  # terms whose means have weights of their own
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
 ByName = dict[str, float]
@@ -190,7 +190,6 @@ class BatchGradient:
                 "environment": t_attributes > 0,
                 "composite": weight[rows][is_inverse],
                 "cycle": weight[rows][is_again],
-                "answers": is_inverse,
             }
             mass = {kind: float(of_rows.sum()) for kind, of_rows in weights.items()}
             seed = seeds[split.processes.rank + split.processes.size * j]

@@ -46,17 +46,6 @@ _TINY_COLOUR = dataclasses.replace(
     augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
     batch_size=24,
 )
-# `tiny` with a picture encoder: first that alone, then with the decoder that it serves.
-_TINY_ENCODER = dataclasses.replace(
-    _TINY_RENDERER,
-    model=dataclasses.replace(_TINY_RENDERER.model, picture_features="encoder"),
-    loss=dataclasses.replace(_SMALL.loss, answers=1.0),
-    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
-    optimizer=OptimizerConfig(kind="muon", learning_rate=3e-3),
-    batch_size=96,
-    trains="encoder",
-    p_render=0.0,
-)
 # What `small` ships as: its network wider below the finest level, and with attention at the level above the lowest, on
 # pictures moved in the frame, with more weight on materials and normals.
 _SMALL_WIDE = dataclasses.replace(
@@ -74,21 +63,6 @@ _SMALL_MORE = dataclasses.replace(
     optimizer=OptimizerConfig(kind="muon", learning_rate=1e-3, warmup_steps=50),
     batch_size=24,
     p_render=0.2,
-)
-# On such objects the inverse direction alone: what the network renders from given maps stays the same to the bit.
-_SMALL_INVERSE = dataclasses.replace(
-    _SMALL_MORE,
-    loss=dataclasses.replace(_SMALL_MORE.loss, cycle=0.0),
-    optimizer=OptimizerConfig(learning_rate=1e-4, beta2=0.98, weight_decay=0.0, warmup_steps=30, ema_decay=0.998),
-    trains="inverse",
-    p_render=0.0,
-)
-# The network of `small_wide` with the loss of `small`, likewise; `small_renderer` comes after it.
-_SMALL_COLOUR = dataclasses.replace(
-    _SMALL,
-    model=_SMALL_WIDE.model,
-    loss=dataclasses.replace(_SMALL.loss, material=3.0),
-    augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.0),
 )
 _SD_MODEL = ModelConfig(
     resolution=512,
@@ -116,12 +90,10 @@ PRESETS: dict[str, TrainConfig] = {
     "tiny": _TINY,
     "tiny_plain": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="none")),
     "tiny_composite": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, physics_prior="composite")),
-    "tiny_light_encoder": dataclasses.replace(_TINY, model=dataclasses.replace(_TINY.model, light="encoder")),
     "tiny_without_cycle": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle=0.0)),
     "tiny_cycle_into_renderer": dataclasses.replace(
         _TINY, loss=dataclasses.replace(_TINY.loss, cycle_into_renderer=True)
     ),
-    "tiny_cycle_sampled": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, cycle_steps=2)),
     "tiny_composite_loss": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, composite=1.0)),
     "tiny_muon": dataclasses.replace(
         _TINY,
@@ -131,31 +103,12 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "tiny_renderer": _TINY_RENDERER,
     "tiny_colour": _TINY_COLOUR,
-    "tiny_encoder": _TINY_ENCODER,
-    "tiny_inverse": dataclasses.replace(
-        _TINY_ENCODER, trains="inverse", batch_size=24, optimizer=OptimizerConfig(kind="muon")
-    ),
-    "tiny_min_snr": dataclasses.replace(_TINY, loss=dataclasses.replace(_TINY.loss, timestep_weight="min_snr")),
     "tiny_algorithm1": dataclasses.replace(_TINY, timestep_rule="algorithm1"),
     "tiny_one_at_a_time": dataclasses.replace(_TINY, group_size=8),
     "tiny_without_unified": dataclasses.replace(_TINY, model=_HALF_TINY),
     "small": _SMALL,
     "small_wide": _SMALL_WIDE,
     "small_more": _SMALL_MORE,
-    "small_inverse": _SMALL_INVERSE,
-    "small_colour": _SMALL_COLOUR,
-    "small_renderer": dataclasses.replace(
-        _SMALL,
-        model=_SMALL_WIDE.model,
-        trains="renderer",
-        p_render=1.0,
-        augmentation=dataclasses.replace(_SMALL.augmentation, derived=0.5, shadowed=0.9),
-    ),
-    "small_vgg": dataclasses.replace(
-        _SMALL,
-        model=dataclasses.replace(_SMALL_WIDE.model, picture_features="vgg16"),
-        loss=dataclasses.replace(_SMALL.loss, material=4.0),
-    ),
     "medium": dataclasses.replace(
         _TINY,
         model=ModelConfig(resolution=128, block_out_channels=(96, 128, 192, 256), layers_per_block=2),

@@ -50,7 +50,7 @@ def train(
     from unirender.training.processes import join_processes
 
     config = options.resolved(config)
-    options.check_start(config, out)
+    options.check_start(config)
     if validate is None and (options.validate or options.keep_best is not None):
         raise UsageError(
             f"validate {options.validate}, keep_best {options.keep_best}: nothing scores, expected the argument "

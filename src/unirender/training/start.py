@@ -15,7 +15,6 @@ from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
 from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
-from unirender.models.picture_features import PictureFeatures, read_vgg
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.notices import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -26,7 +25,6 @@ from unirender.training.stable_diffusion import StableDiffusion, load_stable_dif
 from unirender.training.trainer import Trainer
 from unirender.training.widening import can_widen, widened
 
-FEATURES_PREFIXES = ("vgg.", "inverse.vgg.", "encoder.", "inverse.encoder.")  # of the entries of a picture's features
 _KINDS = {True: "one network for both directions (unified)", False: "a network for each direction (unified=False)"}
 
 
@@ -69,8 +67,6 @@ class Start:
             if self.pipeline.config["calibration"]:
                 own = "its calibration is that of its own weights"
                 tell(f"{self.folder}: {own}; run `unirender calibrate` on the new ones")
-        else:
-            load_features(trainer.model)
         trainer.begun_with = self.named
 
 
@@ -112,8 +108,7 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     """Gives a trainer, and its average, the weights of another network.
 
     A wider form of the network begins near it (`unirender.training.widening`).
-    With another physics prior than the network's the image stream's last convolution starts at zero again. Features of
-    a clean picture that the network has not are added.
+    With another physics prior than the network's the image stream's last convolution starts at zero again.
 
     Args:
         trainer: that has not begun.
@@ -125,15 +120,8 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
     """
     model = trainer.model
     if can_widen(model, network):
-        if trainer.config.trains != "all":
-            raise UnirenderError(
-                f"initial weights: they are of a narrower network, and this preset trains its {trainer.config.trains} "
-                "alone, which could not learn what the others become; begin with weights of its own network"
-            )
         network = widened(trainer.config.model, network, trainer.vae)
     own, other = ({k: tuple(v.shape) for k, v in m.state_dict().items()} for m in (model, network))
-    if network.config["picture_features"] == "none":  # what they add begins at zero
-        own = {k: v for k, v in own.items() if not k.startswith(FEATURES_PREFIXES)}
     curves = [m.config["hdr_curves"] for m in (model, network)]
     if own != other or {k: tuple(v) for k, v in curves[0].items()} != {k: tuple(v) for k, v in curves[1].items()}:
         differing = sorted(k for k in own.keys() | other.keys() if own.get(k) != other.get(k)) or ["hdr_curves"]
@@ -141,15 +129,8 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
             f"initial weights: {len(differing)} entries differ from the preset's network (first: {differing[0]}), "
             f"expected the same network; choose the preset that the weights were trained with{_named(history)}"
         )
-    model.load_state_dict(model.state_dict() | network.state_dict())
-    if network.config["picture_features"] == "none":
-        load_features(model)
+    model.load_state_dict(network.state_dict())
     if network.config["physics_prior"] != model.config["physics_prior"]:
-        if trainer.config.trains not in ("all", "renderer"):
-            raise UnirenderError(
-                f"initial weights: their physics prior is {network.config['physics_prior']}, expected "
-                f"{model.config['physics_prior']}: this preset trains nothing that could learn the other one"
-            )
         restart_from_prior(model)  # what it added to the other closed form is no correction of this one
     trainer.begin_anew(history)
 
@@ -157,18 +138,6 @@ def begin_with_network(trainer: Trainer, network: DualStreamModel, history: Sequ
 def _named(history: Sequence[dict[str, Any]]) -> str:
     preset = history[-1].get("preset") if history else None
     return f" ({preset})" if preset else ""
-
-
-def load_features(model: DualStreamModel) -> None:
-    """Gives a network with features of ImageNet their weights, from the user's cache; one without nothing.
-
-    Raises:
-        UnirenderError: they are not there.
-    """
-    features = [part for part in model.modules() if isinstance(part, PictureFeatures)]
-    weights = read_vgg() if features else {}
-    for part in features:
-        part.load_vgg(weights)
 
 
 def begin_with_diffusion(trainer: Trainer, weights: StableDiffusion) -> None:

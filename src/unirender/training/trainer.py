@@ -43,7 +43,6 @@ from unirender.training.run_log import OVERFLOW, RunLog
 from unirender.training.source import BatchSource, NamesGroups
 from unirender.training.state import check_alike, resume, state_of, write_config
 from unirender.training.stopping import StopRequest, stopping_gently
-from unirender.training.trained import train_only
 from unirender.training.validation import Validate, Validation
 
 
@@ -80,13 +79,9 @@ class Trainer:
         for p in model.parameters():
             if p.dim() == 4:
                 p.data = p.data.contiguous(memory_format=torch.channels_last)
-        train_only(model, config.trains)
         self.model = model
         self.generator = torch.Generator().manual_seed(config.seed)
-        alone = config.trains == "encoder"
-        self.loss = LossFunction(
-            self.model, conditioning, make_scheduler(), config.loss, config.map_dropout, encoder_alone=alone
-        )
+        self.loss = LossFunction(self.model, conditioning, make_scheduler(), config.loss, config.map_dropout)
         self.gradient = BatchGradient(self.loss, config, self.split, self.generator, dtype)
         self.loss_scale = LossScale(dtype)
         self.optimizer = make_optimizer(self.model, config.optimizer, self.gradient.pool)

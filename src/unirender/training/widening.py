@@ -78,8 +78,6 @@ def can_widen(network: DualStreamModel, other: DualStreamModel) -> bool:
         return False
     if all(own[name] == old[name] for name in GROWS):
         return False
-    if own["picture_features"] != "none":  # what they enter by has the widths of the levels
-        return False
     if not isinstance(own["attention_head_dim"], int) or not set(old["attention_levels"]) <= set(
         own["attention_levels"]
     ):
@@ -139,7 +137,7 @@ def widen(network: DualStreamModel, other: DualStreamModel) -> None:
     for name in ("attributes_to_image", "image_to_attributes"):
         for new, old, level in zip(getattr(network, name), getattr(other, name), pyramid, strict=True):
             growth.layer(new, old, levels[level], levels[level])
-    for name in ("attribute_extra", "image_extra", "light_encoder"):
+    for name in ("attribute_extra", "image_extra"):
         if getattr(other, name) is not None:
             getattr(network, name).load_state_dict(getattr(other, name).state_dict())
     network.prompt_embedding.copy_(other.prompt_embedding)

@@ -219,10 +219,8 @@ def test_a_batch_is_cut_as_training_cuts_it() -> None:
     assert cut_batch(dataclasses.replace(config, batch_size=2, p_render=0.5), 8) == [Rows(1, 0, 0), Rows(0, 1, 0)]
     no_cycle = dataclasses.replace(config, loss=dataclasses.replace(config.loss, cycle=0.0))
     assert cut_batch(no_cycle, 1) == [Rows(4, 7, 0)]
-    with pytest.raises(UnirenderError, match="got the timestep rule 'algorithm1' and 1 cycle_steps"):
+    with pytest.raises(UnirenderError, match="got the timestep rule 'algorithm1'"):
         cut_batch(dataclasses.replace(config, timestep_rule="algorithm1"), 1)
-    with pytest.raises(UnirenderError, match="got the timestep rule 'conditional' and 2 cycle_steps"):
-        cut_batch(dataclasses.replace(config, loss=dataclasses.replace(config.loss, cycle_steps=2)), 1)
 
 
 def calls(model: torch.nn.Module, action: Any) -> list[tuple[int, range, range]]:

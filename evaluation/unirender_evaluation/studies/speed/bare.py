@@ -57,10 +57,10 @@ def cut_batch(config: TrainConfig, parallel: int) -> list[Rows]:
     Raises:
         UnirenderError: the preset trains by other passes than these.
     """
-    if config.timestep_rule != "conditional" or config.loss.cycle_steps != 1:
+    if config.timestep_rule != "conditional":
         raise UnirenderError(
-            f"bare passes: got the timestep rule {config.timestep_rule!r} and {config.loss.cycle_steps} cycle_steps, "
-            "expected 'conditional' and 1; choose another preset"
+            f"bare passes: got the timestep rule {config.timestep_rule!r}, expected 'conditional'; choose another "
+            "preset"
         )
     size, render = config.batch_size, round(config.batch_size * config.p_render)
     again = round(config.loss.cycle_share * (size - render)) if config.loss.cycle else 0
@@ -140,7 +140,6 @@ class BarePasses:
                 extras.attributes,
                 extras.image,
                 image_prior=extras.prior,
-                light=extras.light,
                 attribute_rows=slice(rows.render, None) if rows.inverse else None,
                 image_rows=slice(0, rows.render) if rows.render else None,
             )
@@ -161,7 +160,6 @@ class BarePasses:
                 extras.attributes[again],
                 extras.image[again],
                 image_prior=None if extras.prior is None else extras.prior[again],
-                light=None if extras.light is None else extras.light[again],
                 attribute_rows=None,
             )
         assert out.image is not None

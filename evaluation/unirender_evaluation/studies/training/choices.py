@@ -20,7 +20,6 @@ QUESTIONS = {
     "timesteps": "Timesteps",
     "cycle": "Cycle consistency",
     "physics": "Physics",
-    "weights": "Weights of the loss",
     "batches": "Batches",
     "optimizer": "Optimiser",
     "network": "Network",
@@ -80,12 +79,9 @@ def training_choices(seed: int = 0, batch_size: int | None = None, preset: str =
         run("half-noise", "timesteps", "any noise as often as pure noise (p_t = 0.5)", p_t=0.5),
         loss("no-cycle", "cycle", "no cycle", cycle=0.0),
         loss("into-renderer", "cycle", "its gradient reaches the renderer", cycle_into_renderer=True),
-        loss("cycle-of-sample", "cycle", "of a sample of two steps", cycle_steps=2),
         loss("composite-loss", "physics", "composite of the maps against the picture", composite=1.0),
         model("composite-prior", "physics", "prior: composite", physics_prior="composite"),
         model("split-sum-prior", "physics", "prior: split-sum", physics_prior="split_sum"),
-        loss("min-snr", "weights", "min-SNR", timestep_weight="min_snr"),
-        loss("v-weights", "weights", "those of v-prediction", timestep_weight="v"),
         run(
             "one-at-a-time",
             "batches",
@@ -100,7 +96,6 @@ def training_choices(seed: int = 0, batch_size: int | None = None, preset: str =
             kind="muon",
             learning_rate=2 * base.optimizer.learning_rate,
         ),
-        model("light-encoder", "network", "light through an encoder of its own", light="encoder"),
         model("patch-1", "network", "pixels as they are", patch=1),
         model("patch-4", "network", "4 x 4 pixels a latent", patch=4),
         model(
