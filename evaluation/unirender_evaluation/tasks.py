@@ -25,11 +25,11 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods import quantise
 from unirender_evaluation.suite_objects import known_mesh
-from unirender_evaluation.suites import Material, Scene, Suite, material_key
+from unirender_evaluation.suites import MetallicRoughness, Scene, Suite, material_key
 from unirender_evaluation.task import LIGHT, LIGHT_ANSWER, PROTOCOLS, Asked, Task
 
 
-def edit_quantity(base: Material, target: Material) -> str:
+def edit_quantity(base: MetallicRoughness, target: MetallicRoughness) -> str:
     """Which column an edit belongs to.
 
     Raises:
@@ -40,7 +40,7 @@ def edit_quantity(base: Material, target: Material) -> str:
     return "edit_metallic" if base[0] != target[0] else "edit_roughness"
 
 
-def picture(suite: Suite, scene: Scene, material: Material) -> dict[str, Any]:
+def picture(suite: Suite, scene: Scene, material: MetallicRoughness) -> dict[str, Any]:
     """What a method sees of an image: 8-bit display values, mask, camera."""
     return {
         "image_srgb": quantise(suite.image(scene, material), suite.mask(scene)),
@@ -103,7 +103,7 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_edit(suite: Suite, scene: Scene, target: Material) -> Asked:
+def _read_edit(suite: Suite, scene: Scene, target: MetallicRoughness) -> Asked:
     base = suite.spec.base
     change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
     return Asked(
@@ -130,7 +130,7 @@ def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_render(suite: Suite, scene: Scene, target: Material, protocol: str) -> Asked:
+def _read_render(suite: Suite, scene: Scene, target: MetallicRoughness, protocol: str) -> Asked:
     maps = suite.intrinsics(scene, target)
     maps = maps.replace(environment=None) if protocol == "given" else maps.replace(specular=None, diffuse=None)
     return Asked(
@@ -158,7 +158,7 @@ def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_inverse(suite: Suite, scene: Scene, material: Material) -> Asked:
+def _read_inverse(suite: Suite, scene: Scene, material: MetallicRoughness) -> Asked:
     return Asked(
         suite.mask(scene),
         {"decompose": picture(suite, scene, material)},

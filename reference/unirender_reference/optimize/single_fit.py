@@ -26,7 +26,7 @@ from unirender_reference.optimize.material_mix import Lobes, Mixed, lobes_at, ma
 from unirender_reference.optimize.robust import HUBER
 from unirender_reference.optimize.roughness_nodes import NODES
 from unirender_reference.optimize.single_config import Priors
-from unirender_reference.optimize.single_picture import Picture
+from unirender_reference.optimize.single_picture import PicturePixels
 from unirender_reference.optimize.single_priors import (
     LIGHT_GRID,
     albedo_precision,
@@ -97,7 +97,9 @@ class Fit:
         noise: expected misfit in display values.
     """
 
-    def __init__(self, picture: Picture, log_light: Float[np.ndarray, "j 3"], priors: Priors, noise: float) -> None:
+    def __init__(
+        self, picture: PicturePixels, log_light: Float[np.ndarray, "j 3"], priors: Priors, noise: float
+    ) -> None:
         self.picture, self.priors = picture, priors
         self.log_albedo = np.log(picture.maps["albedo"] + DARKEST)
         self.log_light = log_light

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_encode, unpremultiply
+from unirender.pictures import DISPLAY_WHITE
 from unirender_reference.optimize.differences import side_by_side
 from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.surface_points import blocker, mapped_points, picture_points
@@ -16,11 +17,10 @@ from unirender_reference.optimize.transport import Transport, light_transport
 from unirender_reference.shapes import MeshObject
 
 POINTS = 4  # of a pixel on a known mesh
-SATURATED = 0.999  # display value from which a channel may stand for more
 
 
 @dataclass(frozen=True)
-class Picture:
+class PicturePixels:
     """The n pixels of a (shrunk) picture that show the object.
 
     Attributes:
@@ -66,7 +66,7 @@ def make_picture(
     light_shape: tuple[int, int],
     hdr: bool,
     seed: int,
-) -> Picture:
+) -> PicturePixels:
     """Shrinks a picture by whole blocks until at most about `pixels` covered ones are left, and traces their transport.
 
     Args:
@@ -100,7 +100,7 @@ def make_picture(
 
     display = srgb_encode(unpremultiply(radiance, coverage)).astype(np.float64)
     saturated = np.zeros((len(pixel), 3), bool) if hdr else chosen(shrink(_clipped(image_linear, mask), block)) > 0
-    return Picture(
+    return PicturePixels(
         transport,
         pixel,
         size,
@@ -134,7 +134,7 @@ def neighbours(pixel: Int[np.ndarray, " n"], size: tuple[int, int]) -> Int[np.nd
 
 def _clipped(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
     """1 where a channel's display value is at its end."""
-    full = image_srgb(unpremultiply(image_linear, mask)) >= SATURATED
+    full = image_srgb(unpremultiply(image_linear, mask)) >= DISPLAY_WHITE
     return (full & (mask > 0)).astype(np.float32)
 
 

@@ -22,7 +22,7 @@ from unirender_reference.optimize.placement import check_in_picture
 from unirender_reference.optimize.single_config import COLD, SingleConfig, fitted
 from unirender_reference.optimize.single_exposure import exposed, exposure_of
 from unirender_reference.optimize.single_fit import Fit, Unknowns
-from unirender_reference.optimize.single_picture import Picture, make_picture
+from unirender_reference.optimize.single_picture import PicturePixels, make_picture
 from unirender_reference.optimize.single_result import result
 from unirender_reference.optimize.single_search import anneal, descend
 from unirender_reference.optimize.views import Step
@@ -88,7 +88,7 @@ def optimize_image(
     maps["normal"] = _start_normals(mask, camera, normal, geometry, init)
     shape = (config.light_rows, 2 * config.light_rows)
 
-    def prepared(pixels: int) -> Picture:
+    def prepared(pixels: int) -> PicturePixels:
         return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed)
 
     coarse = prepared(config.coarse_pixels)
@@ -159,7 +159,7 @@ def _start_normals(
     return normal
 
 
-def _start_light(picture: Picture, init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
+def _start_light(picture: PicturePixels, init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
     """Log radiance of the start; even light where nothing is predicted."""
     if init is None:
         return np.zeros((shape[0] * shape[1], 3))

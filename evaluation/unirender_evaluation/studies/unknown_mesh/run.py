@@ -7,7 +7,7 @@ from rich.console import Console
 
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
-from unirender_evaluation.stratification import Material
+from unirender_evaluation.stratification import MetallicRoughness
 from unirender_evaluation.studies.about import description
 from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.unknown_mesh import tables
@@ -50,6 +50,6 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
         return records
 
 
-def scene_name(scene: Scene, material: Material) -> str:
+def scene_name(scene: Scene, material: MetallicRoughness) -> str:
     """Object, family and material."""
     return f"{scene.object} ({scene.family}, metallic {material[0]:g}, roughness {material[1]:g})"

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 
 from unirender.color import display_slope, image_srgb
+from unirender.pictures import DISPLAY_WHITE
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -27,7 +28,6 @@ from unirender_reference.optimize.views import Step, Views
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION
 
 FILLED = 0.99  # coverage from which a pixel shows nothing but the object
-SATURATED = 0.998  # display value that may stand for more light
 STIFFER = 5.0  # the last step than the first: large movements first, then less of the samples' noise
 OUTLIER = 0.1  # display values: errors of this size count half (Geman-McClure weights)
 
@@ -111,12 +111,12 @@ def image_term(
     linear, target = image_linear[shaded.pixel], target_srgb[shaded.pixel]
     error = (image_srgb(linear) - target).astype(np.float64)
     weight = np.sqrt(config.image_weight) / (1 + (error / OUTLIER) ** 2)
-    slope = display_slope(linear) * (target < SATURATED)
+    slope = display_slope(linear) * (target < DISPLAY_WHITE)
     rows = (weight * slope)[:, None, :, None] * shaded.share[:, :, None, None] * shaded.derivative[:, None]
     row = np.arange(len(error))[:, None, None, None] * 3 + np.arange(3)[:, None]
     column = fit.faces[shaded.face][:, :, None, None] * 3 + np.arange(3)
     place = [np.broadcast_to(indices, rows.shape).ravel() for indices in (row, column)]
     by_normals = coo_array((rows.ravel(), place), shape=(error.size, fit.vertices.size)).tocsr()
-    counts = weight * (target < SATURATED)
+    counts = weight * (target < DISPLAY_WHITE)
     matrix = by_normals @ normal_matrix(fit.vertices, fit.faces)
     return ImageTerm((counts * error).ravel(), matrix), float(np.sqrt((error**2).mean()))
