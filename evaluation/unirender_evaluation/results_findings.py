@@ -107,6 +107,7 @@ def against_trivial(results: Results, questions: Sequence[Question]) -> str:
 
 
 def _against_trivial(results: Results, question: Question) -> list[str] | None:
+    """Ours beside the best row without a model and the ceiling; None where one of them has no answer."""
     metric = question.kind
     records = Selection(question.table, question.protocol).of(results.records)
 

@@ -34,6 +34,7 @@ def over_lights(results: Results, questions: Sequence[Question], lights: Mapping
 
 
 def _line(results: Results, question: Question, lights: Mapping[str, str]) -> list[str]:
+    """A question's difference with its interval over objects and the one over objects and lights."""
     labels = [label_of(results, key) for key in (question.a, question.b)]
     records = Selection(question.table, question.protocol).of(results.records)
     a, b = (values_of(records, key, question.key) for key in (question.a, question.b))

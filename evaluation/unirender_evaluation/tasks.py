@@ -87,6 +87,7 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Itera
 
 
 def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the picture with another material."""
     base = suite.spec.base
     for target in suite.spec.edits:
         yield Task(
@@ -116,6 +117,7 @@ def _read_edit(suite: Suite, scene: Scene, target: MetallicRoughness) -> Asked:
 
 
 def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the picture of true maps."""
     for target in suite.spec.edits:
         yield Task(
             table="rendering",
@@ -143,6 +145,7 @@ def _read_render(suite: Suite, scene: Scene, target: MetallicRoughness, protocol
 
 
 def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the maps of a picture, one for each stratified material."""
     for material in scene.materials:
         sample = f"{scene.key}_{material_key(material)}"
         yield Task(
@@ -167,6 +170,7 @@ def _read_inverse(suite: Suite, scene: Scene, material: MetallicRoughness) -> As
 
 
 def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """The question for the picture under the object's other light."""
     target = suite.other_light(scene)
     given_sd = protocol == "from-image-sd"
     light = target.key.rsplit("_", 1)[1]
@@ -205,6 +209,7 @@ def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> 
 
 
 def _light(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """The question for the light of a picture."""
     sample = f"{scene.key}_{material_key(suite.spec.base)}"
     yield Task(
         table=LIGHT[0],

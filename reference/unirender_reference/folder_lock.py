@@ -59,6 +59,7 @@ def _warn(folder: Path, why: str) -> None:
 
 
 def _acquire(folder: Path, path: Path) -> int:
+    """A handle that holds the lock of the folder; an error where another process has it."""
     import fcntl
 
     while True:

@@ -105,6 +105,7 @@ class StanfordOrb:
 
     @cached_property
     def _samples(self) -> tuple[Sample, ...]:
+        """All questions of the folder; missing files are named all at once."""
         named = {capture.name: capture for capture in self._captures}
         found = [
             self._map_sample(key, frame, named[frame.capture])

@@ -65,6 +65,7 @@ class Census:
         return 1 if written else 0
 
     def _breakdown(self, bad: list["BadPixel"]) -> object:
+        """A table of the bad pixels by each property of the render that they are in."""
         from rich.table import Table
 
         table = Table("where", "bad pixels", title="where they come from")

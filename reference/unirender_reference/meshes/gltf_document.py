@@ -92,6 +92,7 @@ class Document:
             raise UnirenderError(f"{what}: its data URI is broken ({error}); export it again") from error
 
     def _buffer(self, index: object) -> bytes:
+        """The bytes of a buffer, read once; all buffers of a model together have a limit."""
         buffer = self.item("buffers", index)
         uri = buffer.get("uri")
         if uri is None and (index != 0 or self._binary is None):

@@ -80,6 +80,7 @@ class Materials:
         return {} if index is None else self._document.item("materials", index)
 
     def _channels(self, material: dict[str, Any]) -> dict[str, Channel]:
+        """The material's channels, of whichever of its models the file has."""
         extensions = material.get("extensions", {})
         self._note_ignored(material, extensions)
         if GLOSS in extensions:
@@ -98,6 +99,7 @@ class Materials:
         return channels
 
     def _metallic_roughness(self, pbr: dict[str, Any]) -> dict[str, Channel]:
+        """Albedo, roughness and metallic by the metallic-roughness model: factor times texture, linear."""
         color = np.clip(vector(pbr, "baseColorFactor", [1, 1, 1, 1]), 0, 1).astype(np.float32)
         roughness = np.clip(_scalar(pbr, "roughnessFactor", 1.0), 0, 1)
         metallic = np.clip(_scalar(pbr, "metallicFactor", 1.0), 0, 1)

@@ -73,6 +73,7 @@ class _Lines:
                 kept = b""
 
     def _line(self, parts: list[bytes]) -> None:
+        """Takes one line, split into its keyword and the rest."""
         if len(parts) < 2:
             return
         keyword, rest = parts
@@ -107,6 +108,7 @@ class _Lines:
             check_materials(len(self.libraries))
 
     def _face(self, tokens: list[bytes]) -> None:
+        """Takes one polygon: its corners' indices from 1, 0 where there is none; negative ones count from the end."""
         if len(tokens) < 3:
             return
         counts = len(self.points) // 3, len(self.coordinates) // 2, len(self.normals) // 3
@@ -273,6 +275,7 @@ def _colors(lines: _Lines, count: int) -> Float[np.ndarray, "n 3"] | None:
 
 
 def _libraries(folder: ModelFolder, names: Iterable[str]) -> dict[str, MtlEntry]:
+    """All materials of the MTL files of these names; a name with spaces may be several."""
     entries: dict[str, MtlEntry] = {}
     for name in names:
         try:

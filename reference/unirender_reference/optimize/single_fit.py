@@ -259,6 +259,7 @@ class Fit:
         scale: float,
         eliminated: list[Eliminated],
     ) -> Unknowns:
+        """The unknowns after a step of the solver, bounded; the eliminated ones follow."""
         maps, c = self.picture.maps, 3 * self.coarse
         metallic = at.metallic + float(np.clip(move[-2], -0.25, 0.25))
         roughness = at.roughness + float(np.clip(move[-1], -0.2, 0.2))

@@ -147,6 +147,7 @@ def _start_normals(
     geometry: MeshObject | None,
     init: Intrinsics | None,
 ) -> Float[np.ndarray, "h w 3"]:
+    """The normals that are given, else those of `init`, else of the silhouette; 0 where a mesh has its own."""
     if normal is None and geometry is None and init is not None:
         normal = init.normal
     if normal is None:

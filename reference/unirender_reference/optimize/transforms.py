@@ -130,6 +130,7 @@ class PosedPicture:
         return side / (2 * math.tan(angle / 2))
 
     def _check_lens(self) -> None:
+        """Refuses a lens that is no pinhole."""
         model = self.values.get("camera_model", PINHOLE[0])
         if not isinstance(model, str) or model.upper() not in PINHOLE:
             raise UnirenderError(

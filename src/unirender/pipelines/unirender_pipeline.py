@@ -418,6 +418,9 @@ class UniRenderPipeline(DualStreamPipeline):
         sampling: dict[str, Any],
         derived: Collection[str] = (),
     ) -> Float[np.ndarray, "h w 3"]:
+        """The picture of the edited maps (h, w, 3), linear, premultiplied; anchored: the picture times what the edit
+        changes.
+        """
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
         settings["step_end"] = step_end_of(self, sampling.get("callback_on_step_end"))

@@ -118,6 +118,7 @@ class Consistency:
     def _rendered(
         self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
     ) -> Float[Tensor, ""]:
+        """The error of the picture that the attributes render to, from pure noise in one step."""
         given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
         extras = self.conditioning.extras(mask, given, self.conditioning.decode_given(attributes))
         if self.conditioning.light_encoder:  # the predicted light is seen by its own encoder alone

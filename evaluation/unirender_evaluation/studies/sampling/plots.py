@@ -44,6 +44,7 @@ def draw_steps(records: Sequence[Record], settings: Sequence[Setting]) -> bytes:
 
 
 def _steps_panel(axes: Any, records: Sequence[Record], settings: Sequence[Setting], column: Column) -> None:
+    """Draws the difference from mode `mean` over steps, a line for each number of samples."""
     sampled = [setting for setting in settings if setting != MEAN]
     counts = sorted({setting.samples for setting in sampled})
     for index, count in enumerate(counts):
