@@ -262,6 +262,7 @@ def _column(number: tuple[str, str]) -> str:
 
 
 def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:
+    """A Markdown table, whose first `left` columns are set to the left; an error where a line has another length."""
     if any(len(line) != len(head) for line in lines):
         raise UnirenderError(f"table: got lines of {sorted({len(line) for line in lines})} cells, expected {len(head)}")
     rule = [":--" if i < left else "--:" for i in range(len(head))]

@@ -42,6 +42,9 @@ def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) 
 
     Returns:
         For each scene its list of (metallic, roughness).
+
+    Raises:
+        UnirenderError: there are too few levels for it.
     """
     rng = np.random.default_rng(seed)
     total, step = n_scenes * per_scene, levels - 1

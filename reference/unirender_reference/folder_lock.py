@@ -16,7 +16,11 @@ _log = logging.getLogger("unirender.dataset")
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Makes a folder; if what follows fails, those that were made and are still empty go again."""
+    """Makes a folder; if what follows fails, those that were made and are still empty go again.
+
+    Raises:
+        UnirenderError: it cannot be made.
+    """
     new = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         try:

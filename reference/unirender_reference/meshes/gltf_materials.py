@@ -25,7 +25,11 @@ GLOSS_TEXTURE = "specularGlossinessTexture"
 
 
 def vector(owner: dict[str, Any], key: str, default: list[float]) -> Float[np.ndarray, " n"]:
-    """A list of finite numbers of a JSON object, as long as its default."""
+    """A list of finite numbers of a JSON object, as long as its default.
+
+    Raises:
+        UnirenderError: it is something else.
+    """
     value = owner.get(key, default)
     try:
         array = np.asarray(value, np.float64).reshape(-1)
