@@ -247,6 +247,7 @@ class Optimize:
                 geometry=obj,
                 init=start,
                 hdr=given.hdr,
+                clipped=given.clipped,
                 on_step=on_step,
             )
             seconds = time.perf_counter() - began

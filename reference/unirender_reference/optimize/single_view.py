@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.arguments import as_coverage, as_floats, as_instance
 from unirender.camera import Camera
@@ -43,6 +43,7 @@ def optimize_image(
     geometry: MeshObject | None = None,
     init: Intrinsics | None = None,
     hdr: bool = False,
+    clipped: Bool[np.ndarray, "h w 3"] | None = None,
     on_step: OnStep | None = None,
 ) -> Intrinsics:
     """Finds the maps and the light whose rendering is the picture.
@@ -57,6 +58,7 @@ def optimize_image(
         init: a prediction with albedo, roughness, metallic and environment, centre of the priors; None: grey, half
             metallic and half rough, under even light.
         hdr: the picture is linear and no value is clipped; the light that is found has its scale, as that of `init`.
+        clipped: where a value is only a lower bound (of a picture that was reduced); None: where it is 1.
         on_step: hears of every step.
 
     Returns:
@@ -89,7 +91,7 @@ def optimize_image(
     shape = (config.light_rows, 2 * config.light_rows)
 
     def prepared(pixels: int) -> PicturePixels:
-        return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed)
+        return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed, clipped)
 
     coarse = prepared(config.coarse_pixels)
     fit = Fit(coarse, _start_light(coarse, init, shape), priors, config.noise[0])
