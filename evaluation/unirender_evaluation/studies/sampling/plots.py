@@ -98,7 +98,7 @@ def draw_reliability(records: Sequence[Record], setting: Setting) -> bytes:
     most = max(map(len, shown.values()), default=0)
     for axes, (name, found) in zip(panels, shown.items(), strict=False):
         _reliability_panel(axes, found)
-        axes.set_title(name if len(found) == most else f"{name} (n = {len(found)})", fontsize=10)
+        axes.set_title(name if len(found) == most else f"{name} ({len(found)} of {most} scenes)", fontsize=10)
     for axes in panels[len(shown) :]:
         axes.axis("off")
     for axes in panels[max(0, len(shown) - ACROSS) : len(shown)]:
