@@ -89,8 +89,8 @@ class Census:
         samples = renders * self.resolution**2 * self.spp
         return (
             f"{renders} renders of {len(censuses)} objects ({calls} calls of mi.render, {samples:.3g} camera paths) in "
-            f"{seconds:.0f} s on {workers} workers; {sum(c.repaired for c in censuses)} pixels rendered again; "
-            f"{written} bad values in what was handed out"
+            f"{seconds:.0f} s on {workers} worker{'s' * (workers != 1)}; "
+            f"{sum(c.repaired for c in censuses)} pixels rendered again; {written} bad values in what was handed out"
         )
 
 

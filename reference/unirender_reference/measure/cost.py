@@ -77,7 +77,8 @@ class Cost:
             whole.add_section()
         console.print(parts)
         console.print(
-            f"CPU seconds of one core at {self.spp} spp, kilobytes of an EXR file; means over {self.scenes} scenes."
+            f"CPU seconds of one core at {self.spp} spp, kilobytes of an EXR file; "
+            f"means over {self.scenes} scene{'s' * (self.scenes != 1)}."
         )
         console.print(whole)
         console.print(f"{self.objects:,} objects x {PAIRS} pairs, {SHARD_GROUPS} groups a shard.")
