@@ -84,7 +84,11 @@ def read_sdist(archive: Path, backbone: Backbone) -> dict[str, np.ndarray]:
 
 
 def state_dict(tree: Mapping[str, Any], stack: str, backbone: Backbone) -> dict[str, np.ndarray]:
-    """Flax names and HWIO kernels -> torch names and OIHW kernels; shapes are checked against `LpipsNetwork`."""
+    """Flax names and HWIO kernels -> torch names and OIHW kernels; shapes are checked against `LpipsNetwork`.
+
+    Raises:
+        UnirenderError: a name or a shape is another than the network's.
+    """
     expected = {name: tuple(value.shape) for name, value in LpipsNetwork(backbone).state_dict().items()}
     weights = {}
     for index in range(len(tree[stack])):

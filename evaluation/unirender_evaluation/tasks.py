@@ -25,11 +25,11 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.suites.objects import known_mesh
-from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, material_key
 from unirender_evaluation.task import LIGHT, LIGHT_ANSWER, PROTOCOLS, Asked, Task
 
 
-def edit_quantity(base: Material, target: Material) -> str:
+def edit_quantity(base: MetallicRoughness, target: MetallicRoughness) -> str:
     """Which column an edit belongs to.
 
     Raises:
@@ -40,7 +40,7 @@ def edit_quantity(base: Material, target: Material) -> str:
     return "edit_metallic" if base[0] != target[0] else "edit_roughness"
 
 
-def picture(suite: Suite, scene: Scene, material: Material) -> dict[str, Any]:
+def picture(suite: Suite, scene: Scene, material: MetallicRoughness) -> dict[str, Any]:
     """What a method sees of an image: 8-bit display values, mask, camera."""
     return {
         "image_srgb": quantise(suite.image(scene, material), suite.mask(scene)),
@@ -87,6 +87,7 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Itera
 
 
 def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the picture with another material."""
     base = suite.spec.base
     for target in suite.spec.edits:
         yield Task(
@@ -103,7 +104,7 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_edit(suite: Suite, scene: Scene, target: Material) -> Asked:
+def _read_edit(suite: Suite, scene: Scene, target: MetallicRoughness) -> Asked:
     base = suite.spec.base
     change = {"metallic": target[0]} if target[0] != base[0] else {"roughness": target[1]}
     return Asked(
@@ -116,6 +117,7 @@ def _read_edit(suite: Suite, scene: Scene, target: Material) -> Asked:
 
 
 def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the picture of true maps."""
     for target in suite.spec.edits:
         yield Task(
             table="rendering",
@@ -130,7 +132,7 @@ def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_render(suite: Suite, scene: Scene, target: Material, protocol: str) -> Asked:
+def _read_render(suite: Suite, scene: Scene, target: MetallicRoughness, protocol: str) -> Asked:
     maps = suite.intrinsics(scene, target)
     maps = maps.replace(environment=None) if protocol == "given" else maps.replace(specular=None, diffuse=None)
     return Asked(
@@ -143,6 +145,7 @@ def _read_render(suite: Suite, scene: Scene, target: Material, protocol: str) ->
 
 
 def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """Questions for the maps of a picture, one for each stratified material."""
     for material in scene.materials:
         sample = f"{scene.key}_{material_key(material)}"
         yield Task(
@@ -158,7 +161,7 @@ def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         )
 
 
-def _read_inverse(suite: Suite, scene: Scene, material: Material) -> Asked:
+def _read_inverse(suite: Suite, scene: Scene, material: MetallicRoughness) -> Asked:
     return Asked(
         suite.mask(scene),
         {"decompose": picture(suite, scene, material)},
@@ -167,6 +170,7 @@ def _read_inverse(suite: Suite, scene: Scene, material: Material) -> Asked:
 
 
 def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """The question for the picture under the object's other light."""
     target = suite.other_light(scene)
     given_sd = protocol == "from-image-sd"
     light = target.key.rsplit("_", 1)[1]
@@ -205,6 +209,7 @@ def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> 
 
 
 def _light(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
+    """The question for the light of a picture."""
     sample = f"{scene.key}_{material_key(suite.spec.base)}"
     yield Task(
         table=LIGHT[0],

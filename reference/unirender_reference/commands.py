@@ -243,7 +243,7 @@ class Dataset:
         overhead = f"{report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers)"
         return (
             f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
-            f"workers, {overhead if report.render_seconds else 'nothing rendered'}; "
+            f"worker{'s' * (report.workers != 1)}, {overhead if report.render_seconds else 'nothing rendered'}; "
             f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
             f"manifest {report.manifest_sha256[:12]}"
         )

@@ -110,6 +110,7 @@ def _generate(
     start: float,
     verify: bool,
 ) -> GenerateReport:
+    """Renders the groups that no complete shard has, in the order of the plan, and writes shards and manifest."""
     shards = _shards(len(plan))
     header: dict[str, Any] = {"config": content, "versions": versions(config.denoise)}
     if unreadable := _unreadable_folders(plan):

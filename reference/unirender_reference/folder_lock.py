@@ -16,7 +16,11 @@ _log = logging.getLogger("unirender.dataset")
 
 @contextlib.contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Makes a folder; if what follows fails, those that were made and are still empty go again."""
+    """Makes a folder; if what follows fails, those that were made and are still empty go again.
+
+    Raises:
+        UnirenderError: it cannot be made.
+    """
     new = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         try:
@@ -59,6 +63,7 @@ def _warn(folder: Path, why: str) -> None:
 
 
 def _acquire(folder: Path, path: Path) -> int:
+    """A handle that holds the lock of the folder; an error where another process has it."""
     import fcntl
 
     while True:

@@ -16,11 +16,11 @@ from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, next_spp, 
 from unirender_reference.samplers import stratified_sampler
 from unirender_reference.scene import EditableScene
 
-Material = tuple[float | None, float | None]
+RoughnessMetallic = tuple[float | None, float | None]  # in this order; None is the object's own map
 
 
 def geometry_buffers(
-    scene: EditableScene, camera: Camera, resolution: int, spp: int, seed: int, material: Material | None
+    scene: EditableScene, camera: Camera, resolution: int, spp: int, seed: int, material: RoughnessMetallic | None
 ) -> Intrinsics:
     """Albedo, normal (camera axes) and mask; with a `material` also roughness and metallic.
 
@@ -55,7 +55,7 @@ def geometry_buffers(
 
 
 def _trace(
-    scene: EditableScene, size: int, spp: int, seed: int, material: Material | None
+    scene: EditableScene, size: int, spp: int, seed: int, material: RoughnessMetallic | None
 ) -> Float[np.ndarray, "h w c"]:
     """Mean over `spp` camera rays of (hit, base colour, normal[, roughness, metallic]), per pixel."""
     mi = mitsuba()

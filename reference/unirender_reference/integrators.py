@@ -31,6 +31,7 @@ def python_integrator(radiance: Radiance, channels: Sequence[str] = ()) -> Any:
 
 @functools.cache
 def _class(variant: str) -> Any:
+    """The integrator class of a variant, whose radiance is a Python function."""
     mi = mitsuba(variant)
 
     class PythonIntegrator(mi.SamplingIntegrator):

@@ -41,7 +41,11 @@ class Journal:
             self._written = float("-inf")
 
     def add(self, record: ShardRecord) -> None:
-        """Records a shard that is complete."""
+        """Records a shard that is complete.
+
+        Raises:
+            UnirenderError: it cannot be written.
+        """
         self.records[record.name] = record
         self._pending = True
         if time.monotonic() - self._written >= SECONDS:

@@ -34,6 +34,9 @@ def base_color_bitmap(albedo_linear: Float[np.ndarray, "*size 3"]) -> dict[str, 
     Args:
         albedo_linear: one colour (3,) or a picture (h, w, 3), linear Rec.709 in [0, 1]. One colour becomes a 2 x 2
             picture, so that every object runs the same compiled kernel.
+
+    Raises:
+        UnirenderError: another shape, or values out of range.
     """
     albedo = np.asarray(albedo_linear, dtype=np.float32)
     if albedo.ndim == 1:

@@ -125,6 +125,9 @@ def measured_floor_db(picture: Estimate, converged: Estimate, mask: Mask, premul
         converged: the same scene; needs its variance.
         mask: coverage: the weight of a pixel.
         premultiplied: whether both are.
+
+    Raises:
+        UnirenderError: `converged` has no variance.
     """
     if converged.variance is None:
         raise UnirenderError(

@@ -107,6 +107,7 @@ class Plan(Sequence[GroupPlan]):
 
     @functools.lru_cache(maxsize=4)  # noqa: B019 - a plan lives as long as the run that follows it
     def _object(self, index: int) -> list[GroupPlan]:
+        """The groups of an object, with the seeds of their renders."""
         config = self.config
         return [
             GroupPlan(

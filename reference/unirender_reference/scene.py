@@ -298,7 +298,11 @@ def _fingerprint(array: Float[np.ndarray, "..."]) -> bytes:
 
 
 def parameter_name(parameters: Any, suffix: str) -> str:
-    """The full name of the one parameter of a scene that ends in `suffix`."""
+    """The full name of the one parameter of a scene that ends in `suffix`.
+
+    Raises:
+        UnirenderError: none or several do.
+    """
     names = [key for key in parameters.keys() if f".{key}".endswith(f".{suffix}")]  # noqa: SIM118  (iterates over pairs)
     if len(names) != 1:
         raise UnirenderError(f"Mitsuba scene: {len(names)} parameters end in {suffix!r}; an untested Mitsuba version?")

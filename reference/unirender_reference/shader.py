@@ -147,7 +147,11 @@ class Shader:
         return sum(self.reflected(lanes, drawn) for drawn in self.directions(lanes, sampler))
 
     def set(self, maps: Mapping[str, Any], environment: Any) -> None:
-        """Puts maps and light into the BSDF and the emitter; normals enter with `lanes`."""
+        """Puts maps and light into the BSDF and the emitter; normals enter with `lanes`.
+
+        Raises:
+            UnirenderError: a map has another size.
+        """
         import drjit as dr
 
         mi = mitsuba()

@@ -220,6 +220,7 @@ def all_failures(records: Iterable[ShardRecord]) -> list[Failure]:
 
 
 def _replace(path: Path, data: bytes) -> None:
+    """Writes a file under another name, flushes it to the disk and moves it into place."""
     temporary = path.parent / f".{path.name}.{os.getpid()}.part"
     try:
         with temporary.open("wb") as stream:

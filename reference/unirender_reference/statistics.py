@@ -68,6 +68,9 @@ def p_values(
         var_a, var_b: variances of these means.
         batches_a, batches_b: how many batches each variance was taken from.
         rounding: relative standard deviation added for rounding (half precision: 5e-4).
+
+    Raises:
+        UnirenderError: shapes differ.
     """
     a, b, va, vb = (np.asarray(array, dtype=np.float64) for array in (mean_a, mean_b, var_a, var_b))
     if not a.shape == b.shape == va.shape == vb.shape:

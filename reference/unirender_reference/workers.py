@@ -133,6 +133,7 @@ class LocalWorkers:
         inner.add_done_callback(lambda done: self._done(task, pool, done))
 
     def _done(self, task: _Task, pool: WorkerPool, inner: Future) -> None:
+        """Hands a task's result on; where its worker died, it is tried once more with nothing beside it."""
         with self._lock:
             alone, self._alone = self._alone, False
             self._running -= 1

@@ -49,6 +49,7 @@ def _check_empty(argv: Sequence[str]) -> None:
 
 
 def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any:
+    """The command of the words; of an error, the one of ours that caused it, or else tyro's own message."""
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             command, unknown = tyro.cli(

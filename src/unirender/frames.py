@@ -17,7 +17,7 @@ from unirender.visualization import map_picture
 
 
 @dataclass(frozen=True)
-class Frame:
+class FilmFrame:
     """A frame and its decomposition, as people look at them: display values in [0, 1].
 
     Attributes:
@@ -29,7 +29,7 @@ class Frame:
     mask: Float[np.ndarray, "h w 1"]
 
     @classmethod
-    def read(cls, picture: Path, result: Path) -> "Frame":
+    def read(cls, picture: Path, result: Path) -> "FilmFrame":
         """The picture's file and its result folder.
 
         Raises:
@@ -39,11 +39,11 @@ class Frame:
         shown = {name: np.clip(map_picture(name, maps[name]), 0, 1) for name in MAPS if name in maps and name != "mask"}
         return cls({"input": read_picture(picture).image_srgb} | shown, maps["mask"])
 
-    def comparable(self, other: "Frame") -> bool:
+    def comparable(self, other: "FilmFrame") -> bool:
         """Whether both are of one size and show the object at a common pixel."""
         return self.mask.shape == other.mask.shape and bool((np.minimum(self.mask, other.mask) > 0).any())
 
-    def difference(self, other: "Frame") -> dict[str, float]:
+    def difference(self, other: "FilmFrame") -> dict[str, float]:
         """Mean absolute difference of each picture; pixels count by the smaller coverage, those of the light alike.
 
         Args:
@@ -65,13 +65,13 @@ def temporal_difference(frames: Sequence[tuple[Path, Path] | None]) -> dict[str,
         frames: picture file and result folder of each frame, in order; None for one without a result.
 
     Returns:
-        `pairs`: how many successive frames both have a result and are `Frame.comparable`; and, unless there are none,
-        the mean over them of what `Frame.difference` gives.
+        `pairs`: how many successive frames both have a result and are `FilmFrame.comparable`; and, unless there are
+        none, the mean over them of what `FilmFrame.difference` gives.
     """
     differences: list[dict[str, float]] = []
-    before: Frame | None = None
+    before: FilmFrame | None = None
     for files in frames:
-        frame = None if files is None else Frame.read(*files)
+        frame = None if files is None else FilmFrame.read(*files)
         if before is not None and frame is not None and before.comparable(frame):
             differences.append(before.difference(frame))
         before = frame

@@ -219,6 +219,7 @@ def unit_normals(normal: Float[np.ndarray, "*size 3"]) -> Float[np.ndarray, "*si
 
 
 def _check_range(name: str, value: Float[np.ndarray, "..."]) -> None:
+    """Refuses values that are not finite or out of the map's range, and an empty array."""
     if not np.isfinite(value).all():
         bad = int(np.count_nonzero(~np.isfinite(value)))
         raise UnirenderError(f"{name}: {bad} of {value.size} values are NaN or infinite, expected finite values")

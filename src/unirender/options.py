@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 Sampler = Literal["ddim", "unipc"]
-Material = Literal["scalar", "map"]
+MaterialForm = Literal["scalar", "map"]
 
 MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
 
@@ -173,7 +173,7 @@ class DecompositionOptions:
     longer; 6 give most of it."""
     tile: bool = False
     """Add to albedo and normal the detail of overlapping tiles, seen at the picture's own resolution."""
-    material: Material | None = None
+    material: MaterialForm | None = None
     """scalar: one roughness and one metallic for the object; map: one for each pixel. None: as the checkpoint was
     trained, scalar for those shipped."""
 

@@ -212,6 +212,7 @@ def _read_exr_mask(path: Path) -> Float[np.ndarray, "h w 1"]:
 
 
 def _read_exr_picture(path: Path) -> Picture:
+    """A linear, premultiplied EXR as straight display values; `A`, or else `mask.Y`, is its mask."""
     channels, attributes = read_exr(path)
     if not set("RGB") <= set(channels):
         raise UnirenderError(

@@ -40,6 +40,7 @@ def in_rec709(
 
 
 def _to_rec709(chromaticities: Sequence[float], name: str) -> Float[np.ndarray, "3 3"]:
+    """The matrix from linear colours of these x, y of red, green, blue and white to linear Rec.709 (Bradford)."""
     import colour
 
     points = np.asarray(chromaticities, np.float64).reshape(4, 2)

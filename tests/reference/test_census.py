@@ -9,7 +9,7 @@ import pytest
 
 from unirender.errors import UsageError
 from unirender_reference import backend
-from unirender_reference.measure.census import KINDS, census_of_object, classify, draw_materials
+from unirender_reference.measure.census import KINDS, census_of_object, classify, draw_renders
 from unirender_reference.measure.census_command import Census, band
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import make_object
@@ -70,11 +70,11 @@ def test_bad_values_that_get_through_are_noticed(monkeypatch: pytest.MonkeyPatch
 
 
 def test_materials_cover_the_corners_of_the_cube() -> None:
-    drawn = draw_materials(make_object(2, "train"), 2, 400)
-    exact = [material.roughness in (0.0, 1.0) for material in drawn]
+    drawn = draw_renders(make_object(2, "train"), 2, 400)
+    exact = [draw.roughness in (0.0, 1.0) for draw in drawn]
     assert 0.2 < np.mean(exact) < 0.4
-    assert {material.depth for material in drawn} == {2, 4}
-    assert drawn == draw_materials(make_object(2, "train"), 2, 400)
+    assert {draw.depth for draw in drawn} == {2, 4}
+    assert drawn == draw_renders(make_object(2, "train"), 2, 400)
 
 
 def test_bands_cover_the_range() -> None:

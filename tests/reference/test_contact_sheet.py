@@ -8,7 +8,7 @@ from PIL import Image
 
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.contact_sheet import CHECK_CONTRAST, COLUMNS, Sheet, buffer_tiles
+from unirender_reference.measure.contact_sheet import CHECK_CONTRAST, COLUMNS, TINT, Sheet, buffer_tiles
 from unirender_reference.render import Sample, render_sample
 
 
@@ -39,7 +39,8 @@ def test_tiles_show_the_buffers(sample: Sample) -> None:
         if column == "mask":
             assert (tile[outside] == 0).all()
         else:  # the page, or checks about it
-            assert np.abs(tile[outside] - 0.8).max() <= CHECK_CONTRAST / 2 + 1e-3
+            tint = TINT if column in ("roughness", "metallic") else 0.0  # no grey looks like them
+            assert np.abs(tile[outside] - (0.8 + np.array(tint))).max() <= CHECK_CONTRAST / 2 + 1e-3
     assert tiles["environment"].shape == (12, 24, 3)
 
 

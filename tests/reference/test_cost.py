@@ -30,7 +30,8 @@ def test_the_plans_count_renders_and_files() -> None:
 def test_the_command_prints_what_it_measured(capsys: pytest.CaptureFixture[str]) -> None:
     assert Cost(resolutions=(16, 32), spp=4, scenes=1, objects=1000).run() == 0
     printed = capsys.readouterr().out
-    assert "Seconds of one core at 4 spp" in printed
+    assert "CPU seconds of one core at 4 spp" in printed
+    assert {"image", "specular", "diffuse", "(s)", "(kB)", "(MB)"} <= set(printed.split())
     assert "1,000 objects x 121 pairs, 16 groups a shard" in printed
     assert printed.count("sweep, one light") == 2
 

@@ -24,7 +24,7 @@ from unirender.folders import (
     mask_finder,
     write_summary,
 )
-from unirender.frames import Frame, temporal_difference
+from unirender.frames import FilmFrame, temporal_difference
 from unirender.input_picture import read_input
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
@@ -308,5 +308,5 @@ def test_frames_without_a_neighbour_are_left_out(tmp_path: Path) -> None:
     assert both["albedo"] == pytest.approx(alone["albedo"] / 2)
     mask = np.zeros((10, 12, 1), dtype=np.float32)
     mask[:, 8:] = 1
-    elsewhere = Frame(Frame.read(*first).shown, mask)
-    assert not elsewhere.comparable(Frame.read(*first))
+    elsewhere = FilmFrame(FilmFrame.read(*first).shown, mask)
+    assert not elsewhere.comparable(FilmFrame.read(*first))

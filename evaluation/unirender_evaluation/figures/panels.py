@@ -23,12 +23,12 @@ from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.scoring import over_white, score_image, score_maps
-from unirender_evaluation.suites.suite import Material, Scene, Suite
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import picture, tasks
 from unirender_evaluation.truth.render import good_spp, item_seed
 
-Truth = Callable[[Scene, Material, Float[np.ndarray, "eh ew 3"]], Image]
+Truth = Callable[[Scene, MetallicRoughness, Float[np.ndarray, "eh ew 3"]], Image]
 LIGHT_ROWS = 32  # of a light's picture
 
 
@@ -60,7 +60,7 @@ class MitsubaTruth:
         self.suite, self.spp = suite, good_spp(spp, suite.spec)
         self._objects: dict[str, MitsubaScene] = {}
 
-    def __call__(self, scene: Scene, material: Material, environment: Float[np.ndarray, "eh ew 3"]) -> Image:
+    def __call__(self, scene: Scene, material: MetallicRoughness, environment: Float[np.ndarray, "eh ew 3"]) -> Image:
         """Linear image, premultiplied.
 
         Raises:

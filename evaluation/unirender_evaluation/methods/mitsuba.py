@@ -26,7 +26,7 @@ from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import evenly
 from unirender_evaluation.store import Job
 from unirender_evaluation.suites.objects import object_is_here, scene_object
-from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, material_key
 from unirender_evaluation.suites.truth_file import diffuse_member, image_member, specular_member
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
@@ -81,13 +81,13 @@ class MitsubaScene:
         """Whether this is the object of the stored truth."""
         return self.geometry_test.passed
 
-    def maps(self, material: Material) -> Intrinsics:
+    def maps(self, material: MetallicRoughness) -> Intrinsics:
         """What a perfect decomposition says: traced buffers, the scene's material; no light."""
         inside = (self.geometry.require("mask")["mask"] > 0).astype(np.float32)
         metallic, roughness = (inside * np.float32(value) for value in material)
         return self.geometry.replace(metallic=metallic, roughness=roughness)
 
-    def image(self, lit: Scene, material: Material, spp: int | None = None) -> Image:
+    def image(self, lit: Scene, material: MetallicRoughness, spp: int | None = None) -> Image:
         """The picture of the object, linear and premultiplied.
 
         Args:

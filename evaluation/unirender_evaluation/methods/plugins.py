@@ -164,6 +164,7 @@ def _value(text: str, annotation: Any, what: str) -> Any:
 
 
 def _module_of_file(path: Path, what: str) -> ModuleType:
+    """The module of a file, imported once; its neighbours are found, but after what is installed."""
     path = path.resolve()
     if not path.is_file():
         raise UnirenderError(f"{what}: no file {path}, expected {FORM}")

@@ -91,6 +91,7 @@ def _solved(
     backbones: Sequence[str],
     pictures: MultiviewPictures,
 ) -> Record:
+    """The record of a method on one object: it is solved, timed, rendered and scored."""
     from unirender_evaluation import lpips
 
     networks = [lpips.load(name) for name in backbones]

@@ -17,7 +17,7 @@ from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.rows import evenly
 from unirender_evaluation.suites.objects import bare_mesh, scene_object
-from unirender_evaluation.suites.suite import Material, Scene, Suite
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite
 from unirender_evaluation.truth.render import item_seed
 from unirender_reference.multiview import orbit
 from unirender_reference.optimize.views import View, Views
@@ -65,7 +65,7 @@ class MultiviewScene:
     def __init__(
         self,
         obj: MeshObject,
-        material: Material,
+        material: MetallicRoughness,
         light: Environment,
         other_light: Environment,
         camera: Camera,
@@ -153,7 +153,7 @@ def multiview_scenes(scenes: list[Scene], most: int | None) -> list[Scene]:
     return evenly(firsts, most)
 
 
-def scene_material(suite: Suite, scene: Scene) -> Material:
+def scene_material(suite: Suite, scene: Scene) -> MetallicRoughness:
     """One of the scene's stratified materials: they are sorted by metallic, and objects take them in turn, two each."""
     index = list(dict.fromkeys(other.object for other in suite.scenes)).index(scene.object)
     return scene.materials[index // 2 % len(scene.materials)]

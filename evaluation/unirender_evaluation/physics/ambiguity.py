@@ -32,7 +32,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods.method import Mask, quantise
 from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.metrics import weighted_mean
-from unirender_evaluation.suites.suite import Material
+from unirender_evaluation.suites.suite import MetallicRoughness
 from unirender_evaluation.truth.render import item_seed
 from unirender_reference.noise import full_spp
 from unirender_reference.sweep import QUADRATIC, lagrange_weights
@@ -68,7 +68,7 @@ class Explanations:
         material: (metallic, roughness) of the picture: one that the suite stores.
     """
 
-    def __init__(self, mitsuba: MitsubaScene, material: Material) -> None:
+    def __init__(self, mitsuba: MitsubaScene, material: MetallicRoughness) -> None:
         self.mitsuba, self.material = mitsuba, material
         suite, scene = mitsuba.suite, mitsuba.scene
         mask = suite.mask(scene)

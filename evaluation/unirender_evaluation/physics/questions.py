@@ -14,10 +14,10 @@ from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.physics import formulas, region
 from unirender_evaluation.physics.ambiguity import Points
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Light, Shader, Stage
-from unirender_evaluation.suites.suite import Material
+from unirender_evaluation.suites.suite import MetallicRoughness
 
-Decompose = Callable[[Stage, Material, Image], Intrinsics]
-Posterior = Callable[[Stage, Material, Image], Points]  # samples of the object's material
+Decompose = Callable[[Stage, MetallicRoughness, Image], Intrinsics]
+Posterior = Callable[[Stage, MetallicRoughness, Image], Points]  # samples of the object's material
 PSNR_KEY = metric_key("loop", METRICS["psnr"])
 
 
@@ -34,7 +34,7 @@ def roughness_response(render: formulas.Render, stage: Stage) -> float:
     )
 
 
-def decomposition(decompose: Decompose, stage: Stage, material: Material) -> Intrinsics:
+def decomposition(decompose: Decompose, stage: Stage, material: MetallicRoughness) -> Intrinsics:
     """What is found in the true picture of a material."""
     return decompose(stage, material, stage.image(material))
 
@@ -44,12 +44,12 @@ def loop(shader: Shader, light: Light, decompose: Decompose, stage: Stage) -> fl
     return _loop_psnr(decompose, stage, shader, light, stage.suite.spec.base)
 
 
-def _loop_psnr(decompose: Decompose, stage: Stage, shader: Shader, light: Light, material: Material) -> float:
+def _loop_psnr(decompose: Decompose, stage: Stage, shader: Shader, light: Light, material: MetallicRoughness) -> float:
     maps = decomposition(decompose, stage, material)
     return stage.loop_values(maps, shader, light, material, "loop")[PSNR_KEY]
 
 
-def true_maps(stage: Stage, material: Material, _: Image) -> Intrinsics:
+def true_maps(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
     """The decomposer whose closed loop is the ceiling of all others."""
     return stage.true_maps(material)
 

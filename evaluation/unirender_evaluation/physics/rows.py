@@ -86,6 +86,7 @@ def _mitsuba(stage: Stage, key: str) -> Record:
 
 
 def _record(stage: Stage, row: Row, key: str) -> Record:
+    """The row's values of all tests that its functions can be asked for."""
     values: dict[str, float] = {}
     suite, scene = stage.suite, stage.scene
     if callable(getattr(row.method, "render", None)):

@@ -31,7 +31,7 @@ from unirender_evaluation.physics.tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.folder import write_files
-from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, material_key
 from unirender_evaluation.tables.formats import estimate_text
 from unirender_evaluation.tables.text import markdown_row
 from unirender_evaluation.truth.render import item_seed
@@ -94,11 +94,11 @@ def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any, sampler: Posterio
     return {MITSUBA: _buffers, SHADE: true_maps, OURS: partial(_found, ours.decompose), TWIN: test.twin}
 
 
-def _buffers(stage: Stage, material: Material, _: Image) -> Intrinsics:
+def _buffers(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
     return stage.mitsuba.maps(material)
 
 
-def _found(decompose: Callable[..., Intrinsics], stage: Stage, _: Material, image: Image) -> Intrinsics:
+def _found(decompose: Callable[..., Intrinsics], stage: Stage, _: MetallicRoughness, image: Image) -> Intrinsics:
     """What a method finds: it is handed what a camera would store, nothing else."""
     return decompose(**_shown(stage, image))
 
@@ -120,9 +120,9 @@ class Sampler:
 
     def __init__(self, pipeline: Any) -> None:
         self._pipeline = pipeline
-        self._drawn: dict[tuple[str, Material], Points] = {}  # by scene and material: they make the picture
+        self._drawn: dict[tuple[str, MetallicRoughness], Points] = {}  # by scene and material: they make the picture
 
-    def __call__(self, stage: Stage, material: Material, image: Image) -> Points:
+    def __call__(self, stage: Stage, material: MetallicRoughness, image: Image) -> Points:
         asked = (stage.scene.key, material)
         if asked not in self._drawn:
             import torch

@@ -15,7 +15,7 @@ from unirender_evaluation.methods.method import Image, Mask
 from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.physics.ambiguity import Explanations
 from unirender_evaluation.physics.formulas import composite_shader
-from unirender_evaluation.suites.suite import Material, Scene, Suite
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite
 
 Shader = Literal["shade", "composite"]
 Light = Literal["input", "heldout"]
@@ -65,12 +65,12 @@ class Stage:
         return MitsubaScene(self.suite, self.scene)
 
     @property
-    def pictures(self) -> tuple[Material, ...]:
+    def pictures(self) -> tuple[MetallicRoughness, ...]:
         """Materials whose pictures are stored under both lights."""
         return tuple(dict.fromkeys((self.suite.spec.base, *self.suite.spec.edits)))
 
     @property
-    def own_material(self) -> Material:
+    def own_material(self) -> MetallicRoughness:
         """One of the scene's stratified materials: over a suite's objects, roughly uniform on the unit square."""
         from unirender_evaluation.multiview.scenes import scene_material  # the optimiser
 
@@ -81,11 +81,11 @@ class Stage:
         """Which materials explain the picture of `own_material`."""
         return Explanations(self.mitsuba, self.own_material)
 
-    def true_maps(self, material: Material) -> Intrinsics:
+    def true_maps(self, material: MetallicRoughness) -> Intrinsics:
         """The stored surface in a material, without light."""
         return self.suite.intrinsics(self.scene, material).replace(specular=None, diffuse=None, environment=None)
 
-    def image(self, material: Material) -> Image:
+    def image(self, material: MetallicRoughness) -> Image:
         """The true picture: stored where the suite has it, else rendered."""
         if material in (*self.pictures, *self.scene.materials):
             return self.suite.image(self.scene, material)
@@ -108,7 +108,7 @@ class Stage:
         return self._shaded[key]
 
     def loop_values(
-        self, maps: Intrinsics, shader: Shader, light: Light, material: Material, quantity: str
+        self, maps: Intrinsics, shader: Shader, light: Light, material: MetallicRoughness, quantity: str
     ) -> dict[str, float]:
         """All image metrics of found maps, shaded again, against the true picture in the material that was shown."""
         lit = self.scene if light == "input" else self.suite.other_light(self.scene)

@@ -7,7 +7,7 @@ from unirender_evaluation.methods.composite import Composite
 from unirender_evaluation.methods.method import Image
 from unirender_evaluation.physics.ambiguity import POSTERIOR, Points
 from unirender_evaluation.physics.stage import Stage
-from unirender_evaluation.suites.suite import Material
+from unirender_evaluation.suites.suite import MetallicRoughness
 from unirender_evaluation.truth.render import item_seed
 
 _PERFECT = Composite().render
@@ -39,13 +39,13 @@ def blind_to_roughness(maps: Intrinsics) -> Image:
     return _PERFECT(maps.replace(specular=maps.require("diffuse")["diffuse"]))
 
 
-def dents_for_bumps(stage: Stage, material: Material, _: Image) -> Intrinsics:
+def dents_for_bumps(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
     """The true maps, each normal turned by half a turn about the view axis: lit from the other side."""
     maps = stage.true_maps(material)
     return maps.replace(normal=maps.require("normal")["normal"] * np.array([-1, -1, 1], np.float32))
 
 
-def constant_material(stage: Stage, material: Material, _: Image) -> Intrinsics:
+def constant_material(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
     """The true albedo and normal, metallic and roughness 0.5 whatever the picture."""
     return stage.true_maps((0.5, 0.5)).replace(albedo=stage.true_maps(material).albedo)
 

@@ -152,6 +152,7 @@ def _is_answer(path: Path, question: Question) -> bool:
 
 
 def _layout_problems(folder: Path, files: list[Path], question: Question) -> Iterator[str]:
+    """A line for each file that answers nothing, or that another one answers as well."""
     for path in files:
         expected = _is_answer(path, question) or path.name in IGNORED
         if unusable := _unusable(path):
@@ -237,6 +238,7 @@ def _named_truth(path: Path) -> str | None:
 
 
 def _file_problems(predictions: PredictionFolder, path: Path, question: Question) -> Iterator[str]:
+    """A line for each fault of a file's content."""
     try:
         if path.name in LIGHT_FILES:
             predictions.read_light(path)

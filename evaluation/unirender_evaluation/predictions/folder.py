@@ -187,6 +187,7 @@ class PredictionFolder:
         return intrinsics_from_channels(read_exr(path)[0]).mask if path.suffix == ".exr" else None
 
     def _read_exr_maps(self, path: Path, mask: Mask, camera: Camera) -> dict[str, np.ndarray]:
+        """The maps of an `intrinsics.exr` without its mask; unknown channels are refused."""
         channels, _ = read_exr(path)
         read = intrinsics_from_channels(channels, camera=camera)
         maps = {name: getattr(read, name) for name in read.present if name != "mask"}

@@ -61,6 +61,7 @@ class Maw(Scenes):
 
     @cached_property
     def _photographs(self) -> tuple[Sample, ...]:
+        """The photographs of `meta.csv`; every faulty line has its problem."""
         need_folder(self.folder, self.name, LAYOUT)
         meta = self.folder / "labels" / "meta.csv"
         try:

@@ -37,7 +37,7 @@ from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.public import orb_scoring as scoring
 from unirender_evaluation.public.metrics import ERODED, eroded
-from unirender_evaluation.public.orb_frames import HDR, LDR, Capture, Frame, captures, relightings
+from unirender_evaluation.public.orb_frames import HDR, LDR, Capture, Photograph, captures, relightings
 from unirender_evaluation.public.sets import (
     MAPS,
     Answer,
@@ -89,12 +89,12 @@ class StanfordOrb:
         return found
 
     @cached_property
-    def _tests(self) -> dict[str, Frame]:
+    def _tests(self) -> dict[str, Photograph]:
         """Test photographs by the key of their sample."""
         return {f"{frame.capture}_{frame.id}": frame for capture in self._captures for frame in capture.test}
 
     @cached_property
-    def _relit(self) -> dict[str, tuple[Frame | None, Frame]]:
+    def _relit(self) -> dict[str, tuple[Photograph | None, Photograph]]:
         """By the key of their sample: the photograph that a method sees, if there is one, and that which is asked."""
         if not (self.folder / HDR).is_dir():
             return {}
@@ -105,6 +105,7 @@ class StanfordOrb:
 
     @cached_property
     def _samples(self) -> tuple[Sample, ...]:
+        """All questions of the folder; missing files are named all at once."""
         named = {capture.name: capture for capture in self._captures}
         found = [
             self._map_sample(key, frame, named[frame.capture])
@@ -133,12 +134,12 @@ class StanfordOrb:
         """The capture that a method was given."""
         return self._tests[sample].capture if sample in self._tests else sample.split("/")[0]
 
-    def _map_sample(self, key: str, frame: Frame, capture: Capture) -> Sample:
+    def _map_sample(self, key: str, frame: Photograph, capture: Capture) -> Sample:
         truths = frame_truths(self.folder, frame).values()
         files = (frame.photo(self.folder), frame.mask(self.folder), capture.files[0], *truths)
         return Sample(scoring.MAPS_TABLE.name, key, capture.object, "decompose", key, MAPS, files)
 
-    def _relight_sample(self, key: str, source: Frame | None, frame: Frame, capture: Capture) -> Sample:
+    def _relight_sample(self, key: str, source: Photograph | None, frame: Photograph, capture: Capture) -> Sample:
         light = frame.truth(self.folder, "env_map", ".exr")
         sees = source is not None and light.parent.is_dir()
         files = [frame.photo(self.folder, HDR), frame.mask(self.folder), *capture.files]
@@ -189,7 +190,7 @@ class StanfordOrb:
         truths = {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
         return scoring.score_maps(answer, truths, mask, lpips)
 
-    def _mask(self, frame: Frame) -> Float[np.ndarray, "h w 1"]:
+    def _mask(self, frame: Photograph) -> Float[np.ndarray, "h w 1"]:
         path = frame.mask(self.folder)
         full = read_display(path, 1)
         if full.shape[0] != full.shape[1]:
@@ -202,7 +203,9 @@ class StanfordOrb:
             )
         return mask
 
-    def _reduced(self, value: Float[np.ndarray, "h w c"], path: Path, frame: Frame) -> Float[np.ndarray, "h2 w2 c"]:
+    def _reduced(
+        self, value: Float[np.ndarray, "h w c"], path: Path, frame: Photograph
+    ) -> Float[np.ndarray, "h2 w2 c"]:
         """A map at the run's resolution, which has to be a square like the mask of its frame."""
         if value.shape[0] != value.shape[1]:
             raise UnirenderError(
@@ -211,7 +214,7 @@ class StanfordOrb:
         return block_mean(value, self.resolution, str(path))
 
     def _truth(
-        self, name: str, path: Path, frame: Frame, counted: Float[np.ndarray, "h w 1"]
+        self, name: str, path: Path, frame: Photograph, counted: Float[np.ndarray, "h w 1"]
     ) -> Float[np.ndarray, "h w c"]:
         """A map of the truth, with a look at the values that count: those of the eroded mask."""
         if path.suffix == ".png":
@@ -260,11 +263,11 @@ def _size(value: Float[np.ndarray, "h w c"]) -> str:
     return f"{value.shape[1]} x {value.shape[0]}"
 
 
-def _relight_name(frame: Frame) -> str:
+def _relight_name(frame: Photograph) -> str:
     return f"relight_{frame.capture}_{frame.id}"
 
 
-def frame_truths(folder: Path, frame: Frame) -> dict[str, Path]:
+def frame_truths(folder: Path, frame: Photograph) -> dict[str, Path]:
     """The truths of a photograph whose folder is there, by map; a file may still be missing in it."""
     found = {}
     for name, (kind, suffixes) in MAP_TRUTHS.items():

@@ -21,7 +21,7 @@ NAMES = (re.compile(r"(?P<object>.+)_scene\d+"), re.compile(r"scene\d+_(?P<objec
 
 
 @dataclass(frozen=True)
-class Frame:
+class Photograph:
     """One photograph of a capture.
 
     Attributes:
@@ -75,19 +75,19 @@ class Capture:
 
     name: str
     object: str
-    test: tuple[Frame, ...]
-    train: tuple[Frame, ...]
-    novel: tuple[Frame, ...]
+    test: tuple[Photograph, ...]
+    train: tuple[Photograph, ...]
+    novel: tuple[Photograph, ...]
     files: tuple[Path, ...]
 
-    def nearest(self, novel: Frame, tolerance_deg: float) -> Frame | None:
+    def nearest(self, novel: Photograph, tolerance_deg: float) -> Photograph | None:
         """The photograph of this capture from nearly the same camera as a novel frame's; None where there is none."""
         near = [(difference_deg(frame, novel), frame) for frame in (*self.test, *self.train)]
         best = min(near, key=lambda item: item[0], default=None)
         return best[1] if best is not None and best[0] <= tolerance_deg else None
 
 
-def difference_deg(a: Frame, b: Frame) -> float:
+def difference_deg(a: Photograph, b: Photograph) -> float:
     """How far two cameras of one world differ, degrees.
 
     The largest of the turn between them, the angle under which their distance is seen from a's distance to the origin
@@ -103,7 +103,7 @@ def captures(folder: Path) -> tuple[list[Capture], list[str]]:
     """The captures below blender_LDR, and a line for each thing that is wrong with their transforms."""
     found, problems = [], []
     for path in sorted(p for p in (folder / LDR).iterdir() if p.is_dir()):
-        split_frames: dict[str, tuple[Frame, ...]] = {}
+        split_frames: dict[str, tuple[Photograph, ...]] = {}
         files = [path / f"transforms_{split}.json" for split in ("test", "train", "novel")]
         for split, file in zip(("test", "train", "novel"), files, strict=True):
             try:
@@ -122,21 +122,21 @@ def object_of(capture: str) -> str:
     return next((match["object"] for match in matches if match), capture)
 
 
-def read_frames(path: Path, capture: str) -> tuple[Frame, ...]:
+def read_frames(path: Path, capture: str) -> tuple[Photograph, ...]:
     """The frames of a transforms_*.json.
 
     Raises:
         UnirenderError: no readable file, another layout, or a pose that is no rotation and position.
     """
 
-    def frames(content: Any) -> tuple[Frame, ...]:
+    def frames(content: Any) -> tuple[Photograph, ...]:
         return tuple(_frame(entry, content, capture) for entry in content["frames"])
 
     layout = "frames with file_path and a 4 x 4 transform_matrix, and camera_angle_x in radians"
     return parsed_json(path, frames, layout)
 
 
-def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Frame:
+def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Photograph:
     pose = np.asarray(entry["transform_matrix"], np.float64)
     angle = float(content["camera_angle_x"] if "camera_angle_x" in content else entry["camera_angle_x"])
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
@@ -152,10 +152,10 @@ def _frame(entry: dict[str, Any], content: dict[str, Any], capture: str) -> Fram
         )
     pose[:3, :3] = turn / scale  # captures that are aligned with one another may be scaled
     rows = tuple(tuple(float(x) for x in row) for row in pose)
-    return Frame(str(entry.get("scene_name", capture)), file.parent.name, file.stem, angle, rows)
+    return Photograph(str(entry.get("scene_name", capture)), file.parent.name, file.stem, angle, rows)
 
 
-def relightings(all_captures: Sequence[Capture]) -> list[tuple[Capture, Frame]]:
+def relightings(all_captures: Sequence[Capture]) -> list[tuple[Capture, Photograph]]:
     """Every novel frame of every capture whose own capture is there."""
     names = {capture.name for capture in all_captures}
     return [(capture, frame) for capture in all_captures for frame in capture.novel if frame.capture in names]

@@ -112,6 +112,7 @@ def run(what: PublicRun, console: Console) -> PublicResult:
 
 
 def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> PublicResult:
+    """Answers what no record answers yet, and writes the tables."""
     missing = {
         row.info.label: [f"{sample.table}/{sample.key}" for sample in samples if not takes_part(row, sample)]
         for row in what.rows

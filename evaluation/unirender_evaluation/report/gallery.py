@@ -236,6 +236,7 @@ def picture_rows(item: GalleryItem, run: RunInfo) -> list[tuple[str, dict[str, s
 
 
 def _card(item: GalleryItem, run: RunInfo, most: int) -> dict[str, Any]:
+    """An item as the report's template takes it; pictures of at most `most` pixels a side."""
     names = list(item.truth)
     place = f"{item.rank} of {item.count}" if item.rank else f"{item.place} of {item.count}"
     return {

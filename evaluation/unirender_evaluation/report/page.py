@@ -146,6 +146,7 @@ def _block(variants: Sequence[Table]) -> dict[str, Any]:
 
 
 def _panel(table: Table) -> dict[str, Any]:
+    """A table as the report's template takes it."""
     metrics = {column.metric.name: column for column in table.columns}.values()
     return {
         "dense": len(table.columns) >= DENSE,
@@ -229,6 +230,7 @@ def _claim(line: str) -> dict[str, str]:
 
 
 def _verdicts(specs: Mapping[str, TableSpec], records: Sequence[Record], run: RunInfo) -> list[dict[str, Any]]:
+    """The headline comparisons of every table, as the report's template takes them."""
     groups = []
     for spec in specs.values():
         for protocol in spec.protocols:

@@ -162,6 +162,7 @@ def make_sheets(items: Iterable[GalleryItem], limit: int = SHEET_BYTES) -> dict[
 
 
 def _sheet(item: GalleryItem) -> Sheet:
+    """A sample's pictures as tiles of one sheet: the truth above the leading row's answers."""
     made = item.predictions[item.leader]
     names = [name for name in item.truth if name in made]
     columns = [(item.truth[name], made[name]) for name in names]

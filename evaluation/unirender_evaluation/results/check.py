@@ -91,6 +91,7 @@ def _gathered(records: Iterable[Record], check: Callable[[Record], Iterable[tupl
 
 
 def _method_problems(results: Results) -> Iterator[Problem]:
+    """Rows that are described twice, not at all, or under a name that is not published."""
     keys = Counter(info.key for info in results.run.methods)
     for i, info in enumerate(results.run.methods):
         place = f"run.methods[{i}]"
@@ -139,6 +140,7 @@ def _record_problems(record: Record) -> Iterator[tuple[str, str]]:
 
 
 def _value_problems(backbones: Iterable[str]) -> Callable[[Record], Iterator[tuple[str, str]]]:
+    """A check of a record's values: unknown keys, and numbers better than perfect ones."""
     backbones, known = tuple(backbones), {}
 
     def check(record: Record) -> Iterator[tuple[str, str]]:

@@ -107,6 +107,7 @@ def against_trivial(results: Results, questions: Sequence[Question]) -> str:
 
 
 def _against_trivial(results: Results, question: Question) -> list[str] | None:
+    """Ours beside the best row without a model and the ceiling; None where one of them has no answer."""
     metric = question.kind
     records = Selection(question.table, question.protocol).of(results.records)
 
@@ -261,6 +262,7 @@ def _column(number: tuple[str, str]) -> str:
 
 
 def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:
+    """A Markdown table, whose first `left` columns are set to the left; an error where a line has another length."""
     if any(len(line) != len(head) for line in lines):
         raise UnirenderError(f"table: got lines of {sorted({len(line) for line in lines})} cells, expected {len(head)}")
     rule = [":--" if i < left else "--:" for i in range(len(head))]

@@ -27,6 +27,7 @@ def comparison_table(found: PairComparison) -> Table:
 
 
 def _cells(found: ColumnComparison) -> tuple[str, ...]:
+    """A comparison as cells: number, both means with ranks, difference with interval, n, verdict."""
     digits = found.column.metric.decimals
     difference, n = MISSING, MISSING
     if found.comparison is not None:

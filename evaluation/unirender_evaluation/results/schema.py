@@ -139,6 +139,7 @@ def _of_dataclass(cls: type) -> dict[str, Any]:
 
 
 def _of_type(hint: Any) -> dict[str, Any]:
+    """The JSON schema of a type annotation."""
     simple = {str: "string", int: "integer", float: "number", NoneType: "null", bool: "boolean"}
     if hint in simple:
         return {"type": simple[hint]}

@@ -93,6 +93,7 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
 
 
 def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
+    """Answers what no record answers yet, checks the truth, and writes tables, verdict and report."""
     suite, request = here.suite, check_request(config)
     store = Store.open(config.out / "records.jsonl")
     say = partial(console.print, highlight=False, markup=False, soft_wrap=True)
@@ -204,6 +205,7 @@ def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Prog
 
 
 def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: list[Record]) -> RunInfo:
+    """What `run.json` says: suite, versions, machine, and every row that has records."""
     suite, scenes = here.suite, here.scenes
     used = {record.method for record in records}
     infos = [row.described(len(scenes)) for row in here.rows] + [

@@ -105,6 +105,7 @@ _here: tuple[Run, frozenset[str], Path] | UnirenderError | None = None  # with t
 
 
 def _start(setup: _Setup) -> None:
+    """Prepares a worker: one thread, and the run of `setup`; an error waits for the first task."""
     import threadpoolctl
     import torch
 

@@ -12,7 +12,7 @@ from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.suites.check import value_problems
-from unirender_evaluation.suites.stratification import Material, stratified_materials
+from unirender_evaluation.suites.stratification import MetallicRoughness, stratified_materials
 
 RENAMED = {  # keys of the tables -> attributes
     "truth": {"file": "truth_file", "sha256": "truth_sha256", "cost": "truth_cost"},
@@ -71,8 +71,8 @@ class SuiteSpec:
     lights_per_object: int
     light_rows: int
     assignment_seed: int
-    base: Material
-    edits: tuple[Material, ...]
+    base: MetallicRoughness
+    edits: tuple[MetallicRoughness, ...]
     specular_roughness: tuple[float, ...]
     levels: int
     per_scene: int
@@ -111,7 +111,7 @@ class SuiteSpec:
         named = self.objects_folder if kind == "objects" else self.lights_folder
         return self.path.parent / Path(named).expanduser() if named else None
 
-    def materials(self, meshes: int = 0) -> list[list[Material]]:
+    def materials(self, meshes: int = 0) -> list[list[MetallicRoughness]]:
         """Stratified materials of each scene, objects outermost; `meshes`: objects beside the procedural ones."""
         scenes = (len(self.objects) + meshes) * self.lights_per_object
         return stratified_materials(scenes, self.per_scene, self.levels, self.assignment_seed)

@@ -10,12 +10,12 @@ from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
 
-Material = tuple[float, float]
+MetallicRoughness = tuple[float, float]  # in this order, as in glTF
 EVEN = 0.002  # by which the MSE of the constant may differ from that on the whole grid
 DRAWS = 4096  # of a remainder, where the first is not even
 
 
-def material_key(material: Material) -> str:
+def material_key(material: MetallicRoughness) -> str:
     """`(0.5, 0.3)` -> `m050_r030`: percent, no dots."""
     return f"m{round(100 * material[0]):03d}_{roughness_key(material[1])}"
 
@@ -25,7 +25,7 @@ def roughness_key(roughness: float) -> str:
     return f"r{round(100 * roughness):03d}"
 
 
-def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) -> list[list[Material]]:
+def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) -> list[list[MetallicRoughness]]:
     """Spreads `n_scenes * per_scene` materials evenly and independently over the `levels x levels` grid.
 
     Every cell of the grid is used equally often but for a remainder. The remainder of 240 over 121 cells is 2 x 121 -
@@ -42,6 +42,9 @@ def stratified_materials(n_scenes: int, per_scene: int, levels: int, seed: int) 
 
     Returns:
         For each scene its list of (metallic, roughness).
+
+    Raises:
+        UnirenderError: there are too few levels for it.
     """
     rng = np.random.default_rng(seed)
     total, step = n_scenes * per_scene, levels - 1
@@ -85,14 +88,14 @@ def _even_remainder(
     return draws[np.argmin(off(draws))]
 
 
-def constant_mse(materials: list[list[Material]]) -> tuple[float, float]:
+def constant_mse(materials: list[list[MetallicRoughness]]) -> tuple[float, float]:
     """MSE that the constant 0.5 scores for (metallic, roughness) over all scenes' materials."""
     flat = np.array([material for scene in materials for material in scene])
     mse = np.mean((flat - 0.5) ** 2, axis=0)
     return float(mse[0]), float(mse[1])
 
 
-def level_counts(materials: list[list[Material]]) -> tuple[Counter, Counter]:
+def level_counts(materials: list[list[MetallicRoughness]]) -> tuple[Counter, Counter]:
     """How often each level of metallic and of roughness occurs."""
     flat = [material for scene in materials for material in scene]
     return Counter(m for m, _ in flat), Counter(r for _, r in flat)

@@ -21,7 +21,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.suites.definition import check_definition
 from unirender_evaluation.suites.home import found_spec, truth_command
 from unirender_evaluation.suites.spec import SuiteSpec
-from unirender_evaluation.suites.stratification import Material, material_key
+from unirender_evaluation.suites.stratification import MetallicRoughness, material_key
 from unirender_evaluation.suites.truth_file import (
     CEILING,
     diffuse_member,
@@ -37,7 +37,7 @@ from unirender_evaluation.suites.truth_file import (
 
 CACHE_BYTES = 512 * 2**20  # of decoded members that a suite keeps
 
-__all__ = ["Material", "Scene", "Suite", "SuiteSpec", "load_suite", "material_key"]
+__all__ = ["MetallicRoughness", "Scene", "Suite", "SuiteSpec", "load_suite", "material_key"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Scene:
     light: str
     turn_columns: int
     exposure: float
-    materials: tuple[Material, ...]
+    materials: tuple[MetallicRoughness, ...]
 
 
 class Suite:
@@ -156,11 +156,11 @@ class Suite:
         same = [s for s in self.scenes if s.object == scene.object]
         return same[(same.index(scene) + 1) % len(same)]
 
-    def image(self, scene: Scene, material: Material) -> Float[np.ndarray, "h w 3"]:
+    def image(self, scene: Scene, material: MetallicRoughness) -> Float[np.ndarray, "h w 3"]:
         """Linear image, premultiplied by coverage."""
         return self._mean(image_member(scene.key, material))
 
-    def image_variance(self, scene: Scene, material: Material) -> Float[np.ndarray, "h w 3"]:
+    def image_variance(self, scene: Scene, material: MetallicRoughness) -> Float[np.ndarray, "h w 3"]:
         """Variance of the stored mean, same units squared."""
         return self._variance(image_member(scene.key, material))
 
@@ -172,7 +172,7 @@ class Suite:
         """The same of s."""
         return self._variance(specular_member(scene.key, roughness))
 
-    def ceiling_image(self, scene: Scene, material: Material) -> Float[np.ndarray, "h w 3"] | None:
+    def ceiling_image(self, scene: Scene, material: MetallicRoughness) -> Float[np.ndarray, "h w 3"] | None:
         """The image rendered independently with `ceiling_factor` times its samples; None where none is stored."""
         return self._ceiling(image_member(scene.key, material))
 
@@ -193,7 +193,7 @@ class Suite:
         """Coverage, [0, 1]."""
         return self._channels(shared_member(scene.object))["mask.Y"][..., None]
 
-    def intrinsics(self, scene: Scene, material: Material) -> Intrinsics:
+    def intrinsics(self, scene: Scene, material: MetallicRoughness) -> Intrinsics:
         """All true maps; `specular` only where the suite stores it for this roughness, else None."""
         shared, mask = self._channels(shared_member(scene.object)), self.mask(scene)
         inside = (mask > 0).astype(np.float32)

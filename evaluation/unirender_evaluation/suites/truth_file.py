@@ -37,7 +37,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.exr import Channels
-from unirender_evaluation.suites.stratification import Material, material_key, roughness_key
+from unirender_evaluation.suites.stratification import MetallicRoughness, material_key, roughness_key
 
 Kind = Literal["image", "specular", "diffuse"]
 Rgb = Float[np.ndarray, "h w 3"]
@@ -49,7 +49,7 @@ CEILING = "ceiling/"
 PREFIX: Mapping[Kind, str] = {"image": "", "specular": "specular.", "diffuse": "diffuse."}
 
 
-def image_member(scene_key: str, material: Material) -> str:
+def image_member(scene_key: str, material: MetallicRoughness) -> str:
     return f"{scene_key}.{material_key(material)}.exr"
 
 

@@ -199,6 +199,7 @@ def _answered(spec: TableSpec, records: Sequence[Record], show_published: bool) 
 def _measured_row(
     spec: TableSpec, records: Sequence[Record], run: RunInfo, info: MethodInfo, variant: Variant, lights: Lights | None
 ) -> Row:
+    """A row's cells: the mean of each column over the samples that have a value."""
     objects = {record.sample: record.object for record in records}
     answered = {key.partition(".")[0] for record in records if record.method == info.key for key in record.values}
     cells, n = [], 0

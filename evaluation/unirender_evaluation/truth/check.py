@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from unirender.errors import UsageError
 from unirender_evaluation.suites.objects import object_is_here, scene_object
-from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, material_key
 from unirender_evaluation.suites.truth_file import diffuse_member, image_member, specular_member
 from unirender_evaluation.truth.geometry import GeometryTest, compare_geometry, twin_geometry
 from unirender_evaluation.truth.render import good_spp, item_seed
@@ -46,7 +46,7 @@ class Check:
 
     scene: Scene
     kind: str  # "image", "specular" or "diffuse"
-    material: Material
+    material: MetallicRoughness
     mean: Float[np.ndarray, "h w 3"]
     test: Any  # unirender_reference.statistics.ZTest
 
@@ -147,7 +147,7 @@ def chosen_scenes(suite: Suite, count: int, seed: int) -> list[Scene]:
     return order[: min(count, len(order))]
 
 
-def checked_images(suite: Suite, scene: Scene, seed: int) -> list[tuple[Scene, Material]]:
+def checked_images(suite: Suite, scene: Scene, seed: int) -> list[tuple[Scene, MetallicRoughness]]:
     """The images of a scene that are rendered again: edits, a stratified one, the base under the other light."""
     stratified = scene.materials[seed % len(scene.materials)] if scene.materials else suite.spec.base
     edits = [(scene, material) for material in suite.spec.edits]
@@ -241,7 +241,13 @@ def look_twice(check: Callable[[int], Check], seed: int) -> Check:
 
 
 def _check_image(
-    suite: Suite, renderer: Any, scene: Scene, stored: Material, rendered: Material, seed: int, alpha: float
+    suite: Suite,
+    renderer: Any,
+    scene: Scene,
+    stored: MetallicRoughness,
+    rendered: MetallicRoughness,
+    seed: int,
+    alpha: float,
 ) -> Check:
     member = image_member(scene.key, stored)
     again = renderer.image(

@@ -87,6 +87,7 @@ class BenchTruth:
         return 0
 
     def _make(self) -> None:
+        """Renders the truth and prints what its noise leaves possible."""
         from rich.console import Console
         from rich.progress import Progress
 

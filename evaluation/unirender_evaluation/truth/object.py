@@ -13,7 +13,7 @@ from jaxtyping import Float
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender_evaluation.suites.objects import ObjectSource
 from unirender_evaluation.suites.spec import SuiteSpec
-from unirender_evaluation.suites.stratification import Material
+from unirender_evaluation.suites.stratification import MetallicRoughness
 from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.suites.truth_file import (
     CEILING,
@@ -46,7 +46,7 @@ class ObjectJob:
     source: ObjectSource
     lights: tuple[tuple[str, int], ...]
     environments: dict[str, Environment]
-    materials: tuple[tuple[Material, ...], ...]
+    materials: tuple[tuple[MetallicRoughness, ...], ...]
     out: Path
 
 
@@ -114,8 +114,8 @@ def render_object(job: ObjectJob) -> Path:
 
 
 def _light_scene(
-    renderer: Any, job: ObjectJob, key: str, light: str, turn: int, materials: Sequence[Material]
-) -> tuple[Scene, Environment, dict[Material, str]]:
+    renderer: Any, job: ObjectJob, key: str, light: str, turn: int, materials: Sequence[MetallicRoughness]
+) -> tuple[Scene, Environment, dict[MetallicRoughness, str]]:
     """The scene, its exposed light, and the scene hash of each of its materials."""
     from unirender_reference.exposure import scene_exposure
     from unirender_reference.lights import Light
@@ -134,7 +134,7 @@ def _light_scene(
 
 
 def _buffers(
-    renderer: Any, spec: SuiteSpec, scene: Scene, environment: Environment, hash_of: dict[Material, str]
+    renderer: Any, spec: SuiteSpec, scene: Scene, environment: Environment, hash_of: dict[MetallicRoughness, str]
 ) -> Iterator[_Buffer]:
     """d, s at the suite's roughness values, and the images of a scene."""
     from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, shared_scene_hash

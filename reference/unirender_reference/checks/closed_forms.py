@@ -92,6 +92,7 @@ def camera(seed: int) -> Check:
 
 
 def _furnace(name: str, metallic: float, seed: int) -> Check:
+    """A white sphere under constant light against our BSDF's directional albedo, at each of `FURNACE_ROUGHNESS`."""
     view = ball_view(Camera(), SIZE, 4)
     renderer = Renderer(ball(WHITE), resolution=SIZE)
     light = _constant(FURNACE)

@@ -53,6 +53,7 @@ class Check:
         return self._twins(names) if self.twins else self._table(names)
 
     def _table(self, names: tuple[str, ...]) -> int:
+        """Prints a line for each check; the exit status is 1 if one fails."""
         from rich.table import Column, Table
 
         start = time.perf_counter()
@@ -76,6 +77,7 @@ class Check:
         return 1 if failed else 0
 
     def _twins(self, names: tuple[str, ...]) -> int:
+        """Prints every check under every perturbation; the exit status is 1 if a perturbation or a check passes all."""
         from rich.table import Column, Table
 
         from unirender_reference.checks.perturbations import PERTURBATIONS

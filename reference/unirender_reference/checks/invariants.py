@@ -88,6 +88,7 @@ def render_fresh(seed: int) -> Estimate:
 
 @functools.lru_cache(maxsize=2)
 def _in_scalar_process(seed: int) -> Estimate:
+    """The estimate of the same scene by `scalar_rgb`, which needs a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "scalar.npz"
         run = subprocess.run(

@@ -45,7 +45,11 @@ def _stored(file: str) -> Float[np.ndarray, "h w 3"]:
 
 
 def bundled_lights(split: str | None = None) -> list[Light]:
-    """The bundled maps of a split ("train", "test"), or all, in name order."""
+    """The bundled maps of a split ("train", "test"), or all, in name order.
+
+    Raises:
+        UnirenderError: another split.
+    """
     if split not in (None, "train", "test"):
         raise UnirenderError(f"bundled_lights: got split {split!r}, expected 'train', 'test' or None")
     return [bundled_light(name) for name, row in sorted(catalogue().items()) if split in (None, row["split"])]

@@ -13,7 +13,11 @@ FINE = (128, 256)  # synthetic maps are drawn at this size and averaged down
 
 
 def light_constant(rgb: Float[np.ndarray, "3"] | tuple[float, float, float]) -> Light:
-    """The same radiance from everywhere; only the ratio of the channels is kept (mean luminance 1)."""
+    """The same radiance from everywhere; only the ratio of the channels is kept (mean luminance 1).
+
+    Raises:
+        UnirenderError: a channel is negative or not finite.
+    """
     color = np.asarray(rgb, np.float32)
     if color.shape != (3,) or not np.isfinite(color).all() or color.min() < 0:
         raise UnirenderError(f"light_constant: got {rgb}, expected three finite numbers >= 0")

@@ -35,7 +35,7 @@ POLE = np.cos(np.radians(6))
 
 
 @dataclass(frozen=True)
-class Material:
+class RenderDraw:
     """What a render draws: None is the object's own map."""
 
     light_seed: int
@@ -62,7 +62,7 @@ class BadPixel:
     family: str
     bumped: bool
     light: str
-    material: Material
+    material: RenderDraw
     seed: int
     spp: int
     row: int
@@ -89,7 +89,7 @@ class ObjectCensus:
     repaired: int
 
 
-def draw_materials(obj: MeshObject, object_seed: int, count: int) -> list[Material]:
+def draw_renders(obj: MeshObject, object_seed: int, count: int) -> list[RenderDraw]:
     """The renders of an object: lights of the train pool, materials with many exact zeros and ones, two depths."""
     rng = np.random.default_rng([object_seed, 7])
 
@@ -99,7 +99,7 @@ def draw_materials(obj: MeshObject, object_seed: int, count: int) -> list[Materi
         return float(rng.integers(2)) if rng.random() < EXACT else float(rng.random())
 
     return [
-        Material(
+        RenderDraw(
             int(rng.integers(1 << 31)),
             value(obj.roughness),
             value(obj.metallic),
@@ -115,12 +115,12 @@ def census_of_object(object_seed: int, renders: int, resolution: int, spp: int) 
     renderer = Renderer(obj, resolution=resolution)
     bad: list[BadPixel] = []
     calls = written = repaired = 0
-    for number, material in enumerate(draw_materials(obj, object_seed, renders)):
-        light = make_light(material.light_seed, "train")
+    for number, draw in enumerate(draw_renders(obj, object_seed, renders)):
+        light = make_light(draw.light_seed, "train")
         with _raw_renders() as raw:
             seed = derive_seed(object_seed, "census", number)
-            arguments = (light.environment, material.roughness, material.metallic, spp, seed)
-            estimate = renderer.image(*arguments, depth=material.depth, batches=1)
+            arguments = (light.environment, draw.roughness, draw.metallic, spp, seed)
+            estimate = renderer.image(*arguments, depth=draw.depth, batches=1)
         calls += len(raw)
         written += int((~np.isfinite(estimate.mean)).sum() + (estimate.mean < 0).sum())
         repaired += estimate.nan_pixels
@@ -133,7 +133,7 @@ def census_of_object(object_seed: int, renders: int, resolution: int, spp: int) 
                 values = tuple(float(x) for x in picture[row, column])
                 where = (obj.family, obj.normal_map is not None, light.provenance.get("kind", light.name))
                 pixel = (pass_seed, pass_spp, int(row), int(column), values)
-                bad.append(BadPixel(KINDS[kind], str(places[row, column]), object_seed, *where, material, *pixel))
+                bad.append(BadPixel(KINDS[kind], str(places[row, column]), object_seed, *where, draw, *pixel))
     return ObjectCensus(renders, calls, tuple(bad), written, repaired)
 
 

@@ -65,6 +65,7 @@ class Census:
         return 1 if written else 0
 
     def _breakdown(self, bad: list["BadPixel"]) -> object:
+        """A table of the bad pixels by each property of the render that they are in."""
         from rich.table import Table
 
         table = Table("where", "bad pixels", title="where they come from")
@@ -88,8 +89,8 @@ class Census:
         samples = renders * self.resolution**2 * self.spp
         return (
             f"{renders} renders of {len(censuses)} objects ({calls} calls of mi.render, {samples:.3g} camera paths) in "
-            f"{seconds:.0f} s on {workers} workers; {sum(c.repaired for c in censuses)} pixels rendered again; "
-            f"{written} bad values in what was handed out"
+            f"{seconds:.0f} s on {workers} worker{'s' * (workers != 1)}; "
+            f"{sum(c.repaired for c in censuses)} pixels rendered again; {written} bad values in what was handed out"
         )
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 COLUMNS = ("image", "albedo", "normal", "roughness", "metallic", "specular s", "diffuse d", "environment", "mask")
 MATERIALS = ((0.1, 1.0), (0.5, 0.0), (0.2, 0.0), (0.35, 1.0), (0.8, 0.0), (0.05, 0.5), (0.6, 1.0), (0.3, 0.5))
 CHECKS, CHECK_CONTRAST = 12, 0.08  # squares along a tile's side, and their difference in display grey
+TINT = (-0.08, 0.0, 0.08)  # of the checks about a map of one channel: no grey of it looks like them
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,10 @@ class Sheet:
 def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
     """Display values of the buffers in the order of `COLUMNS`.
 
-    The image is composited in linear light over the background; the maps stand on checks about it, so that no value is
-    mistaken for the page. s and d are clipped at display white like the image; roughness, metallic and mask are shown
-    as their values, normals as (n + 1) / 2; the environment is exposed for itself (`sheets.environment_preview`).
+    The image is composited in linear light over the background; the maps stand on checks about it, those of one channel
+    on bluish ones, so that no value is mistaken for the page. s and d are clipped at display white like the image;
+    roughness, metallic and mask are shown as their values, normals as (n + 1) / 2; the environment is exposed for
+    itself (`sheets.environment_preview`).
 
     Args:
         sample: a complete sample.
@@ -117,10 +119,10 @@ def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
     }
     size = mask.shape[1]
     odd = (np.indices(mask.shape[:2]) // (size // CHECKS)).sum(axis=0)[..., None] % 2
-    under = background + CHECK_CONTRAST * (odd - 0.5)
+    under = background + CHECK_CONTRAST * (odd - 0.5) + np.zeros(3)
     return [
         image_srgb(sample.image_linear + (1 - mask) * grey),
-        *(np.repeat(mask * value + (1 - mask) * under, 3 // value.shape[2], axis=2) for value in shown.values()),
+        *(mask * value + (1 - mask) * (under + TINT if value.shape[2] == 1 else under) for value in shown.values()),
         environment_preview(resample_environment(maps["environment"], (size // 2, size))),
         np.repeat(mask, 3, axis=2),
     ]

@@ -48,8 +48,10 @@ class Cost:
 
         if min((*self.resolutions, self.spp, self.scenes, self.objects), default=0) < 1 or not self.resolutions:
             raise UsageError("expected at least 1 resolution, sample, scene and object")
-        console = Console(width=132)
-        parts = Table("px", *(f"{part} s" for part in PARTS), *(f"{file} kB" for file in FILES), "peak MB")
+        console = Console(width=160)
+        names = {"s": "specular", "d": "diffuse"}  # beside seconds
+        columns = [f"{names.get(name, name)} ({unit})" for unit, of in (("s", PARTS), ("kB", FILES)) for name in of]
+        parts = Table("px", *columns, "peak (MB)")
         whole = Table("px", "data set", "core-hours", "TB", "groups", "shards", "GB a shard")
         for resolution in self.resolutions:
             with WorkerPool(1) as pool:
@@ -75,7 +77,8 @@ class Cost:
             whole.add_section()
         console.print(parts)
         console.print(
-            f"Seconds of one core at {self.spp} spp, kilobytes of an EXR file; means over {self.scenes} scenes."
+            f"CPU seconds of one core at {self.spp} spp, kilobytes of an EXR file; "
+            f"means over {self.scenes} scene{'s' * (self.scenes != 1)}."
         )
         console.print(whole)
         console.print(f"{self.objects:,} objects x {PAIRS} pairs, {SHARD_GROUPS} groups a shard.")

@@ -115,6 +115,7 @@ class Lights:
         return {side: light_pool(self.pool, side, self.holdout, self.share) for side in sides}
 
     def _selected(self, shown: "_Shown") -> "Iterator[tuple[Split, Light]]":
+        """The lights that the options ask for, one after the other; files that are none go into `shown.failures`."""
         from unirender_reference.lights import Light, bundled_lights, make_light
 
         for side, pool in self._sides().items():
@@ -189,6 +190,7 @@ def _new_folder(path: Path | None) -> Iterator[Path | None]:
 
 
 def _export(folder: Path, light: "Light") -> None:
+    """Writes a light as EXR, on the grid, and a preview as PNG."""
     from PIL import Image
 
     from unirender.color import eight_bits

@@ -93,6 +93,7 @@ def _walk(
     enters: Callable[[tuple[str, ...]], bool],
     report: Callable[[Path, str], None],
 ) -> Iterator[Path]:
+    """Files below a folder that are `wanted`, in name order; a folder that cannot be listed is reported."""
     folder = root.joinpath(*below)
     names: list[str] = []
     folders: list[str] = []

@@ -81,7 +81,11 @@ class Document:
         return memoryview(data)[offset : offset + length]
 
     def resource(self, uri: str, what: str) -> bytes:
-        """The bytes of a data URI or of a file in the model's folder."""
+        """The bytes of a data URI or of a file in the model's folder.
+
+        Raises:
+            UnirenderError: a broken data URI, or a file that cannot be read or lies elsewhere.
+        """
         if not uri.startswith("data:"):
             return self.folder.read(uri, what, uri=True)
         header, _, content = uri.partition(",")
@@ -93,6 +97,7 @@ class Document:
             raise UnirenderError(f"{what}: its data URI is broken ({error}); export it again") from error
 
     def _buffer(self, index: object) -> bytes:
+        """The bytes of a buffer, read once; all buffers of a model together have a limit."""
         buffer = self.item("buffers", index)
         uri = buffer.get("uri")
         if uri is None and (index != 0 or self._binary is None):
@@ -112,7 +117,11 @@ class Document:
 
 
 def size(owner: dict[str, Any], key: str, default: int | None = None) -> int:
-    """A non-negative integer of a JSON object."""
+    """A non-negative integer of a JSON object.
+
+    Raises:
+        UnirenderError: it is something else.
+    """
     value = owner.get(key, default)
     if not isinstance(value, int) or value < 0:
         raise UnirenderError(f"has {key} {value!r}, expected a non-negative integer; export it again")

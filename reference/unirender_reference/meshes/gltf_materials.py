@@ -27,7 +27,11 @@ GLOSS_TEXTURE = "specularGlossinessTexture"
 
 
 def vector(owner: dict[str, Any], key: str, default: list[float]) -> Float[np.ndarray, " n"]:
-    """A list of finite numbers of a JSON object, as long as its default."""
+    """A list of finite numbers of a JSON object, as long as its default.
+
+    Raises:
+        UnirenderError: it is something else.
+    """
     value = owner.get(key, default)
     try:
         array = np.asarray(value, np.float64).reshape(-1)
@@ -82,6 +86,7 @@ class Materials:
         return {} if index is None else self._document.item("materials", index)
 
     def _channels(self, material: dict[str, Any]) -> dict[str, Channel]:
+        """The material's channels, of whichever of its models the file has."""
         extensions = material.get("extensions", {})
         self._note_ignored(material, extensions)
         if GLOSS in extensions:
@@ -100,6 +105,7 @@ class Materials:
         return channels
 
     def _metallic_roughness(self, pbr: dict[str, Any]) -> dict[str, Channel]:
+        """Albedo, roughness and metallic by the metallic-roughness model: factor times texture, linear."""
         color = np.clip(vector(pbr, "baseColorFactor", [1, 1, 1, 1]), 0, 1).astype(np.float32)
         roughness = np.clip(_scalar(pbr, "roughnessFactor", 1.0), 0, 1)
         metallic = np.clip(_scalar(pbr, "metallicFactor", 1.0), 0, 1)

@@ -97,6 +97,7 @@ def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4
 
 
 def _local(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
+    """The node's own transform: its matrix, or translation, rotation (a unit quaternion) and scale."""
     if "matrix" in node:
         return vector(node, "matrix", [0.0] * 16).reshape(4, 4).T
     x, y, z, w = quaternion = vector(node, "rotation", [0, 0, 0, 1])

@@ -119,6 +119,7 @@ def _eight_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> Image
 
 
 def _upper_bits(image: Image.Image, tags: Mapping[int, Any], name: str) -> UInt8[np.ndarray, "h w"]:
+    """8 bits of each value of a grey picture with more, or of floats in [0, 1]."""
     values = np.asarray(image)
     if image.mode == "F":
         if not (values.min() >= -SLACK and values.max() <= 1 + SLACK):  # NaN is neither

@@ -72,6 +72,7 @@ class _Lines:
                 kept = b""
 
     def _line(self, parts: list[bytes]) -> None:
+        """Takes one line, split into its keyword and the rest."""
         if len(parts) < 2:
             return
         keyword, rest = parts
@@ -106,6 +107,7 @@ class _Lines:
             check_materials(len(self.libraries))
 
     def _face(self, tokens: list[bytes]) -> None:
+        """Takes one polygon: its corners' indices from 1, 0 where there is none; negative ones count from the end."""
         if len(tokens) < 3:
             return
         counts = len(self.points) // 3, len(self.coordinates) // 2, len(self.normals) // 3

@@ -195,6 +195,7 @@ def read_columns(path: Path, header: PlyHeader, wanted: Collection[str]) -> dict
 
 
 def _of_text(body: bytes, elements: Mapping[str, PlyElement], wanted: Collection[str]) -> dict[str, PlyColumns]:
+    """The wanted elements of a text PLY."""
     claimed = sum(element.rows for element in elements.values())
     lines = [line for line in body.splitlines() if line.strip()][:claimed]
     if len(lines) < claimed:

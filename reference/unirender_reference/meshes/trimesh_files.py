@@ -108,6 +108,7 @@ def _texture(folder: ModelFolder, header: PlyHeader) -> Texture | None:
 
 
 def _piece(mesh: trimesh.Trimesh, texture: Texture | None, step: float) -> Piece:
+    """The mesh as a piece with its texture, or else its colours, or else the default albedo."""
     faces = np.asarray(mesh.faces, np.int64)
     vertices = np.asarray(mesh.vertices, np.float64)
     stored = mesh._cache["vertex_normals"]  # the file's, or None; the property would compute them

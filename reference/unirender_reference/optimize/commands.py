@@ -129,6 +129,7 @@ class Optimize:
         return self._run_folder(chosen) if self.input.is_dir() else self._run_picture(chosen)
 
     def _run_folder(self, predict: Predict | None) -> int:
+        """Optimises a folder of posed pictures and prints the figures of the result; the exit status."""
         import json
         import time
 
@@ -205,6 +206,7 @@ class Optimize:
         return solution_from_predictions(views, obj, predictions, self.config.texture_size, self.config.light_rows)
 
     def _run_picture(self, predict: Predict | None) -> int:
+        """Optimises one picture and writes a result folder; the exit status."""
         import time
 
         from rich.console import Console
@@ -245,6 +247,7 @@ class Optimize:
                 geometry=obj,
                 init=start,
                 hdr=given.hdr,
+                clipped=given.clipped,
                 on_step=on_step,
             )
             seconds = time.perf_counter() - began

@@ -25,11 +25,11 @@ from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
 from unirender.files import new_folder
-from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
+from unirender.pictures import DISPLAY_WHITE, check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender.visualization import write_png
 from unirender_reference.meshes.images import area_means
-from unirender_reference.optimize.transforms import Y_UP, Frame, Up, read_transforms
-from unirender_reference.optimize.views import SATURATED, View, Views
+from unirender_reference.optimize.transforms import Y_UP, PosedPicture, Up, read_transforms
+from unirender_reference.optimize.views import View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
@@ -93,7 +93,7 @@ def read_views(
     return views
 
 
-def _split(main: Path, hold_out: int) -> tuple[list[Frame], list[Frame]]:
+def _split(main: Path, hold_out: int) -> tuple[list[PosedPicture], list[PosedPicture]]:
     """The frames that are seen, and those that are held out: by the files, and every N-th of the others."""
     frames = read_transforms(main)
     seen = [frame for frame in frames if not frame.held_out]
@@ -125,7 +125,7 @@ def _check_arguments(up: Up, hold_out: int, most_views: int | None, longest_side
             raise UnirenderError(f"{name}: got {value}, expected 1 or more, or None (no limit)")
 
 
-def _warn(views: Views, frames: Sequence[Frame]) -> None:
+def _warn(views: Views, frames: Sequence[PosedPicture]) -> None:
     """Logs what is hardly meant: black pictures, one picture twice, and a lens in pixels of another size."""
     names: dict[bytes, str] = {}
     for view, frame in zip((*views.seen, *views.held_out), frames, strict=True):
@@ -138,13 +138,13 @@ def _warn(views: Views, frames: Sequence[Frame]) -> None:
         names.setdefault(digest, frame.name)
 
 
-def _spread(frames: list[Frame], most: int | None) -> list[Frame]:
+def _spread(frames: list[PosedPicture], most: int | None) -> list[PosedPicture]:
     if most is None or len(frames) <= most:
         return frames
     return [frames[index * len(frames) // most] for index in range(most)]
 
 
-def _view(frame: Frame, folder: Path, linear: bool, up: Up, longest_side: int | None, notices: set[str]) -> View:
+def _view(frame: PosedPicture, folder: Path, linear: bool, up: Up, longest_side: int | None, notices: set[str]) -> View:
     """Reads one picture with its mask; what is due on the set as a whole goes to `notices`."""
     picture = read_picture_file(frame.file, upright=False)
     image, mask = picture.image, picture.mask
@@ -251,7 +251,7 @@ def reduced(view: View, longest_side: int, linear: bool) -> View:
     )
     if linear:
         return View(image, mask, camera, view.pose, view.name)
-    full = (view.image >= SATURATED) if view.clipped is None else view.clipped
+    full = (view.image >= DISPLAY_WHITE) if view.clipped is None else view.clipped
     clipped = means((full & (view.mask > 0)).astype(np.float32)) > LEAST_SHARE
     return View(np.clip(srgb_encode(image), 0, 1), mask, camera, view.pose, view.name, clipped)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.display_files import stored_values
@@ -38,6 +38,7 @@ class PictureInput:
         camera: field of view and principal point.
         normal: unit vectors in camera axes, 0 outside the mask, or None.
         hdr: whether the picture is linear.
+        clipped: where a display value is only a lower bound, if the picture was reduced; None: where it is 1.
     """
 
     image: Float[np.ndarray, "h w 3"]
@@ -45,6 +46,7 @@ class PictureInput:
     camera: Camera
     normal: Float[np.ndarray, "h w 3"] | None
     hdr: bool
+    clipped: Bool[np.ndarray, "h w 3"] | None = None
 
 
 def read_picture_input(
@@ -87,7 +89,7 @@ def read_picture_input(
     if normal is not None:
         normals = _fitting_normals(normal, full, view, longest_side)
         check_axes(normals, view.mask, view.camera, normal)
-    return PictureInput(view.image, view.mask, view.camera, normals, hdr)
+    return PictureInput(view.image, view.mask, view.camera, normals, hdr, view.clipped)
 
 
 def _camera(stated: Camera | None, fov_deg: float | None, normal: Path | None) -> Camera:

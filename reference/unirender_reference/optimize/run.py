@@ -173,6 +173,7 @@ class _Run:
         return found
 
     def _stage(self, name: str, found: Solution | MeshObject | None) -> Solution | MeshObject:
+        """What a stage makes of what the stages before it found."""
         kind, config = name.split("-")[0], self.config
         shape = dataclasses.replace(config.shape, seed=config.shape.seed + config.seed)
         if kind == SHAPE:
@@ -248,6 +249,7 @@ class _Run:
         return on_step
 
     def _refine(self, name: str, start: Solution) -> Solution:
+        """The solution refined by descent, from the saved state where there is one."""
         config = dataclasses.replace(self.config.refine, seed=self.config.refine.seed + self.config.seed)
         if not config.enabled:
             return start

@@ -26,7 +26,7 @@ from unirender_reference.optimize.material_mix import Lobes, Mixed, lobes_at, ma
 from unirender_reference.optimize.robust import HUBER
 from unirender_reference.optimize.roughness_nodes import NODES
 from unirender_reference.optimize.single_config import Priors
-from unirender_reference.optimize.single_picture import Picture
+from unirender_reference.optimize.single_picture import PicturePixels
 from unirender_reference.optimize.single_priors import (
     LIGHT_GRID,
     albedo_precision,
@@ -97,7 +97,9 @@ class Fit:
         noise: expected misfit in display values.
     """
 
-    def __init__(self, picture: Picture, log_light: Float[np.ndarray, "j 3"], priors: Priors, noise: float) -> None:
+    def __init__(
+        self, picture: PicturePixels, log_light: Float[np.ndarray, "j 3"], priors: Priors, noise: float
+    ) -> None:
         self.picture, self.priors = picture, priors
         self.log_albedo = np.log(picture.maps["albedo"] + DARKEST)
         self.log_light = log_light
@@ -257,6 +259,7 @@ class Fit:
         scale: float,
         eliminated: list[Eliminated],
     ) -> Unknowns:
+        """The unknowns after a step of the solver, bounded; the eliminated ones follow."""
         maps, c = self.picture.maps, 3 * self.coarse
         metallic = at.metallic + float(np.clip(move[-2], -0.25, 0.25))
         roughness = at.roughness + float(np.clip(move[-1], -0.2, 0.2))

@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_encode, unpremultiply
+from unirender.pictures import DISPLAY_WHITE
 from unirender_reference.optimize.differences import side_by_side
 from unirender_reference.optimize.light_grid import LightGrid
 from unirender_reference.optimize.surface_points import blocker, mapped_points, picture_points
@@ -16,11 +17,10 @@ from unirender_reference.optimize.transport import Transport, light_transport
 from unirender_reference.shapes import MeshObject
 
 POINTS = 4  # of a pixel on a known mesh
-SATURATED = 0.999  # display value from which a channel may stand for more
 
 
 @dataclass(frozen=True)
-class Picture:
+class PicturePixels:
     """The n pixels of a (shrunk) picture that show the object.
 
     Attributes:
@@ -66,7 +66,8 @@ def make_picture(
     light_shape: tuple[int, int],
     hdr: bool,
     seed: int,
-) -> Picture:
+    clipped: Bool[np.ndarray, "h w 3"] | None = None,
+) -> PicturePixels:
     """Shrinks a picture by whole blocks until at most about `pixels` covered ones are left, and traces their transport.
 
     Args:
@@ -79,6 +80,7 @@ def make_picture(
         light_shape: rows and columns of the light.
         hdr: no value is clipped.
         seed: of the points' places.
+        clipped: where a value is only a lower bound; None: where its display value is 1, and nowhere if `hdr`.
     """
     height, width = mask.shape[:2]
     block = max(1, math.ceil(math.sqrt((mask > 0).sum() / pixels) - 0.05))
@@ -99,8 +101,10 @@ def make_picture(
         return values.reshape(-1, values.shape[-1])[pixel].astype(np.float64)
 
     display = srgb_encode(unpremultiply(radiance, coverage)).astype(np.float64)
-    saturated = np.zeros((len(pixel), 3), bool) if hdr else chosen(shrink(_clipped(image_linear, mask), block)) > 0
-    return Picture(
+    if clipped is None:
+        clipped = np.zeros(image_linear.shape, bool) if hdr else _clipped(image_linear, mask)
+    saturated = chosen(shrink(clipped.astype(np.float32), block)) > 0
+    return PicturePixels(
         transport,
         pixel,
         size,
@@ -132,10 +136,9 @@ def neighbours(pixel: Int[np.ndarray, " n"], size: tuple[int, int]) -> Int[np.nd
     return pairs[:, (pairs >= 0).all(axis=0)]
 
 
-def _clipped(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
-    """1 where a channel's display value is at its end."""
-    full = image_srgb(unpremultiply(image_linear, mask)) >= SATURATED
-    return (full & (mask > 0)).astype(np.float32)
+def _clipped(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Bool[np.ndarray, "h w 3"]:
+    """Where a channel's display value is at its end."""
+    return (image_srgb(unpremultiply(image_linear, mask)) >= DISPLAY_WHITE) & (mask > 0)
 
 
 def _unit(values: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

@@ -18,7 +18,7 @@ from unirender.lighting import resample_environment
 from unirender_reference.optimize.inflate import nearest
 from unirender_reference.optimize.single_config import Trust
 from unirender_reference.optimize.single_fit import DARKEST, Fit, Unknowns
-from unirender_reference.optimize.single_picture import Picture, shrink
+from unirender_reference.optimize.single_picture import PicturePixels, shrink
 
 MOST_GAIN = 4.0
 DARK = 1e-4  # least radiance whose logarithm counts
@@ -131,7 +131,7 @@ def _shading(
     return specular, diffuse
 
 
-def _mesh_normal(picture: Picture, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
+def _mesh_normal(picture: PicturePixels, size: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
     """The mesh's normals at the picture's own size."""
     normal = enlarge(picture, picture.normal, size)
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
@@ -145,7 +145,9 @@ def light_buffers(
     return (fit.model(at).lobes.gloss @ light) / coverage, (fit.picture.transport.white @ light) / coverage
 
 
-def enlarge(picture: Picture, values: Float[np.ndarray, "n c"], size: tuple[int, int]) -> Float[np.ndarray, "h w c"]:
+def enlarge(
+    picture: PicturePixels, values: Float[np.ndarray, "n c"], size: tuple[int, int]
+) -> Float[np.ndarray, "h w c"]:
     """Values of blocks at the pixels of a picture of `size`: bilinear; blocks without one have their neighbour's."""
     import scipy.ndimage as ndimage
 
@@ -165,7 +167,7 @@ def _mean(values: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) 
 
 
 def _blurred(
-    picture: Picture, image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]
+    picture: PicturePixels, image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]
 ) -> Float[np.ndarray, "h w 3"]:
     """The picture as its blocks show it, straight."""
     coverage = shrink(mask, picture.block)

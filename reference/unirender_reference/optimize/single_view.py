@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from unirender.arguments import as_coverage, as_floats, as_instance
 from unirender.camera import Camera
@@ -22,7 +22,7 @@ from unirender_reference.optimize.placement import check_in_picture
 from unirender_reference.optimize.single_config import COLD, SingleConfig, fitted
 from unirender_reference.optimize.single_exposure import exposed, exposure_of
 from unirender_reference.optimize.single_fit import Fit, Unknowns
-from unirender_reference.optimize.single_picture import Picture, make_picture
+from unirender_reference.optimize.single_picture import PicturePixels, make_picture
 from unirender_reference.optimize.single_result import result
 from unirender_reference.optimize.single_search import anneal, descend
 from unirender_reference.optimize.views import Step
@@ -43,6 +43,7 @@ def optimize_image(
     geometry: MeshObject | None = None,
     init: Intrinsics | None = None,
     hdr: bool = False,
+    clipped: Bool[np.ndarray, "h w 3"] | None = None,
     on_step: OnStep | None = None,
 ) -> Intrinsics:
     """Finds the maps and the light whose rendering is the picture.
@@ -57,6 +58,7 @@ def optimize_image(
         init: a prediction with albedo, roughness, metallic and environment, centre of the priors; None: grey, half
             metallic and half rough, under even light.
         hdr: the picture is linear and no value is clipped; the light that is found has its scale, as that of `init`.
+        clipped: where a value is only a lower bound (of a picture that was reduced); None: where it is 1.
         on_step: hears of every step.
 
     Returns:
@@ -88,8 +90,8 @@ def optimize_image(
     maps["normal"] = _start_normals(mask, camera, normal, geometry, init)
     shape = (config.light_rows, 2 * config.light_rows)
 
-    def prepared(pixels: int) -> Picture:
-        return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed)
+    def prepared(pixels: int) -> PicturePixels:
+        return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed, clipped)
 
     coarse = prepared(config.coarse_pixels)
     fit = Fit(coarse, _start_light(coarse, init, shape), priors, config.noise[0])
@@ -147,6 +149,7 @@ def _start_normals(
     geometry: MeshObject | None,
     init: Intrinsics | None,
 ) -> Float[np.ndarray, "h w 3"]:
+    """The normals that are given, else those of `init`, else of the silhouette; 0 where a mesh has its own."""
     if normal is None and geometry is None and init is not None:
         normal = init.normal
     if normal is None:
@@ -159,7 +162,7 @@ def _start_normals(
     return normal
 
 
-def _start_light(picture: Picture, init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
+def _start_light(picture: PicturePixels, init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
     """Log radiance of the start; even light where nothing is predicted."""
     if init is None:
         return np.zeros((shape[0] * shape[1], 3))

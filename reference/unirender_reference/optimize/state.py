@@ -162,6 +162,7 @@ def _update(digest: Any, *arrays: np.ndarray | None) -> None:
 
 
 def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Refuses a folder whose run differs in what decides its result."""
     differs = [
         f"{group}.{key}"
         for group in wanted

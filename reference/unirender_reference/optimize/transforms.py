@@ -40,7 +40,7 @@ FOCAL_TOLERANCE = 0.002  # of fl_x and fl_y: less than a pixel at the edge of 80
 
 
 @dataclass(frozen=True)
-class Frame:
+class PosedPicture:
     """One picture of a `transforms.json`.
 
     Attributes:
@@ -130,6 +130,7 @@ class Frame:
         return side / (2 * math.tan(angle / 2))
 
     def _check_lens(self) -> None:
+        """Refuses a lens that is no pinhole."""
         model = self.values.get("camera_model", PINHOLE[0])
         if not isinstance(model, str) or model.upper() not in PINHOLE:
             raise UnirenderError(
@@ -158,7 +159,7 @@ class Frame:
         return float(value)
 
 
-def read_transforms(path: Path) -> list[Frame]:
+def read_transforms(path: Path) -> list[PosedPicture]:
     """The frames of a `transforms.json`, in its order; no picture is opened.
 
     Raises:
@@ -190,7 +191,9 @@ def _split(path: Path, key: str, names: Any) -> set[Path]:
     return {Path(name) for name in names}
 
 
-def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits: Mapping[str, set[Path]]) -> Frame:
+def _frame(
+    path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits: Mapping[str, set[Path]]
+) -> PosedPicture:
     where = f"{path}: frames[{index}]"
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise UnirenderError(f"{where} has no file_path, expected the path of a picture; write it into the frame")
@@ -202,7 +205,7 @@ def _frame(path: Path, index: int, entry: Any, shared: Mapping[str, Any], splits
     mask = entry.get("mask_path")
     if mask is not None and not isinstance(mask, str):
         raise UnirenderError(f"{where}: mask_path is {mask!r}, expected the path of a picture")
-    return Frame(
+    return PosedPicture(
         file=_picture_file(path.parent, _written(entry["file_path"]), where),
         mask=None if mask is None else path.parent / _written(mask),
         pose=_pose(entry, where),

@@ -9,10 +9,10 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers
+from unirender.pictures import DISPLAY_WHITE
 from unirender_reference.scene import check_pose
 
 RANGE_TOLERANCE = 1e-3
-SATURATED = 1 - 0.5 / 255  # display values of 8 bits from here on are 1
 BLACK = 0.5 / 255  # display values of 8 bits below are 0
 
 
@@ -107,7 +107,7 @@ class Views:
         """Where the radiance may be more than the picture shows."""
         if self.hdr:
             return np.zeros(view.image.shape, bool)
-        return view.image >= SATURATED if view.clipped is None else view.clipped
+        return view.image >= DISPLAY_WHITE if view.clipped is None else view.clipped
 
     def black(self, view: View) -> bool:
         """Whether a picture shows no light wherever its mask covers it."""

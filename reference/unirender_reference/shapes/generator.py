@@ -19,7 +19,7 @@ from unirender_reference import textures  # which imports `shapes.noise`: whoeve
 from unirender_reference.shapes import implicit, parametric
 from unirender_reference.shapes.material_maps import Maps, SolidMaterial, random_material
 from unirender_reference.shapes.mesh_object import MeshObject, unit_sphere
-from unirender_reference.shapes.surface import Frame, Part, corner_normals, pack_textures, split_corners
+from unirender_reference.shapes.surface import AtlasPlace, Part, corner_normals, pack_textures, split_corners
 
 Split = Literal["train", "test"]
 SPLIT = {"train": 0x7421, "test": 0x7E57}
@@ -123,13 +123,13 @@ def _finish(
     pattern, albedo, uvs = "constant", textures.random_color(rng), None
     if textured or len(parts) > 1:
         kinds, planes = zip(*[_part_texture(rng, part, textured) for part in parts], strict=True)
-        albedo, frames = pack_textures(planes)
-        uvs = [frame.place(part.corner_uv) for frame, part in zip(frames, parts, strict=True)]
+        albedo, places = pack_textures(planes)
+        uvs = [place.move(part.corner_uv) for place, part in zip(places, parts, strict=True)]
         pattern = "+".join(kinds)
     maps = [material.bake(part.position_map) for material, part in zip(materials, parts, strict=False)]
-    packed, frames = pack_maps(maps)
+    packed, places = pack_maps(maps)
     if maps:
-        uvs = [frame.place(part.corner_uv) for frame, part in zip(frames, parts, strict=True)]
+        uvs = [place.move(part.corner_uv) for place, part in zip(places, parts, strict=True)]
     starts = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     vertices, faces, shading, uv = split_corners(
         unit_sphere(np.concatenate([part.vertices for part in parts])),
@@ -155,14 +155,14 @@ def _finish(
     )
 
 
-def pack_maps(maps: list[Maps]) -> tuple[dict[str, np.ndarray], list[Frame]]:
+def pack_maps(maps: list[Maps]) -> tuple[dict[str, np.ndarray], list[AtlasPlace]]:
     """The maps of all parts side by side, as fields of `MeshObject`, and where each part's lie."""
     if not maps:
         return {}, []
-    roughness, frames = pack_textures([part.roughness[..., None] for part in maps])
+    roughness, places = pack_textures([part.roughness[..., None] for part in maps])
     metallic, _ = pack_textures([part.metallic[..., None] for part in maps])
     normal_map, _ = pack_textures([part.normal_map for part in maps])
-    return {"roughness": roughness[..., 0], "metallic": metallic[..., 0], "normal_map": normal_map}, frames
+    return {"roughness": roughness[..., 0], "metallic": metallic[..., 0], "normal_map": normal_map}, places
 
 
 def _part_texture(rng: np.random.Generator, part: Part, textured: bool) -> tuple[str, Float[np.ndarray, "h w 3"]]:

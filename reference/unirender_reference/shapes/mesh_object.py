@@ -156,6 +156,9 @@ class MeshObject:
 
         Args:
             rotation: p -> rotation @ p, of determinant 1.
+
+        Raises:
+            UnirenderError: the matrix is no rotation.
         """
         rotation = np.asarray(rotation)
         unmoved = rotation @ rotation.T if rotation.shape == (3, 3) else np.zeros((3, 3))

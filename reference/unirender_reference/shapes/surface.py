@@ -233,25 +233,27 @@ def split_corners(
 
 
 @dataclass(frozen=True)
-class Frame:
+class AtlasPlace:
     """Where a texture lies in an atlas: uv of the atlas = uv of the texture * scale + offset."""
 
     scale: Float[np.ndarray, "2"]
     offset: Float[np.ndarray, "2"]
 
-    def place(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    def move(self, uv: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Texture coordinates in the atlas."""
         return uv * self.scale + self.offset
 
 
-def pack_textures(textures: Sequence[Float[np.ndarray, "_ _ c"]]) -> tuple[Float[np.ndarray, "h w c"], list[Frame]]:
+def pack_textures(
+    textures: Sequence[Float[np.ndarray, "_ _ c"]],
+) -> tuple[Float[np.ndarray, "h w c"], list[AtlasPlace]]:
     """Puts textures side by side, repeating the last row below the lower ones."""
     height = max(len(texture) for texture in textures)
     width = sum(texture.shape[1] for texture in textures)
-    columns, frames, left = [], [], 0
+    columns, places, left = [], [], 0
     for texture in textures:
         h, w, _ = texture.shape
         columns.append(np.concatenate([texture, np.repeat(texture[-1:], height - h, axis=0)]))
-        frames.append(Frame(np.array([w / width, h / height]), np.array([left / width, 0.0])))
+        places.append(AtlasPlace(np.array([w / width, h / height]), np.array([left / width, 0.0])))
         left += w
-    return np.concatenate(columns, axis=1), frames
+    return np.concatenate(columns, axis=1), places

@@ -57,8 +57,8 @@ from unirender.pipelines.settings import (
 )
 
 # Shapes and ranges are checked in `unirender.pipelines.inputs`.
-Picture = np.ndarray | Image.Image
-Material = np.ndarray | np.floating | float
+PictureLike = np.ndarray | Image.Image
+ScalarOrMap = np.ndarray | np.floating | float
 Callback = Callable[[Any, int, int, dict[str, Any]], Mapping[str, Any] | None]
 
 
@@ -71,7 +71,7 @@ class UniRenderPipeline(DualStreamPipeline):
     def __call__(self, image: list | tuple, mask: Any = None, **kwargs: Any) -> list[Decomposition]: ...
 
     @overload
-    def __call__(self, image: Picture, mask: Any = None, **kwargs: Any) -> Decomposition: ...
+    def __call__(self, image: PictureLike, mask: Any = None, **kwargs: Any) -> Decomposition: ...
 
     def __call__(self, image: Any, mask: Any = None, **kwargs: Any) -> Decomposition | list[Decomposition]:
         """The same as `decompose`; of a list of pictures, the same as `decompose_batch`."""
@@ -81,8 +81,8 @@ class UniRenderPipeline(DualStreamPipeline):
 
     def decompose(
         self,
-        image_srgb: Picture,
-        mask: Picture | None = None,
+        image_srgb: PictureLike,
+        mask: PictureLike | None = None,
         *,
         camera: Camera | None = None,
         mode: str = "mean",
@@ -153,8 +153,8 @@ class UniRenderPipeline(DualStreamPipeline):
 
     def decompose_batch(
         self,
-        images_srgb: Iterable[Picture],
-        masks: Iterable[Picture | None] | None = None,
+        images_srgb: Iterable[PictureLike],
+        masks: Iterable[PictureLike | None] | None = None,
         *,
         cameras: Camera | Iterable[Camera] | None = None,
         mode: str = "mean",
@@ -291,11 +291,11 @@ class UniRenderPipeline(DualStreamPipeline):
 
     def edit(
         self,
-        image_srgb: Picture,
-        mask: Picture | None = None,
+        image_srgb: PictureLike,
+        mask: PictureLike | None = None,
         *,
-        roughness: Material | None = None,
-        metallic: Material | None = None,
+        roughness: ScalarOrMap | None = None,
+        metallic: ScalarOrMap | None = None,
         anchored: bool = True,
         decomposition: Decomposition | None = None,
         **sampling: Any,
@@ -340,9 +340,9 @@ class UniRenderPipeline(DualStreamPipeline):
 
     def relight(
         self,
-        image_srgb: Picture,
+        image_srgb: PictureLike,
         environment: np.ndarray | None,
-        mask: Picture | None = None,
+        mask: PictureLike | None = None,
         *,
         exposure: str = "auto",
         anchored: bool = True,
@@ -418,6 +418,9 @@ class UniRenderPipeline(DualStreamPipeline):
         sampling: dict[str, Any],
         derived: Collection[str] = (),
     ) -> Float[np.ndarray, "h w 3"]:
+        """The picture of the edited maps (h, w, 3), linear, premultiplied; anchored: the picture times what the edit
+        changes.
+        """
         names = ("mode", "num_inference_steps", "num_samples")
         settings = {name: sampling[name] for name in names if name in sampling}
         settings["step_end"] = step_end_of(self, sampling.get("callback_on_step_end"))

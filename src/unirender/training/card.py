@@ -77,6 +77,7 @@ def _table(rows: Mapping[str, str | None], head: tuple[str, str] = ("", "")) -> 
 
 
 def _training_rows(facts: Facts) -> dict[str, str | None]:
+    """The table "training" of a model card, a text for each line that is known."""
     hardware, software = facts.get("hardware", {}), facts.get("software", {})
     counts = {name: facts[name] for name in ("parameters", "steps", "samples") if name in facts}
     where = [hardware.get("processor"), facts.get("device")]

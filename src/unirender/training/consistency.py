@@ -92,6 +92,7 @@ class Consistency:
     def _rendered(
         self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
     ) -> Float[Tensor, ""]:
+        """The error of the picture that the attributes render to, from pure noise in one step."""
         given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
         extras = self.conditioning.extras(mask, given, self.conditioning.decode_given(attributes))
         t = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)

@@ -223,6 +223,9 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
         path: the tar.
         sha256: its hash as the manifest gives it: verified when the shard is packed, trusted afterwards.
         name: of the shard in its data folder; the file's if None.
+
+    Raises:
+        UnirenderError: the hash is another, or the shard cannot be read or does not keep the contract.
     """
     path = Path(path)
     known = sha256 or file_sha256(path)

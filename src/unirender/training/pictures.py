@@ -44,6 +44,7 @@ def save_sheet(path: Path, sheet: UInt8[np.ndarray, "h w 3"]) -> None:
 
 
 def _line(maps: Maps, row: int, mask: Float[Tensor, "1 H W"]) -> UInt8[np.ndarray, "H 7*W 3"]:
+    """One sample's pictures side by side, in the order of `COLUMNS`."""
     size = tuple(mask.shape[-2:])
     cover = mask.permute(1, 2, 0).cpu().numpy()
 

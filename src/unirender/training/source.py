@@ -116,6 +116,7 @@ class ShardSource:
         return self.dataset
 
     def _open(self, shards: tuple[str, ...] | None = None) -> GroupDataset:
+        """The shards as pairs, or as runs of contrasts; refused where their size is not the network's."""
         if shards is None:
             split_of(self.folder)
         derived = self.augmentation.derived > 0

@@ -112,6 +112,9 @@ class Trainer:
         A step whose gradient overflowed float16 changes no weight, and has no loss terms.
 
         `when_idle` is called after the passes, when a CPU has one busy core left; it returns at once.
+
+        Raises:
+            UnirenderError: the gradient is not finite.
         """
         batch = {name: value.to(self.device) for name, value in batch.items()}
         rate = learning_rate(self.config.optimizer, self.step, self.progress)

@@ -159,6 +159,7 @@ class _Run:
             print(self._log(validate(self.net, held_out, options.seed)), flush=True)  # before anything was learned
 
     def _resume(self, state: Mapping[str, Any]) -> None:
+        """Takes weights, averages and place from a saved run with the same options."""
         from unirender.training.run_log import forget_after
 
         before = state["options"]

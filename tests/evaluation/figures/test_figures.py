@@ -51,7 +51,7 @@ from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.methods.light import MeanLight
 from unirender_evaluation.methods.trivial import InputAsAlbedo, UneditedInput
 from unirender_evaluation.rows import make_row
-from unirender_evaluation.suites.suite import Material, Scene, Suite, load_suite
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, load_suite
 
 UNEDITED = Subject("unedited", make_row(UneditedInput(), "trivial"))
 ALBEDO = Subject("as albedo", make_row(InputAsAlbedo(), "trivial"))
@@ -68,7 +68,7 @@ class StoredTruth:
     def __init__(self, suite: Suite) -> None:
         self.suite, self.asked = suite, []
 
-    def __call__(self, scene: Scene, material: Material, environment: np.ndarray) -> np.ndarray:
+    def __call__(self, scene: Scene, material: MetallicRoughness, environment: np.ndarray) -> np.ndarray:
         self.asked.append((scene.key, material, float(environment.mean())))
         return self.suite.image(scene, self.suite.spec.base)
 

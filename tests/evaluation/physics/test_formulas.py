@@ -18,7 +18,7 @@ from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics.questions import loop_by_roughness, true_maps
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Stage
 from unirender_evaluation.physics.tests import PHYSICS_TABLE, TESTS, renderer_tests
-from unirender_evaluation.suites.suite import Material, Scene, Suite, load_suite
+from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, load_suite
 
 PERFECT = Composite().render
 EXACT = tuple(test.name for test in TESTS.values() if test.asks == "render" and test.expected == 0)
@@ -95,7 +95,7 @@ def test_the_loops_twin_is_wrong_on_the_most_concave_scenes() -> None:
     concave, *others = sorted(suite.scenes, key=lambda scene: unshadowed_share(suite, scene))[:6]
     assert concave.key == "test-000000_l1"
 
-    def half_albedo(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    def half_albedo(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
         maps = stage.true_maps(material)
         return maps.replace(albedo=0.5 * maps.require("albedo")["albedo"])
 
@@ -134,7 +134,7 @@ def test_the_primary_loop_takes_the_rough_pictures(suite: Suite) -> None:
     """A decomposer that is wrong on smooth pictures alone loses nothing in the primary figure, all in the other."""
     stage = OneShading(suite, suite.scenes[0])
 
-    def wrong_where_smooth(stage: Stage, material: Material, image: Image) -> Intrinsics:
+    def wrong_where_smooth(stage: Stage, material: MetallicRoughness, image: Image) -> Intrinsics:
         return (true_maps if material[1] >= ROUGH else TESTS["loop_smooth"].twin)(stage, material, image)
 
     rough, smooth = (partial(loop_by_roughness, stage=stage, rough=rough) for rough in (True, False))
@@ -149,7 +149,7 @@ def test_tau_ranks_the_sweep(parameter: str, suite: Suite, monkeypatch: pytest.M
     stage, test = Stage(suite, suite.scenes[0]), TESTS[f"tau_{parameter}"]
     monkeypatch.setattr(Stage, "image", lambda self, material: np.zeros((32, 32, 3), np.float32))
 
-    def backwards(stage: Stage, material: Material, _: Image) -> Intrinsics:
+    def backwards(stage: Stage, material: MetallicRoughness, _: Image) -> Intrinsics:
         return stage.true_maps((1 - material[0], 1 - material[1]))
 
     assert test.run(true_maps, stage) == pytest.approx(1.0)

@@ -22,7 +22,7 @@ from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public.metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
 from unirender_evaluation.public.orb import StanfordOrb, contract_environment
-from unirender_evaluation.public.orb_frames import Capture, Frame, captures, difference_deg, object_of
+from unirender_evaluation.public.orb_frames import Capture, Photograph, captures, difference_deg, object_of
 from unirender_evaluation.public.sets import Answer, PublicSet, PublicSetError, block_mean, shrunk
 
 
@@ -125,8 +125,8 @@ def test_orb_s_light_is_turned_to_the_contract_s_grid() -> None:
 
 
 def test_cameras_differ_by_turn_place_and_field_of_view() -> None:
-    def frame(pose: np.ndarray, angle: float = 0.6) -> Frame:
-        return Frame("a", "test", "0", angle, tuple(map(tuple, pose.tolist())))
+    def frame(pose: np.ndarray, angle: float = 0.6) -> Photograph:
+        return Photograph("a", "test", "0", angle, tuple(map(tuple, pose.tolist())))
 
     moved = POSE.copy()
     moved[0, 3] = 3 * np.tan(np.radians(5))

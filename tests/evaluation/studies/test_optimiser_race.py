@@ -180,7 +180,7 @@ def test_the_report_says_what_was_measured(tmp_path: Path) -> None:
     assert content["objects"][0]["curves"][1]["points"][1] == {"iteration": 1, "seconds": 40.0, "psnr": 19.0}
     (tmp_path / "race.png").write_bytes(draw(races))
     picture = np.asarray(Image.open(tmp_path / "race.png").convert("RGB"))
-    assert (picture == (0xC2, 0x41, 0x0C)).all(axis=-1).any()  # our curve's colour
+    assert (picture == (0xD5, 0x5E, 0x00)).all(axis=-1).any()  # our curve's colour
     (tmp_path / "one.png").write_bytes(draw(races[:1]))
     assert Image.open(tmp_path / "one.png").width < picture.shape[1]
 

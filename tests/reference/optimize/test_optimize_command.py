@@ -18,7 +18,7 @@ from optimizer_runs import rendered_views, truth
 from PIL import Image
 
 from unirender.camera import Camera
-from unirender.color import image_srgb, unpremultiply
+from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.files import read_result, write_result
@@ -32,6 +32,7 @@ from unirender_reference.optimize.folder import write_views
 from unirender_reference.optimize.machine import require_cores, require_memory
 from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input, unit_normals
 from unirender_reference.optimize.placement import placed
+from unirender_reference.optimize.single_picture import make_picture
 from unirender_reference.optimize.single_render import rerendered
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View, Views
@@ -318,6 +319,22 @@ def test_wrong_command_lines_of_a_picture(tmp_path: Path):
         command(tmp_path / "transforms.json", "--out", tmp_path / "out").run()
     with pytest.raises(UnirenderError, match="no such file or folder"):
         command(tmp_path / "two", "--up", "z", "--out", tmp_path / "out").run()
+
+
+def test_of_a_reduced_picture_the_mean_of_a_clipped_value_is_a_lower_bound(tmp_path: Path):
+    image = np.full((8, 8, 3), 0.5)
+    image[2, 2, 0] = 1
+    write_png(tmp_path / "one.png", image)
+    given = read_picture_input(tmp_path / "one.png", longest_side=4)
+    assert given.image[1, 1, 0] < 0.8
+    facing = np.broadcast_to(np.array([0, 0, 1], np.float32), (4, 4, 3))
+    linear = srgb_decode(given.image)
+    seen = make_picture(linear, given.mask, given.camera, {"normal": facing}, None, 16, (4, 8), False, 0, given.clipped)
+    expected = np.zeros((4, 4, 3), bool)
+    expected[1, 1, 0] = True
+    np.testing.assert_array_equal(seen.saturated.reshape(4, 4, 3), expected)
+    plain = make_picture(linear, given.mask, given.camera, {"normal": facing}, None, 16, (4, 8), False, 0)
+    assert not plain.saturated.any()
 
 
 def test_a_picture_with_what_is_known_of_it(tmp_path: Path, caplog: pytest.LogCaptureFixture):

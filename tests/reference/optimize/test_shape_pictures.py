@@ -134,6 +134,20 @@ def test_refinement_repeats_and_stops_when_it_is_told() -> None:
     assert (first.obj.vertices != other.obj.vertices).any()
 
 
+def test_a_lower_bound_moves_no_vertex() -> None:
+    """Also one that is far below display white: the mean of a clipped value and dark ones (`View.clipped`)."""
+    start, config = _solution(sphere(subdivisions=2), _soft_light()), ShapeConfig(image_steps=1, spp=4)
+    blank = mask_views(dented_sphere(subdivisions=2), 2, SIZE).seen
+
+    def moved(level: float, clipped: bool) -> np.ndarray:
+        image, bound = np.full((SIZE, SIZE, 3), level, np.float32), np.full((SIZE, SIZE, 3), clipped)
+        seen = tuple(dataclasses.replace(view, image=image, clipped=bound) for view in blank)
+        return refine_shape(Views(seen), start, config).obj.vertices
+
+    np.testing.assert_array_equal(moved(0.3, clipped=True), moved(0.7, clipped=True))
+    assert (moved(0.3, clipped=False) != moved(0.7, clipped=False)).any()
+
+
 def test_charts_keep_the_faces_and_do_not_overlap() -> None:
     obj = dented_sphere(subdivisions=3)
     charts = unwrap(obj.vertices, obj.faces)

@@ -28,7 +28,8 @@ NOTE = (
     "stands while it is measured. The plain loop's best is that of all its losses and measures; ratio: our seconds "
     "over its, to at least the same albedo. Ours runs first and so pays for kernels that both need."
 )
-COLOURS = ("#c2410c", "#2563eb", "#059669", "#7c3aed")
+COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7")  # of Okabe and Ito: told apart by every kind of eye
+MARKERS = ".s^d"
 
 
 def finishes(races: Sequence[ObjectRace]) -> list[Finish]:
@@ -96,9 +97,9 @@ def draw(races: Sequence[ObjectRace]) -> bytes:
     figure = Figure(figsize=(5 * across, 3.2 * down), layout="constrained")
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, race in zip(panels, races, strict=False):
-        for colour, curve in zip(COLOURS, (race.ours, *race.loops), strict=False):
+        for colour, marker, curve in zip(COLOURS, MARKERS, (race.ours, *race.loops), strict=False):
             seconds, values = zip(*((point.seconds, point.psnr) for point in curve.points), strict=True)
-            axes.plot(seconds, values, color=colour, marker=".", markersize=3, label=curve.name)
+            axes.plot(seconds, values, color=colour, marker=marker, markersize=3, label=curve.name)
         axes.axhline(race.start, color="0.6", linestyle=":", linewidth=1, label="grey start")
         target = finish(race.ours, race.loops).target
         axes.axhline(target, color="0.3", linestyle="--", linewidth=0.8, label="plain loop's best")

@@ -44,6 +44,7 @@ def draw_steps(records: Sequence[Record], settings: Sequence[Setting]) -> bytes:
 
 
 def _steps_panel(axes: Any, records: Sequence[Record], settings: Sequence[Setting], column: Column) -> None:
+    """Draws the difference from mode `mean` over steps, a line for each number of samples."""
     sampled = [setting for setting in settings if setting != MEAN]
     counts = sorted({setting.samples for setting in sampled})
     for index, count in enumerate(counts):
@@ -97,7 +98,7 @@ def draw_reliability(records: Sequence[Record], setting: Setting) -> bytes:
     most = max(map(len, shown.values()), default=0)
     for axes, (name, found) in zip(panels, shown.items(), strict=False):
         _reliability_panel(axes, found)
-        axes.set_title(name if len(found) == most else f"{name} (n = {len(found)})", fontsize=10)
+        axes.set_title(name if len(found) == most else f"{name} ({len(found)} of {most} scenes)", fontsize=10)
     for axes in panels[len(shown) :]:
         axes.axis("off")
     for axes in panels[max(0, len(shown) - ACROSS) : len(shown)]:

@@ -129,6 +129,7 @@ class BarePasses:
             torch.autograd.grad(loss, self.parameters, allow_unused=True)
 
     def _pass(self, part: Inputs) -> Tensor:
+        """The squared error of one pass of the bare network."""
         rows, extras = part.rows, part.extras
         is_render = torch.arange(len(part.image), device=self.device) < rows.render
         with self._autocast():

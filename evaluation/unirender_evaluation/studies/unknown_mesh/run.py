@@ -11,7 +11,7 @@ from unirender_evaluation.studies.about import description
 from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
-from unirender_evaluation.suites.stratification import Material
+from unirender_evaluation.suites.stratification import MetallicRoughness
 from unirender_evaluation.suites.suite import Scene
 from unirender_reference.optimize.live import live_report
 from unirender_reference.optimize.report import OnReport
@@ -50,6 +50,6 @@ def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: 
         return records
 
 
-def scene_name(scene: Scene, material: Material) -> str:
+def scene_name(scene: Scene, material: MetallicRoughness) -> str:
     """Object, family and material."""
     return f"{scene.object} ({scene.family}, metallic {material[0]:g}, roughness {material[1]:g})"

@@ -10,10 +10,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 
 from unirender.color import display_slope, image_srgb
+from unirender.pictures import DISPLAY_WHITE
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -27,7 +28,6 @@ from unirender_reference.optimize.views import Step, Views
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION
 
 FILLED = 0.99  # coverage from which a pixel shows nothing but the object
-SATURATED = 0.998  # display value that may stand for more light
 STIFFER = 5.0  # the last step than the first: large movements first, then less of the samples' noise
 OUTLIER = 0.1  # display values: errors of this size count half (Geman-McClure weights)
 
@@ -48,6 +48,7 @@ def refine_shape(
     cameras.require_outside()
     masks = np.stack([view.mask[..., 0] for view in views.seen]).astype(np.float64)
     targets = np.stack([image_srgb(view.image) if views.hdr else view.image for view in views.seen]).reshape(-1, 3)
+    known = ~(np.stack([views.saturated(view) for view in views.seen]).reshape(-1, 3) | (targets >= DISPLAY_WHITE))
     points, faces, index = welded(solution.obj.vertices, solution.obj.faces)
     fit = MeshFit(points, faces, masks, cameras)
     for count in range(config.image_steps):
@@ -56,7 +57,7 @@ def refine_shape(
         inner = np.flatnonzero((masks.ravel() > FILLED) & (coverage.ravel() > FILLED))
         seed = config.seed * 1009 + count
         image = TexturedScene(now, views.seen, config.depth).image(maps_of(now), config.spp, seed)[..., :3]
-        term, image_error = image_term(now, cameras, inner, image.reshape(-1, 3), targets, fit, config, seed)
+        term, image_error = image_term(now, cameras, inner, image.reshape(-1, 3), targets, known, fit, config, seed)
         stiffness = config.stiffness * STIFFER ** (count / max(config.image_steps - 1, 1))
         mask_error = fit.step(config.image_smoothness, stiffness, term, coverage)
         values = {"mask_rmse": mask_error, "image_rmse": image_error, "loss": mask_error**2 + image_error**2}
@@ -91,6 +92,7 @@ def image_term(
     inner: Int[np.ndarray, " p"],
     image_linear: Float[np.ndarray, "q 3"],
     target_srgb: Float[np.ndarray, "q 3"],
+    known: Bool[np.ndarray, "q 3"],
     fit: MeshFit,
     config: ShapeConfig,
     seed: int,
@@ -103,6 +105,7 @@ def image_term(
         inner: flat indices of the pixels that count.
         image_linear: all pixels, as rendered.
         target_srgb: all pixels, as they should be.
+        known: where that is more than a lower bound of the light; elsewhere it counts for nothing.
         fit: whose vertices move.
         config: samples and weights.
         seed: of the shading's samples.
@@ -111,12 +114,12 @@ def image_term(
     linear, target = image_linear[shaded.pixel], target_srgb[shaded.pixel]
     error = (image_srgb(linear) - target).astype(np.float64)
     weight = np.sqrt(config.image_weight) / (1 + (error / OUTLIER) ** 2)
-    slope = display_slope(linear) * (target < SATURATED)
+    slope = display_slope(linear) * known[shaded.pixel]
     rows = (weight * slope)[:, None, :, None] * shaded.share[:, :, None, None] * shaded.derivative[:, None]
     row = np.arange(len(error))[:, None, None, None] * 3 + np.arange(3)[:, None]
     column = fit.faces[shaded.face][:, :, None, None] * 3 + np.arange(3)
     place = [np.broadcast_to(indices, rows.shape).ravel() for indices in (row, column)]
     by_normals = coo_array((rows.ravel(), place), shape=(error.size, fit.vertices.size)).tocsr()
-    counts = weight * (target < SATURATED)
+    counts = weight * known[shaded.pixel]
     matrix = by_normals @ normal_matrix(fit.vertices, fit.faces)
     return ImageTerm((counts * error).ravel(), matrix), float(np.sqrt((error**2).mean()))
