@@ -70,6 +70,7 @@ COMMANDS = (
     "physics/twins",
     "prediction_check",
     "run_folder",
+    "run_progress",
     "score_api",
     "shard_scores",
     "subsets",
