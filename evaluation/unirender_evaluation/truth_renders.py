@@ -45,7 +45,7 @@ class TruthRenders:
                 return dict(stored)
         made = make()
         with whole_file(path) as file:
-            np.savez(file, **made)
+            np.savez(file, **made)  # pyright: ignore[reportArgumentType] - no array has the name of an option
         return made
 
     def count(self) -> int:
@@ -89,7 +89,7 @@ class Again:
         maps = self.kept.of(
             f"{name} geometry {seed}", lambda: self.renderer().geometry(spp, seed).require("mask", "albedo", "normal")
         )
-        return Intrinsics(**maps)
+        return Intrinsics(mask=maps["mask"], albedo=maps["albedo"], normal=maps["normal"])
 
     def render(self, kind: str, name: str, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance of what the renderer's function `kind` makes of the arguments; `name` says all of them."""
