@@ -73,7 +73,7 @@ class Record:
 
     def to_plain(self) -> dict[str, Any]:
         """Returns what `to_json` writes, before it is text."""
-        return dataclasses.asdict(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
+        return vars(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
 
     @classmethod
     def from_json(cls, line: str) -> "Record":
