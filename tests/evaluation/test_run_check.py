@@ -18,18 +18,18 @@ from tiny_suites import make_suite
 import unirender_reference.render
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import REFERENCE_KEY
+from unirender_evaluation.methods.mitsuba import MITSUBA
 from unirender_evaluation.metrics import Variant
-from unirender_evaluation.mitsuba_method import MITSUBA
-from unirender_evaluation.protocol import protocol_line
 from unirender_evaluation.records import RunInfo
-from unirender_evaluation.run_check import CheckRequest, draw_seed, read_check, reference_row, run_check
-from unirender_evaluation.specs import PROTOCOLS
+from unirender_evaluation.runs.truth_check import CheckRequest, draw_seed, read_check, reference_row, run_check
+from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.store import Store
-from unirender_evaluation.suites import Suite
-from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.suites.suite import Suite
+from unirender_evaluation.tables.protocol import protocol_line
+from unirender_evaluation.tables.specs import PROTOCOLS
+from unirender_evaluation.truth.check import chosen_scenes
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
-from unirender_evaluation.workers import Run
 from unirender_reference.passes import Estimate
 
 VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
@@ -134,8 +134,8 @@ class Drawing:
 def drawing(monkeypatch: pytest.MonkeyPatch) -> type[Drawing]:
     monkeypatch.setattr(Drawing, "made", [])
     monkeypatch.setattr(Drawing, "stop", None)
-    monkeypatch.setattr("unirender_evaluation.truth_check.scene_object", lambda suite, scene: None)
-    monkeypatch.setattr("unirender_evaluation.truth_check.object_hash", lambda obj: "none")
+    monkeypatch.setattr("unirender_evaluation.truth.check.scene_object", lambda suite, scene: None)
+    monkeypatch.setattr("unirender_evaluation.truth.check.object_hash", lambda obj: "none")
     monkeypatch.setattr(unirender_reference.render, "Renderer", Drawing)
     return Drawing
 
