@@ -73,7 +73,7 @@ class Record:
 
     def to_plain(self) -> dict[str, Any]:
         """Returns what `to_json` writes, before it is text."""
-        return dataclasses.asdict(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
+        return vars(self) | {"values": {k: _encode(v) for k, v in self.values.items()}}
 
     @classmethod
     def from_json(cls, line: str) -> "Record":
@@ -131,6 +131,7 @@ class RunInfo:
     truth_spp: int | None = None
     code: str = ""  # version or hash of the code
     date: str = ""  # ISO date of the run
+    unchecked: str = ""  # why the truth was not rendered again in this run, if it was not
     carried: str = ""  # of which date and code records are that an earlier state of the code measured, if any are
     limit: int | None = None  # --limit: tables are watermarked
     seeds: tuple[int, ...] = ()

@@ -80,7 +80,9 @@ class Store:
         self.used[record.key] = record
 
     def lay_by(self, record: Record) -> None:
-        """Stores a record for later runs that this one did not ask for."""
+        """Stores a record for later runs that this one did not ask for, unless it is there."""
+        if record.key not in self.known:
+            append_record(self.unused_path, record)
         self.known[record.key] = record
 
     def of_other_code(self) -> int:

@@ -65,6 +65,7 @@ COMMANDS = (
     "physics/tracer",
     "physics/twins",
     "predictions/check",
+    "run_progress",
     "runs/benchmark",
     "runs/cluster",
     "runs/config",

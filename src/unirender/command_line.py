@@ -3,6 +3,7 @@
 import contextlib
 import difflib
 import io
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -61,10 +62,11 @@ def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any
                 raise error from None
         if not stopped.code:
             raise
+        _check_options(commands, words, prog)
         command = tyro.cli(commands, args=words, prog=prog, description=description)  # says what is wrong
         unknown = []
     if unknown:
-        raise UsageError(_unknown_words(command, words, unknown, prog))
+        raise UsageError(_unknown_words(commands, words, unknown, prog))
     return command
 
 
@@ -90,20 +92,44 @@ def _sentences_of_options() -> Iterator[None]:
         docstring_parser.parse_from_object = read
 
 
-def _unknown_words(command: Any, argv: Sequence[str], unknown: Sequence[str], prog: str) -> str:
+def _unknown_words(commands: Any, words: Sequence[str], unknown: Sequence[str], prog: str) -> str:
     """The sentence on words that no option takes, with the nearest options of that command."""
-    nested = getattr(command, "command", None)
-    path = " ".join([prog, *(word for word in argv if not word.startswith("-"))][: 2 if nested is None else 3])
+    path, known = _asked(commands, words, prog)
     options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        tyro.cli(type(command if nested is None else nested), args=["--help"])
-    heads = [line[2:].split("  ")[0] for line in printed.getvalue().splitlines() if line[2:3] == "-"]  # not the prose
-    known = sorted(set(OPTION.findall(" ".join(heads))))
     near = dict.fromkeys(match for option in options for match in difflib.get_close_matches(option, known, n=2))
     meant = f"; did you mean {' or '.join(near)}?" if near else ";"
     wrong = "no option of" if options else "not expected by"
     return f"{', '.join(options or unknown)}: {wrong} `{path}`{meant} `{path} --help` lists what it takes"
+
+
+def _check_options(commands: Any, words: Sequence[str], prog: str) -> None:
+    """Looks for options that a command does not have, where something else is wrong, too.
+
+    What follows one is taken for a value of the command then, and what is said of that is no help.
+
+    Raises:
+        UsageError: there are some.
+    """
+    path, known = _asked(commands, words, prog)
+    used = [word.partition("=")[0] for word in words if word.startswith("--")]
+    unknown = [option for option in used if option.replace("_", "-") not in known]
+    if unknown and path != prog:
+        raise UsageError(_unknown_words(commands, words, unknown, prog))
+
+
+def _asked(commands: Any, words: Sequence[str], prog: str) -> tuple[str, list[str]]:
+    """The command that a line begins with, from the program's name on, and the options that its help lists."""
+    names = list(itertools.takewhile(lambda word: not word.startswith("-"), words))[:2]  # or values of a command
+    while True:
+        printed, path = io.StringIO(), " ".join([prog, *names])
+        streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
+        with streams[0], streams[1], contextlib.suppress(SystemExit):
+            tyro.cli(commands, args=[*names, "--help"], prog=prog)
+        lines = printed.getvalue().splitlines()
+        if not names or any(line.startswith(f"usage: {path} ") for line in lines):
+            heads = [line[2:].split("  ")[0] for line in lines if line[2:3] == "-"]  # not the prose
+            return path, sorted({"--help", *OPTION.findall(" ".join(heads))})
+        names.pop()
 
 
 class Ended(KeyboardInterrupt):

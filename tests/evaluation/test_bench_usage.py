@@ -34,7 +34,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[o
     ("command", "option", "value", "expected"),
     [
         ("run", "--limit", "0", "at least 1"),
-        ("run", "--check-scenes", "0", "at least 1"),
+        ("run", "--check-scenes", "-1", "at least 0"),
         ("run", "--check-seed", "-1", "at least 0"),
         ("run", "--sample-scenes", "-1", "at least 0"),
         ("run", "--jobs", "-1", "at least 0"),

@@ -22,6 +22,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_evaluation.figures.grid import Grid, Line, Tile, save
 from unirender_evaluation.methods.trivial import UneditedInput
+from unirender_evaluation.records import Record
 from unirender_evaluation.report.pictures import write_sheet
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.runs import workers
@@ -103,11 +104,30 @@ def test_what_was_made_before_a_method_fails_is_kept(tmp_path: Path, monkeypatch
     scene = suite.scenes[0]
     rows = [make_row(UneditedInput(), "trivial"), make_row(Failing(), "external")]
     run = Run(suite, rows, [scene], Versions("test", {LPIPS: "1"}), (), tmp_path / "pictures")
-    monkeypatch.setattr(workers, "_here", (run, frozenset(), tmp_path / "note"))
-    records, error = workers._scene(scene.key)
-    assert [record.method for record in records] == ["unedited-input", "failing", "unedited-input"]
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    monkeypatch.setattr(workers, "_here", (run, frozenset(), notes / "17"))
+    error = workers._scene(scene.key)
+    journals = workers.Journals(notes)
+    assert [record.method for record in journals.new()] == ["unedited-input", "failing", "unedited-input"]
     assert "method 'failing', edit (rendering/from-image/" in str(error)
     assert "RuntimeError: out of memory" in str(error)
+    assert journals.new() == []
+
+
+def test_records_are_handed_over_one_by_one_and_whole(tmp_path: Path) -> None:
+    """A scene may take minutes, of which a kill would leave nothing; and it may come in the middle of a record."""
+    journals, lines = workers.Journals(tmp_path), [Record("t", "p", "m", str(n), "o", {}).to_json() for n in range(3)]
+    (tmp_path / "1.jsonl").write_text(f"{lines[0]}\n{lines[1][:9]}")
+    (tmp_path / "2.jsonl").write_text(f"{lines[2]}\n")
+    (tmp_path / "1").write_text("Ours on a scene")
+    assert [record.sample for record in journals.new()] == ["0", "2"]
+    with (tmp_path / "1.jsonl").open("a") as file:
+        file.write(lines[1][9:])
+    assert journals.new() == []
+    with (tmp_path / "1.jsonl").open("a") as file:
+        file.write("\n")
+    assert [record.sample for record in journals.new()] == ["1"]
 
 
 def test_rows_are_the_same_in_every_process() -> None:

@@ -46,9 +46,13 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
             "`unirender bench race --help` lists what it takes",
         ),
         (  # its help names `unirender bench run --out`
-            ["bench", "report", "x", "--out", "y"],
+            ["bench", "report", "--out", "x", "y"],  # "missing value for argument 'command.folder'", it was said
             "--out: no option of `unirender bench report`; did you mean --suite? "
             "`unirender bench report --help` lists what it takes",
+        ),
+        (
+            ["bench", "--limit", "3", "run"],
+            "--limit: no option of `unirender bench`; `unirender bench --help` lists what it takes",
         ),
         (["doctor", "now"], "now: not expected by `unirender doctor`; `unirender doctor --help` lists what it takes"),
         (["optimize", "x", "--out", "y", "--shape.cells", "0"], "--shape.cells 0: expected 8 or more"),

@@ -214,12 +214,17 @@ def test_processes_that_were_told_different_things_are_refused(monkeypatch: pyte
     """Another rate would give each its own weights without a word, another length let one wait for the others."""
     monkeypatch.setattr(Processes, "gather", lambda self, value: [[], value])
 
-    def check(config: TrainConfig = TRAIN, steps: int = 9, parallel: int = 1) -> None:
+    def check(
+        config: TrainConfig = TRAIN, steps: int = 9, parallel: int = 1, dtype: torch.dtype = torch.float32
+    ) -> None:
         run = RunConfig(tmp_path, steps=9)
-        first = json.loads(json.dumps(dataclasses.asdict(TRAIN))), {n: getattr(run, n) for n in OF_ALL}
+        first = (
+            json.loads(json.dumps(dataclasses.asdict(TRAIN))),
+            {n: getattr(run, n) for n in OF_ALL} | {"dtype": "float32"},
+        )
         monkeypatch.setattr(Processes, "share", lambda self, value: first)
         own = dataclasses.replace(run, steps=steps, parallel=parallel)
-        told = SimpleNamespace(config=config, run=own, processes=Processes(1, 2))
+        told = SimpleNamespace(config=config, run=own, processes=Processes(1, 2), dtype=dtype)
         check_alike(told)  # pyright: ignore[reportArgumentType] - all that it looks at
 
     check()
@@ -230,6 +235,29 @@ def test_processes_that_were_told_different_things_are_refused(monkeypatch: pyte
         check(steps=7)
     with pytest.raises(UnirenderError, match="parallel 1 instead of 4"):  # by which each draws seeds for the parts
         check(parallel=4)
+    with pytest.raises(
+        UnirenderError, match=r"dtype 'float32' instead of 'float16', as process 1 has it.*--dtype auto"
+    ):
+        check(dtype=torch.float16)  # whose loss scale leaves out steps
+
+
+@pytest.mark.parametrize(
+    ("rank", "local", "order"),
+    [(0, 0, ["all met"]), (1, 1, ["all met", "read"]), (2, 0, ["read", "all met"]), (3, 1, ["all met", "read"])],
+)
+def test_new_shards_are_packed_by_one_process_of_a_machine(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rank: int, local: int, order: list[str]
+) -> None:
+    """After --refresh-minutes each process of another machine than the first packed them."""
+    done: list[str] = []
+    monkeypatch.setattr(Processes, "share", lambda self, value: value)
+    monkeypatch.setattr(Processes, "gather", lambda self, value: done.append("all met"))
+    monkeypatch.setattr(ShardSource, "load_state_dict", lambda self, state: done.append("read"))
+    Trainer._follow_main(
+        SimpleNamespace(processes=Processes(rank, 4, local)),  # pyright: ignore[reportArgumentType] - all it looks at
+        ShardSource(tmp_path, batch_size=2, seed=0),
+    )
+    assert done == order
 
 
 def test_a_shard_that_one_machine_lacks_is_told_as_such(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -141,8 +141,16 @@ class LosingTracker(LineTracker):
         raise ConnectionError
 
 
+class EndingTracker(LineTracker):
+    """Its service goes away at the end."""
+
+    def finish(self) -> None:
+        raise ConnectionError
+
+
 def test_a_tracker_that_fails_on_the_way_ends_no_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    trackers = (LosingTracker("one", tmp_path), LineTracker("two", tmp_path))
+    """Each is told of once, also where one that has failed cannot be finished either."""
+    trackers = (LosingTracker("one", tmp_path), LineTracker("two", tmp_path), EndingTracker("three", tmp_path))
     with tracking(trackers, TRAIN) as report:
         for step in (1, 2):
             report({"step": step, "image": 0.5})

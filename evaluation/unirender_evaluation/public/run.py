@@ -19,7 +19,6 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender.whole_files import replace_file
 from unirender_evaluation import lpips
@@ -29,6 +28,7 @@ from unirender_evaluation.public.sets import PublicSet, Sample
 from unirender_evaluation.public.tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
+from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.runs.folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.subsets import partial as partial_limit
@@ -123,9 +123,8 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     write_missing(what.out, counted)
     say_missing(what.out, counted, say, "has files for")
     store = Store.open(what.out / "records.jsonl")
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     before, contents = set(store.known), []
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with progress_bar(console) as progress:
         bar = progress.add_task(what.public.name, total=len(samples))
         for sample in samples:
             contents.append(sample.sha256())

@@ -184,6 +184,7 @@ def _merged_run(runs: Sequence[RunInfo], methods: tuple[MethodInfo, ...]) -> Run
         lpips=tuple(dict.fromkeys(name for run in runs for name in run.lpips)),
         code=" and ".join(dict.fromkeys(run.code or "-" for run in runs)),
         date=" and ".join(dict.fromkeys(run.date or "-" for run in runs)),
+        unchecked=" and ".join(dict.fromkeys(run.unchecked for run in runs if run.unchecked)),
         carried=" and ".join(dict.fromkeys(run.carried for run in runs if run.carried)),
         limit=min((run.limit for run in runs if run.limit is not None), default=None),
         seeds=tuple(sorted({seed for run in runs for seed in run.seeds})),

@@ -57,6 +57,7 @@ FIELDS: Mapping[str, Mapping[str, dict[str, Any]]] = {
         "coverage": {"minimum": 0, "maximum": 1, "description": "the masks' mean in [0, 1], or null"},
         "truth_spp": {"minimum": 1, "description": "samples per pixel of the truth, at least 1, or null"},
         "date": {"pattern": r"^(\d{4}-\d{2}-\d{2})?$", "description": "the day of the run, YYYY-MM-DD, or empty"},
+        "unchecked": {"description": "why the truth was not rendered again in this run, or empty"},
         "carried": {"description": "when records were measured that an earlier state of the code made, or empty"},
         "limit": {"minimum": 1, "description": "the number of scenes of a partial run, at least 1, or null"},
         "mitsuba": {"description": "the version of Mitsuba that rendered the truth, or null"},

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from unirender.whole_files import replace_file
 from unirender_evaluation import bounds, subsets
@@ -39,6 +39,7 @@ from unirender_evaluation.results.data import NAME as RESULTS
 from unirender_evaluation.results.file import write_results
 from unirender_evaluation.results.lights import sample_lights
 from unirender_evaluation.rows import Row
+from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.runs.cluster import run_on_cluster
 from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.runs.folder import (
@@ -101,8 +102,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     write_missing(config.out, missing)
     say_missing(config.out, missing, say, "has files for")
     before = set(store.known)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with progress_bar(console) as progress:
         check = run_check(request, here, store, progress, say)
         _work(here, config, store, progress)
         _optimise_views(here, config, store, progress)
@@ -232,6 +232,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
         lpips=here.backbones,
         mitsuba=str(suite.provenance["mitsuba"]),
         truth_spp=round(ceiling["mean_spp"]),
+        unchecked=check.get("unchecked", ""),
         code=here.versions.code[:12],
         date=datetime.now(UTC).date().isoformat(),
         limit=subsets.partial(config.limit, len(suite.scenes)),

@@ -47,7 +47,7 @@ class BenchRun:
     seed: int = 0
     """Of sampling methods."""
     check_scenes: int = 4
-    """Scenes that Mitsuba renders again on the spot; at least 1."""
+    """Scenes that Mitsuba renders again on the spot; 0: none, and the tables say that their truth is unchecked."""
     check_seed: int | None = None
     """Chooses them; None: drawn anew in a new folder, kept in one that is continued."""
     recheck: bool = False
@@ -76,13 +76,17 @@ class BenchRun:
         Raises:
             UsageError: one is outside its range, or of another form.
         """
-        at_least(1, limit=self.limit, check_scenes=self.check_scenes)
-        at_least(0, check_seed=self.check_seed, sample_scenes=self.sample_scenes, jobs=self.jobs)
+        at_least(1, limit=self.limit)
+        at_least(0, check_scenes=self.check_scenes, check_seed=self.check_seed)
+        at_least(0, sample_scenes=self.sample_scenes, jobs=self.jobs)
         at_least(0, optimise_scenes=self.optimise_scenes, view_objects=self.view_objects)
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(f"--jobs {self.jobs}: expected none with --cluster, whose workers are its own")
+        if not self.check_scenes and (self.recheck or self.check_seed is not None):
+            option = "--recheck" if self.recheck else f"--check-seed {self.check_seed}"
+            raise UsageError(f"{option}: expected none with --check-scenes 0, which renders nothing again")
         named_folders(self.predictions)
         asked_variants(self.variant)
 

@@ -43,7 +43,7 @@ class BenchConfig:
         predictions: name -> folder of somebody's predictions.
         limit: scenes (evenly spaced); the tables are then watermarked.
         seed: of sampling methods.
-        check_scenes: scenes that Mitsuba renders again on the spot.
+        check_scenes: scenes that Mitsuba renders again on the spot; 0 = none.
         check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
         recheck: render them again also where the folder holds the same check.
         jobs: worker processes, each with one thread; 0 = all in this one.

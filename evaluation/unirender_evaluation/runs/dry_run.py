@@ -42,8 +42,8 @@ class PlannedRow:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run has to do; `check_date` is that of the truth check that it would reuse, None = Mitsuba renders; `jobs`
-    processes of this machine, or those of a `cluster`."""
+    """What a run has to do; `check_date` is that of the truth check that it would reuse, None = Mitsuba renders, or
+    `unchecked` says why not; `jobs` processes of this machine, or those of a `cluster`."""
 
     out: Path
     rows: tuple[PlannedRow, ...]
@@ -51,6 +51,7 @@ class Plan:
     check_date: str | None
     jobs: int
     cluster: str | None = None
+    unchecked: str = ""
 
 
 def planned(config: BenchConfig) -> Plan:
@@ -66,16 +67,18 @@ def planned(config: BenchConfig) -> Plan:
     wanted = (job for job in every if job.possible or job.key in known)
     facts = [(job.label, job.is_done(known.__contains__), known.get(job.key)) for job in wanted]
     labels = dict.fromkeys(label for label, _, _ in facts)
-    check = stored_check(check_request(config), here, known.keys())
+    check = stored_check(check_request(config), here, known.keys()) if config.check_scenes else None
+    unchecked = "" if scenes_here(here.suite) else "since the meshes of the suite are not here"
     return Plan(
         out=config.out,
         rows=tuple(
             _planned_row(label, [(done, record) for own, done, record in facts if own == label]) for label in labels
         ),
-        check_scenes=config.check_scenes if scenes_here(here.suite) else 0,
+        check_scenes=config.check_scenes,
         check_date=None if check is None else str(check["date"]),
         jobs=config.jobs,
         cluster=config.cluster,
+        unchecked=unchecked if config.check_scenes else "as --check-scenes 0 asks",
     )
 
 
@@ -104,8 +107,8 @@ def print_plan(plan: Plan, console: Console) -> None:
     console.print(table)
     scenes = "1 scene" if plan.check_scenes == 1 else f"{plan.check_scenes} scenes"
     check = f"Mitsuba renders {scenes}" if plan.check_date is None else f"that of {plan.check_date} is reused"
-    if plan.check_date is None and not plan.check_scenes:
-        check = "none, since the meshes of the suite are not here"
+    if plan.check_date is None and plan.unchecked:
+        check = f"none, {plan.unchecked}"
     console.print(f"Truth check: {check}.", highlight=False)
     if any(row.seconds is not None for row in plan.rows):
         console.print(

@@ -1,7 +1,8 @@
 """The truth check of a run folder: rendered anew, or reused where the stored one has the same truth, code and seed.
 
 `truth_check.json` holds the check's summary, when it was made, what identifies it, and the content keys of the records
-that its renders give the row *reference (other seed)*.
+that its renders give the row *reference (other seed)*. What a check has rendered is in `truth_check.part` until it is
+done: one that is stopped goes on from there.
 """
 
 import json
@@ -24,7 +25,15 @@ from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth.check import TruthCheck, check_truth, chosen_scenes, scenes_here, where_meshes_belong
+from unirender_evaluation.truth.check import (
+    TruthCheck,
+    check_steps,
+    check_truth,
+    chosen_scenes,
+    scenes_here,
+    where_meshes_belong,
+)
+from unirender_evaluation.truth.renders import TruthRenders
 from unirender_evaluation.versions import LPIPS, REFERENCE
 
 DRAWS = 1000  # of a seed whose scenes meet those of a limited run
@@ -36,7 +45,7 @@ class CheckRequest:
 
     Attributes:
         path: of `truth_check.json`.
-        scenes: how many.
+        scenes: how many; 0 = nothing is checked.
         seed: chooses them and the render seeds; None = that of the stored check, or one drawn at random.
         again: render also where the stored check would do.
     """
@@ -46,13 +55,19 @@ class CheckRequest:
     seed: int | None = None
     again: bool = False
 
+    @property
+    def renders(self) -> TruthRenders:
+        """What a check that is under way has rendered."""
+        return TruthRenders(self.path.with_suffix(".part"))
+
 
 def run_check(
     request: CheckRequest, here: Run, store: Store, progress: Progress, say: Callable[[str], None]
 ) -> dict[str, Any]:
     """The check's summary; its records are in the store, those of scenes outside the run laid by.
 
-    Where no object of the suite is here, its truth is not rendered again, and `passed` is None; no file is written.
+    Where no scene is asked for, or no object of the suite is here, its truth is not rendered again: `passed` is None,
+    and no file is written.
 
     Args:
         request: what is to be checked.
@@ -61,6 +76,8 @@ def run_check(
         progress: gets a bar while Mitsuba renders.
         say: prints one line.
     """
+    if not request.scenes:
+        return _none("--check-scenes 0", "--check-scenes 0")
     stored = stored_check(request, here, store.known.keys() | store.used.keys())
     if stored is not None:
         for key, scene in stored["records"].items():
@@ -70,6 +87,7 @@ def run_check(
             f"Truth check of {stored['date']} reused: same truth, same code, check seed {stored['seed']} "
             "(--recheck renders again)"
         )
+        request.renders.remove()
         return stored
     if not scenes_here(here.suite):
         reason = f"its meshes are not in {where_meshes_belong(here.suite)}"
@@ -77,9 +95,8 @@ def run_check(
             f"No truth check: {reason}. Of Mitsuba's rows what is stored counts. Rows that are told the true shape, as "
             "some of the group optimisation are, end the run: leave them out with --methods."
         )
-        return {"passed": None, "reason": reason, "seed": request.seed or 0, "checked_scenes": []}
-    seed = draw_seed(here.suite, request.scenes, here.scenes) if request.seed is None else request.seed
-    outcome = _render(here.suite, request.scenes, seed, progress)
+        return _none(reason, "its meshes are not here")
+    outcome = _rendered(request, here, progress, say)
     summary = outcome.summary()
     check = summary | {
         "identity": _identity(request, here),
@@ -95,7 +112,13 @@ def run_check(
             store.lay_by(record)
     check["records"] = {record.key: scene.key for record, scene in records}
     replace_file(request.path, json.dumps(check, indent=1) + "\n")
+    request.renders.remove()
     return check
+
+
+def _none(reason: str, unchecked: str) -> dict[str, Any]:
+    """What there is of a check that was not made: why, for the verdict, and in a few words for every table."""
+    return {"passed": None, "reason": reason, "unchecked": unchecked, "seed": 0, "checked_scenes": []}
 
 
 def stored_check(request: CheckRequest, here: Run, known: Collection[str]) -> dict[str, Any] | None:
@@ -141,13 +164,22 @@ def read_check(path: Path) -> dict[str, Any]:
     return {}
 
 
-def _render(suite: Suite, count: int, seed: int, progress: Progress) -> TruthCheck:
-    bar = progress.add_task("Mitsuba: truth check", total=None)
+def _rendered(request: CheckRequest, here: Run, progress: Progress, say: Callable[[str], None]) -> TruthCheck:
+    """The check, rendered as far as it is not there."""
+    renders, identity = request.renders, _identity(request, here)
+    seed = renders.begun(identity) if request.seed is None else request.seed
+    if seed is None:
+        seed = draw_seed(here.suite, request.scenes, here.scenes)
+    renders.begin(identity, seed)
+    if there := renders.count():
+        say(f"Truth check: goes on from {there} renders of check seed {seed}.")
+    bar = progress.add_task("Mitsuba: truth check", total=check_steps(here.suite, request.scenes, seed))
     outcome: TruthCheck | None = None
-    for step in check_truth(suite, count, seed):
-        progress.advance(bar)
+    for step in check_truth(here.suite, request.scenes, seed, renders):
         if isinstance(step, TruthCheck):
             outcome = step
+        else:
+            progress.advance(bar)
     progress.remove_task(bar)
     assert outcome is not None, "the last step is the whole check"
     return outcome

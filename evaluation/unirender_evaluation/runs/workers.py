@@ -5,8 +5,9 @@ Those of a cluster: `runs.cluster`.
 
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.methods.mitsuba import mitsuba_jobs
 from unirender_evaluation.physics.rows import physics_jobs, physics_scenes
-from unirender_evaluation.records import MethodInfo, Record
+from unirender_evaluation.records import MethodInfo, Record, append_record
 from unirender_evaluation.report.pictures import Pictures
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.store import Job, content_key
@@ -81,7 +82,7 @@ class _Setup:
         scenes: their keys.
         versions, backbones, pictures, subsets: as in `Run`.
         known: content keys of records that are there.
-        notes: folder in which each process says what it has under way.
+        notes: folder in which each process says what it has under way, and hands over its records (`Journals`).
     """
 
     build: Callable[[], Sequence[Row]]
@@ -102,6 +103,8 @@ class _Setup:
 
 
 _here: tuple[Run, frozenset[str], Path] | UnirenderError | None = None  # with the file that says what is under way
+JOURNAL = ".jsonl"  # ends the name of a process's file of records
+PAUSE = 0.2  # seconds between two looks at these files
 
 
 def _start(setup: _Setup) -> None:
@@ -143,29 +146,53 @@ def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
     return rows
 
 
-def _scene(key: str) -> tuple[list[Record], UnirenderError | None]:
-    """The records of a scene; where a row fails those that were made before, and how it fails."""
+def _scene(key: str) -> UnirenderError | None:
+    """Makes the records of a scene, each handed over at once; where a row fails, how it does."""
     assert _here is not None, "the pool's initializer sets it"
     if isinstance(_here, UnirenderError):
-        return [], _here
+        return _here
     run, known, note = _here
-    records = []
     for job in run.jobs(run.suite.scene(key)):
         if not job.is_done(known.__contains__):
             with suppress(OSError):  # it is a help, and no more
                 note.write_text(f"{job.label} on {key}", encoding="utf-8")
             try:
-                records.append(job.make())
+                append_record(note.with_suffix(JOURNAL), job.make())
             except UnirenderError as error:
-                return records, error
+                return error
     note.unlink(missing_ok=True)
-    return records, None
+    return None
+
+
+class Journals:
+    """The records that worker processes have made, each in a file of its own: a queue is left locked, or with half a
+    record, by a process that is killed while it writes.
+
+    Args:
+        folder: of the files.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._read: Counter[Path] = Counter()  # bytes
+
+    def new(self) -> list[Record]:
+        """Those that were not there before."""
+        records = []
+        for path in sorted(self._folder.glob(f"*{JOURNAL}")):
+            with path.open("rb") as file:
+                file.seek(self._read[path])
+                lines = file.read()
+            whole = lines[: lines.rfind(b"\n") + 1]
+            self._read[path] += len(whole)
+            records += [Record.from_json(line.decode()) for line in whole.splitlines()]
+        return records
 
 
 def run_in_workers(
     run: Run, build: Callable[[], Sequence[Row]], scenes: list[Scene], known: frozenset[str], jobs: int
 ) -> Generator[list[Record], None, None]:
-    """Records of `scenes`, a scene at a time as they come, from `jobs` processes; `build` makes the rows in each.
+    """Records of `scenes`, some at a time as they come, from `jobs` processes; `build` makes the rows in each.
 
     Raises:
         UnirenderError: a worker process died, or could not make the rows; what a row raises comes as it is.
@@ -183,21 +210,24 @@ def run_in_workers(
             known=known,
             notes=Path(folder),
         )
+        journals = Journals(setup.notes)
         with WorkerPool(jobs, _start, setup) as pool:
-            futures = [pool.submit(_scene, scene.key) for scene in scenes]
-            try:
-                for future in as_completed(futures):
-                    records, error = future.result()
+            waiting = {pool.submit(_scene, scene.key) for scene in scenes}
+            while waiting:
+                done, waiting = wait(waiting, timeout=PAUSE, return_when=FIRST_COMPLETED)
+                if records := journals.new():
                     yield records
-                    if error is not None:
-                        raise error
-            except BrokenProcessPool as error:
-                raise _died(setup.notes) from error
+                try:
+                    errors = [future.result() for future in done]
+                except BrokenProcessPool as error:
+                    raise _died(setup.notes) from error
+                for error in filter(None, errors):
+                    raise error
 
 
 def _died(notes: Path) -> UnirenderError:
     """What is said of a process that died, with what each had under way."""
-    said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir()))
+    said = ", ".join(sorted(note.read_text(encoding="utf-8") for note in notes.iterdir() if note.suffix != JOURNAL))
     return UnirenderError(
         "a worker process died: above is why, if it could not start; else perhaps for want of memory"
         f"{f', or by what it computed (under way: {said})' if said else ''}. Run the same command again, with fewer "

@@ -3,15 +3,9 @@
 from collections.abc import Iterable
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from unirender_evaluation.records import Record
-
-
-def study_bar(console: Console) -> Progress:
-    """A bar with what is at work, how many are done and the time that remains."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal)
+from unirender_evaluation.run_progress import progress_bar
 
 
 def collect(
@@ -26,7 +20,7 @@ def collect(
         console: to show it on.
     """
     records, computed = [], 0
-    with study_bar(console) as progress:
+    with progress_bar(console) as progress:
         bar = progress.add_task(title, total=total)
         for record, new in measured:
             records.append(record)

@@ -104,7 +104,7 @@ def protocol_line(
         *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
         ("interval", CROSSED if over_lights else f"{CONFIDENCE:.0%} over objects, under these lights: {METHOD}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
-        ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}"),
+        ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}{f', unchecked ({run.unchecked})' if run.unchecked else ''}"),
         ("code", f"{run.code or '-'}, {run.date or '-'}{f' ({run.carried})' if run.carried else ''}"),
     ]
     if published_in is not None:

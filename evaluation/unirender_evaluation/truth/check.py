@@ -14,7 +14,7 @@ once more, under another seed, and fails if it does again.
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, m
 from unirender_evaluation.suites.truth_file import diffuse_member, image_member, specular_member
 from unirender_evaluation.truth.geometry import GeometryTest, compare_geometry, twin_geometry
 from unirender_evaluation.truth.render import good_spp, item_seed
+from unirender_evaluation.truth.renders import Again, TruthRenders
 from unirender_reference.scene_spec import object_hash
 
 logger = logging.getLogger(__name__)
@@ -154,13 +155,26 @@ def checked_images(suite: Suite, scene: Scene, seed: int) -> list[tuple[Scene, M
     return list(dict.fromkeys([*edits, (scene, stratified), (suite.other_light(scene), suite.spec.base)]))
 
 
-def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | GeometryCheck | TruthCheck]:
+def check_steps(suite: Suite, count: int, seed: int) -> int:
+    """How many checks `check_truth` yields, the whole one aside."""
+    chosen = chosen_scenes(suite, count, seed)
+    return len({scene.object for scene in chosen}) + _members(suite, chosen, seed)
+
+
+def _members(suite: Suite, chosen: list[Scene], seed: int) -> int:
+    return sum(len(checked_images(suite, scene, seed)) + len(LIGHTS) for scene in chosen)
+
+
+def check_truth(
+    suite: Suite, count: int, seed: int, renders: TruthRenders | None = None
+) -> Iterator[Check | GeometryCheck | TruthCheck]:
     """Renders `count` random scenes again: :func:`checked_images`, s and d; and traces their objects' shared maps.
 
     Args:
         suite: the suite.
         count: scenes.
         seed: chooses scenes and render seeds; never the truth's own.
+        renders: what is rendered already, and where the rest is kept; None: nothing is.
 
     Yields:
         Every check as it is done; at last the :class:`TruthCheck`.
@@ -181,16 +195,18 @@ def check_truth(suite: Suite, count: int, seed: int) -> Iterator[Check | Geometr
     twin = None
     spec, chosen = suite.spec, chosen_scenes(suite, count, seed)
     wrong = twin_roughness(spec.base[1])
-    alpha = FAMILY_ALPHA / sum(len(checked_images(suite, scene, seed)) + len(LIGHTS) for scene in chosen)
+    alpha = FAMILY_ALPHA / _members(suite, chosen, seed)
+    kept = renders or TruthRenders()
     for scene in chosen:
         made = suite.provenance["objects"][scene.object]
         obj = scene_object(suite, scene)
         if object_hash(obj) != made["sha256"]:
             others.append(scene.object)
-        renderer = Renderer(obj, camera=spec.camera, resolution=spec.resolution)
+        renderer = Again(cache(partial(Renderer, obj, camera=spec.camera, resolution=spec.resolution)), kept)
         if scene.object not in {c.name for c in geometry}:
             stored = suite.intrinsics(scene, spec.base)
-            again = renderer.geometry(spec.geometry_spp, item_seed("check", seed, scene.object, "geometry"))
+            own = item_seed("check", seed, scene.object, "geometry")
+            again = renderer.geometry(scene.object, spec.geometry_spp, own)
             geometry.append(GeometryCheck(scene.object, compare_geometry(stored, again, spec.geometry_spp)))
             yield geometry[-1]
             if not geometry_twins or any(test.passed for test in geometry_twins.values()):
@@ -242,7 +258,7 @@ def look_twice(check: Callable[[int], Check], seed: int) -> Check:
 
 def _check_image(
     suite: Suite,
-    renderer: Any,
+    renderer: Again,
     scene: Scene,
     stored: MetallicRoughness,
     rendered: MetallicRoughness,
@@ -250,28 +266,33 @@ def _check_image(
     alpha: float,
 ) -> Check:
     member = image_member(scene.key, stored)
-    again = renderer.image(
-        suite.environment(scene), rendered[1], rendered[0], _samples(suite, member), item_seed("check", seed, member)
+    own = item_seed("check", seed, member)
+    name = f"{scene.key} image {rendered} {own}"
+    mean, variance = renderer.render(
+        "image", name, suite.environment(scene), rendered[1], rendered[0], _samples(suite, member), own
     )
     test = member_test(
-        again.mean[..., :3],
-        again.variance[..., :3],
+        mean[..., :3],
+        variance[..., :3],
         suite.image(scene, stored),
         suite.image_variance(scene, stored),
         mask=suite.mask(scene),
         alpha=alpha,
     )
-    return Check(scene, "image", stored, again.mean[..., :3], test)
+    return Check(scene, "image", stored, mean[..., :3], test)
 
 
-def _check_light(suite: Suite, renderer: Any, scene: Scene, kind: str, seed: int, alpha: float) -> Check:
+def _check_light(suite: Suite, renderer: Again, scene: Scene, kind: str, seed: int, alpha: float) -> Check:
     material, environment = suite.spec.base, suite.environment(scene)
     maps = suite.intrinsics(scene, material).require("diffuse", "specular")
     if kind == "diffuse":
-        member, variance = diffuse_member(scene.key), suite.diffuse_variance(scene)
-        again = renderer.diffuse(environment, _samples(suite, member), item_seed("check", seed, member))
+        member, variance, surface = diffuse_member(scene.key), suite.diffuse_variance(scene), ()
     else:
         member, variance = specular_member(scene.key, material[1]), suite.specular_variance(scene, material[1])
-        again = renderer.specular(environment, material[1], _samples(suite, member), item_seed("check", seed, member))
-    test = member_test(again.mean, again.variance, maps[kind], variance, mask=suite.mask(scene), alpha=alpha)
-    return Check(scene, kind, material, again.mean, test)
+        surface = (material[1],)
+    own = item_seed("check", seed, member)
+    mean, spread = renderer.render(
+        kind, f"{scene.key} {kind} {own}", environment, *surface, _samples(suite, member), own
+    )
+    test = member_test(mean, spread, maps[kind], variance, mask=suite.mask(scene), alpha=alpha)
+    return Check(scene, kind, material, mean, test)

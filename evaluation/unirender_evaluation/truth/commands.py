@@ -89,16 +89,16 @@ class BenchTruth:
     def _make(self) -> None:
         """Renders the truth and prints what its noise leaves possible."""
         from rich.console import Console
-        from rich.progress import Progress
 
         from unirender.paths import cache_dir
+        from unirender_evaluation.run_progress import progress_bar
         from unirender_evaluation.suites.home import target
         from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.truth.make import make_truth, quality_summary
 
         work, console = self.work or cache_dir() / "truth", Console()
         folders = {"out": self.out, "objects": self.objects, "lights": self.lights}
-        with Progress(console=console, disable=not console.is_terminal) as progress:
+        with progress_bar(console) as progress:
             bar = progress.add_task("truth", total=None)
             with closing(make_truth(self.suite, work, self.workers, **folders)) as finished:
                 for done, total in finished:

@@ -89,12 +89,14 @@ def resume(trainer: "Trainer", source: BatchSource, report: Report = lambda line
 def check_alike(trainer: "Trainer") -> None:
     """Looks whether all processes were told the same: each of another machine has a command line of its own.
 
-    With another learning rate they would end with other weights, with another length one would wait for ever.
+    With another learning rate they would end with other weights, with another length one would wait for ever, and in
+    another precision one skips steps that the others take.
 
     Raises:
         UnirenderError: they were not.
     """
     own = {name: getattr(trainer.run, name) for name in OF_ALL}
+    own["dtype"] = str(trainer.dtype).removeprefix("torch.")
     config, run = trainer.processes.share((plain(trainer.config), own))
     other = differences(config, trainer.config)
     other += [f"{name} {run[name]!r} instead of {value!r}" for name, value in own.items() if value != run[name]]
@@ -102,7 +104,7 @@ def check_alike(trainer: "Trainer") -> None:
         if found:
             raise UnirenderError(
                 f"process 0 of {trainer.processes.size} was started with {', '.join(found)}, as process {rank} has it; "
-                "start all of them with the same options"
+                "start all of them with the same options (--dtype auto depends on the machine)"
             )
 
 

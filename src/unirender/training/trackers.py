@@ -91,11 +91,11 @@ def tracking(
         resumed: the run's parameters are stored already.
         show: is told every line, too.
     """
-    working = list(trackers)
+    working = list(trackers)  # those that have not failed
     with contextlib.ExitStack() as stack:
         for tracker in trackers:
             tracker.start()
-            stack.callback(_told, tracker, tracker.finish)
+            stack.callback(_finish, tracker, working)
             if not resumed:
                 tracker.store_init_configuration(parameters(dataclasses.asdict(config)))
 
@@ -108,6 +108,15 @@ def tracking(
             working[:] = [each for each in working if _told(each, functools.partial(each.log, values, step=step))]
 
         yield report
+
+
+def _finish(tracker: GeneralTracker, working: Sequence[GeneralTracker]) -> None:
+    """Finishes a tracker; one that has failed may fail again, of which nothing more is said."""
+    if any(tracker is each for each in working):
+        _told(tracker, tracker.finish)
+    else:
+        with contextlib.suppress(Exception):
+            tracker.finish()
 
 
 def _told(tracker: GeneralTracker, tell: Callable[[], object]) -> bool:

@@ -245,19 +245,22 @@ class Trainer:
     def _follow_main(self, source: BatchSource) -> None:
         """Reads from the shards that process 0 reads from: a folder may grow while the processes look at it.
 
+        What a machine has not packed yet its first process packs, before the others read it.
+
         Raises:
             UnirenderError: they are not there.
         """
         state = self.processes.share(source.state_dict())
-        if self.processes.is_main:
-            return
-        try:
-            source.load_state_dict(state)
-        except UnirenderError as error:
-            raise UnirenderError(
-                f"process {self.processes.rank} of {self.processes.size} does not find the data of process 0, expected "
-                f"one --data that all machines see ({error})"
-            ) from error
+        with self.processes.one_first():
+            if self.processes.is_main:
+                return
+            try:
+                source.load_state_dict(state)
+            except UnirenderError as error:
+                raise UnirenderError(
+                    f"process {self.processes.rank} of {self.processes.size} does not find the data of process 0, "
+                    f"expected one --data that all machines see ({error})"
+                ) from error
 
     def _refresh(self, source: BatchSource, report: Report) -> None:
         """Takes in new shards; where they cannot be used, the run goes on with those that it has, and says so."""

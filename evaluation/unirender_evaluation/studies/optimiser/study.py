@@ -11,8 +11,8 @@ from rich.console import Console
 
 from unirender_evaluation.multiview.scenes import MultiviewScene, multiview_scenes, suite_scene
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
+from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.store import content_key
-from unirender_evaluation.studies.progress import study_bar
 from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.versions import (
     MULTIVIEW,
@@ -105,7 +105,7 @@ class Study:
 
 def work_through(jobs: Mapping[str, Callable[[], None]], console: Console, title: str) -> None:
     """Runs jobs in turn, with a bar that names the one at work."""
-    with study_bar(console) as progress:
+    with progress_bar(console) as progress:
         bar = progress.add_task(title, total=len(jobs), visible=bool(jobs))
         for label, job in jobs.items():
             progress.update(bar, description=f"{title}: {label}")
