@@ -23,7 +23,7 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.flat_albedo import with_flat_albedo
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
-from unirender.pipelines.rendering import render_any_size
+from unirender.pipelines.rendering import renderings
 from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics, with_agreeing_light
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
@@ -88,16 +88,14 @@ def decompose_views(
             blended = _tiled(network, view, how, _one(how, i).draw_seed())
             samples[i] = [add_detail(whole, fine, frame) for whole, fine in zip(samples[i], blended, strict=True)]
     if closed:
-        rendered = iter(render_any_size(network, [sample for own in samples for sample in own], Sampling.of()))
-        samples = [
-            [close_decomposition(sample, view.image_linear, next(rendered)) for sample in own]
-            for view, own in zip(views, samples, strict=True)
-        ]
+        rendered = renderings(network, [sample for own in samples for sample in own], Sampling.of())
+        for view, own in zip(views, samples, strict=True):
+            for i in range(len(own)):  # one after another, so that what each was before is let go
+                own[i] = close_decomposition(own[i], view.image_linear, next(rendered))
     if flat:
-        samples = [
-            [with_flat_albedo(sample, view.image_linear, frame) for sample in own]
-            for view, frame, own in zip(views, frames, samples, strict=True)
-        ]
+        for view, frame, own in zip(views, frames, samples, strict=True):
+            for i in range(len(own)):
+                own[i] = with_flat_albedo(own[i], view.image_linear, frame)
     combined = [combine(tuple(own)) for own in samples]
     return [with_agreeing_light(found) for found in combined] if closed else combined
 
