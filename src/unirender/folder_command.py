@@ -41,7 +41,7 @@ class Reader:
         Raises:
             UnirenderError: it cannot be read, or the network would refuse it.
         """
-        picture, said = read_input(path, mask)
+        picture, said = read_input(path, mask, samples=self.command.model.samples)
         try:
             as_picture(picture.image_srgb, picture.mask)
         except UnirenderError as error:
