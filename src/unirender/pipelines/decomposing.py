@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
 from unirender.pipelines.calibration import Lines, calibrated
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.flat_albedo import with_flat_albedo
@@ -85,8 +86,7 @@ def decompose_views(
     ]
     for i, (view, frame) in enumerate(zip(views, frames, strict=True)):
         if tile and frame.side > network.size:
-            blended = _tiled(network, view, how, _one(how, i).draw_seed())
-            samples[i] = [add_detail(whole, fine, frame) for whole, fine in zip(samples[i], blended, strict=True)]
+            samples[i] = _with_detail(network, view, frame, samples[i], how, _one(how, i).draw_seed())
     if closed:
         rendered = renderings(network, [sample for own in samples for sample in own], Sampling.of())
         for view, own in zip(views, samples, strict=True):
@@ -103,6 +103,14 @@ def decompose_views(
 def _one(how: Sampling, picture: int) -> Sampling:
     """The settings of one picture of a batch."""
     return replace(how, generator=how.generator[picture]) if isinstance(how.generator, Sequence) else how
+
+
+def _with_detail(
+    network: Network, view: View, frame: Frame, samples: list[Intrinsics], how: Sampling, seed: int
+) -> list[Intrinsics]:
+    """The samples of a picture with the detail of its tiles, which are let go of."""
+    blended = _tiled(network, view, how, seed)
+    return [add_detail(whole, fine, frame) for whole, fine in zip(samples, blended, strict=True)]
 
 
 def _tiled(network: Network, view: View, how: Sampling, seed: int) -> list[dict[str, np.ndarray]]:
