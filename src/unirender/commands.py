@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.input_picture import RELIT_BYTES_A_PIXEL
+from unirender.input_picture import (
+    RELIT_BYTES_A_PIXEL,
+    RELIT_MAPS_BYTES_A_PIXEL,
+    RENDERED_BYTES_A_PIXEL,
+    memory_remarks,
+)
 from unirender.notices import notice
 from unirender.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
 from unirender.remarks import (
@@ -126,6 +131,7 @@ class Render:
         check_stops(self.exposure)
         if self.exposure is not None and self.environment is None:
             raise UsageError(f"--exposure {self.exposure:g} is of a new light: expected --environment beside it")
+        remarks = self._memory_remarks()
         intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
@@ -140,7 +146,7 @@ class Render:
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
             pipeline = self.model.load()
-            meta["remarks"] = parts_left_out(intrinsics.mask, self.model.side(pipeline))
+            meta["remarks"] = remarks | parts_left_out(intrinsics.mask, self.model.side(pipeline))
             for remark in meta["remarks"].values():
                 notice(remark)
             added = () if self.environment is None else of_light  # they are there, as direct light
@@ -150,6 +156,15 @@ class Render:
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
         return 0
+
+    def _memory_remarks(self) -> dict[str, str]:
+        """As `memory_remarks` has them, of the maps' size in their header."""
+        from unirender.exr import pixel_count
+        from unirender.files import INTRINSICS_FILE
+
+        file = self.maps / INTRINSICS_FILE if self.maps.is_dir() else self.maps
+        taken = RENDERED_BYTES_A_PIXEL if self.environment is None else RELIT_MAPS_BYTES_A_PIXEL
+        return memory_remarks(self.maps, pixel_count(file), taken)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,9 @@ OTHER_FORMATS = {  # and how their files begin
     "a JPEG XL picture": rb"\xff\x0a|\x00\x00\x00\x0cJXL ",
     "an OpenEXR file under another name": rb"\x76\x2f\x31\x01",
     "a Radiance file": rb"#\?",
+    "a video, whose frames a folder is to hold as pictures": (
+        rb".{4}ftyp(3gp|avc1|dash|iso|M4V|mp4|MSNV|qt)|\x1a\x45\xdf\xa3|RIFF.{4}AVI "
+    ),
     "a PDF": rb"%PDF",
     "an SVG or another text": rb"\s*<",
 }

@@ -1,6 +1,8 @@
 """`unirender decompose` of a folder of pictures: what it reads, and what it says of all of them together."""
 
+import contextlib
 import dataclasses
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,7 +43,7 @@ class Reader:
         Raises:
             UnirenderError: it cannot be read, or the network would refuse it.
         """
-        picture, said = read_input(path, mask)
+        picture, said = read_input(path, mask, samples=self.command.model.samples)
         try:
             as_picture(picture.image_srgb, picture.mask)
         except UnirenderError as error:
@@ -75,15 +77,18 @@ def run_folder(command: "Decompose") -> int:
     read = Reader(command, command.model.side(pipeline))
     settings = {"command": "decompose", **command.decomposition.settings, **command.model.provenance(pipeline)}
     settings["fov"] = command.model.fov
-    found = decompose_folder(
-        pictures,
-        output,
-        read=read,
-        decompose=lambda batch: decompose_batch(command, pipeline, batch),
-        settings=settings,
-        masks=masks,
-        overwrite=command.out.overwrite,
-    )
+    with progress_of(len(pictures), command.model.progress) as watch:
+        pipeline.set_progress_bar_config(disable=True)  # one bar, of the pictures
+        found = decompose_folder(
+            pictures,
+            output,
+            read=read,
+            decompose=lambda batch: decompose_batch(command, pipeline, batch),
+            settings=settings,
+            masks=masks,
+            overwrite=command.out.overwrite,
+            watch=watch,
+        )
     facts: dict[str, Any] = {**settings, **command.input.files}
     if command.frames:
         results = [(path, output / path.name) if path.name in found.figures else None for path in pictures]
@@ -93,6 +98,19 @@ def run_folder(command: "Decompose") -> int:
     read.notices()
     say_result(output, found, facts.get("temporal_difference"))
     return 1 if found.failed else 0
+
+
+@contextlib.contextmanager
+def progress_of(count: int, shown: bool) -> Iterator[Callable[[int], None]]:
+    """A bar on the terminal, if `shown`, that goes when it is done; gives what is told how many pictures are done."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not shown or not console.is_terminal) as bar:
+        task = bar.add_task("pictures", total=count)
+        yield lambda done: bar.update(task, completed=done)
 
 
 def decompose_batch(command: "Decompose", pipeline: "UniRenderPipeline", batch: list[Picture]) -> list[Decomposition]:

@@ -121,6 +121,7 @@ def decompose_folder(
     settings: Mapping[str, Any],
     masks: Path | None = None,
     overwrite: bool = False,
+    watch: Callable[[int], None] = lambda done: None,
 ) -> FolderResult:
     """Decomposes pictures into `output/<file name>`.
 
@@ -132,6 +133,7 @@ def decompose_folder(
         settings: all that decides a result beside the picture, for its `meta.json`.
         masks: the mask file of all pictures, or the folder of their masks.
         overwrite: do those again that are there already.
+        watch: is told after each batch how many pictures are behind it: done, kept or failed.
 
     Raises:
         UsageError: `output` is the folder of the pictures.
@@ -171,6 +173,7 @@ def decompose_folder(
 
     for batch in batches(wanted(), max(AT_ONCE // int(settings.get("looks", 1)), 1)):
         finish(batch)  # whose results are forgotten before the next are made
+        watch(len(done.figures) + len(done.failed))
     return done
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
-from unirender.machine import memory_excess
+from unirender.machine import memory_excess, needs_swap
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -14,12 +14,14 @@ DARK = 0.35  # display value that an object reaches at the exposures of the trai
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
-BYTES_A_PIXEL, BYTES_OF_NONE = 140, 5e8  # of memory: what it takes to take a picture apart, or to edit it
-RELIT_BYTES_A_PIXEL = 230  # what it takes to put it under another light
+BYTES_A_PIXEL, BYTES_OF_NONE = 145, 5e8  # of memory: what it takes to take a picture apart, or to edit it
+RELIT_BYTES_A_PIXEL = 190  # what it takes to put it under another light
+RENDERED_BYTES_A_PIXEL, RELIT_MAPS_BYTES_A_PIXEL = 115, 150  # what it takes to render maps; under another light
+SAMPLE_BYTES_A_PIXEL = 64  # what each takes beside that, where there are several samples
 
 
 def read_input(
-    path: Path, mask: Path | None, option: str = " (--mask)", bytes_a_pixel: int = BYTES_A_PIXEL
+    path: Path, mask: Path | None, option: str = " (--mask)", bytes_a_pixel: int = BYTES_A_PIXEL, samples: int = 1
 ) -> tuple["Picture", dict[str, str]]:
     """A picture with a mask, and remarks by kind: what was assumed, and what the picture cannot show.
 
@@ -28,6 +30,7 @@ def read_input(
         mask: of a picture of the coverage; None: the alpha channel, else the whole frame.
         option: what remarks on a mask that is not there add: how one is given.
         bytes_a_pixel: that the work on it takes, besides `BYTES_OF_NONE`.
+        samples: that are made of it, each of which takes `SAMPLE_BYTES_A_PIXEL` where there are several.
 
     Raises:
         UnirenderError: an unreadable file, a mask that does not fit, or a picture that this machine is too small for.
@@ -37,9 +40,8 @@ def read_input(
     from unirender.pictures import OPAQUE, read_mask_file, read_picture
 
     picture = read_picture(path)
-    remarks = dict(picture.remarks)
     height, width = picture.image_srgb.shape[:2]
-    _check_memory(path, height * width, bytes_a_pixel)
+    remarks = dict(picture.remarks) | memory_remarks(path, height * width, bytes_a_pixel, samples)
     if mask is not None:
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
@@ -75,13 +77,19 @@ def read_input(
     return picture, remarks
 
 
-def _check_memory(path: Path, pixels: int, bytes_a_pixel: int) -> None:
-    """Looks at the size of a picture: one sentence before the work instead of an end without a word in it.
+def memory_remarks(path: Path, pixels: int, bytes_a_pixel: int, samples: int = 1) -> dict[str, str]:
+    """A remark, by kind, where only swap holds a picture or maps of so many pixels; arguments as of `read_input`.
 
     Raises:
-        UnirenderError: it takes more memory than the machine has in all.
+        UnirenderError: it takes more memory than the machine has in all: one sentence before the work instead of an end
+            without a word in it.
     """
-    if excess := memory_excess(BYTES_OF_NONE + bytes_a_pixel * pixels):
+    wanted = BYTES_OF_NONE + pixels * (bytes_a_pixel + (SAMPLE_BYTES_A_PIXEL * samples if samples > 1 else 0))
+    if excess := memory_excess(wanted):
+        fewer = ", or ask for fewer --samples" if samples > 1 else ""
         raise UnirenderError(
-            f"{path}: a picture of {pixels / 1e6:,.3g} megapixels, which {excess}; scale it down first"
+            f"{path}: a picture of {pixels / 1e6:,.3g} megapixels, which {excess}; scale it down first{fewer}"
         )
+    if said := needs_swap(wanted):
+        return {"memory": f"a picture of {pixels / 1e6:,.3g} megapixels {said}; scale it down"}
+    return {}

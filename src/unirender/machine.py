@@ -17,11 +17,12 @@ LIMITS = {  # by version of the control groups: of memory, and of swap, which th
 def memory_bytes() -> float:
     """Memory and swap that this process may have: of the machine, or of its control groups (a container, a job), where
     they allow less; infinite where the system does not tell."""
-    pages = os.sysconf("SC_PHYS_PAGES") if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}) else -1
-    if pages <= 0:
-        return math.inf
-    swap = _swap_bytes()
-    return min([float(pages * os.sysconf("SC_PAGE_SIZE")) + swap, *_group_limits(swap)])
+    return _allowed_bytes(_swap_bytes())
+
+
+def unswapped_bytes() -> float:
+    """The same without swap."""
+    return _allowed_bytes(0)
 
 
 def memory_excess(wanted: float) -> str | None:
@@ -32,10 +33,34 @@ def memory_excess(wanted: float) -> str | None:
     present = memory_bytes()
     if wanted <= present:
         return None
+    needed, there = _gibibytes(wanted, present)
+    return f"would take about {needed} GiB of memory, and this machine has {there} GiB for it"
+
+
+def needs_swap(wanted: float) -> str | None:
+    """What to say of something that takes so many bytes, where only swap makes them so many; None elsewhere."""
+    present = unswapped_bytes()
+    if wanted <= present:
+        return None
+    needed, there = _gibibytes(wanted, present)
+    return f"takes about {needed} GiB, and this machine has {there} GiB without swap: it may be very slow"
+
+
+def _gibibytes(wanted: float, present: float) -> tuple[str, str]:
+    """Both as text, the first rounded up and the second down."""
     digits = int(wanted < 100 * GIB)
     parts = 10**digits
-    needed, there = math.ceil(wanted * parts / GIB) / parts, math.floor(present * parts / GIB) / parts
-    return f"would take about {needed:,.{digits}f} GiB of memory, and this machine has {there:,.{digits}f} GiB for it"
+    rounded = math.ceil(wanted * parts / GIB) / parts, math.floor(present * parts / GIB) / parts
+    needed, there = (f"{number:,.{digits}f}" for number in rounded)
+    return needed, there
+
+
+def _allowed_bytes(swap: float) -> float:
+    """Of the machine with so much swap, or of its control groups; infinite where the system does not tell."""
+    pages = os.sysconf("SC_PHYS_PAGES") if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}) else -1
+    if pages <= 0:
+        return math.inf
+    return min([float(pages * os.sysconf("SC_PAGE_SIZE")) + swap, *_group_limits(swap)])
 
 
 def _swap_bytes() -> float:

@@ -231,7 +231,7 @@ class InputOptions:
         Raises:
             UnirenderError: as `read_input`.
         """
-        picture, remarks = read_input(self.picture, self.mask, bytes_a_pixel=bytes_a_pixel)
+        picture, remarks = read_input(self.picture, self.mask, bytes_a_pixel=bytes_a_pixel, samples=model.samples)
         remarks |= model.camera_remarks(picture)
         for remark in remarks.values():
             notice(remark)

@@ -24,6 +24,7 @@ from unirender.cli import main
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import exr_bytes, image_channels
 from unirender.files import read_result
+from unirender.input_picture import BYTES_OF_NONE
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -97,6 +98,14 @@ def test_an_upload_is_deleted_when_it_is_taken(tmp_path: Path) -> None:
     assert not path.exists()
     with pytest.raises(UnirenderError, match=r"^ball\.png: did not arrive"):
         Upload.take(path)
+
+
+def test_a_picture_is_not_refused_for_the_memory_of_taking_it_apart_at_its_own_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = Upload("a.png", png(np.full((100, 100, 3), 0.5)))
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: BYTES_OF_NONE + 60 * 100 * 100)
+    assert read_upload(taken, None, LIMITS)[0].image_srgb.shape == (100, 100, 3)
 
 
 def test_a_picture_comes_with_its_alpha_channel_or_with_a_mask_or_as_a_whole() -> None:

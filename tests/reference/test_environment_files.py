@@ -1,5 +1,7 @@
 """Environments that unirender wrote, read back as lights: the same light, where any other lat-long map is resampled."""
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -105,8 +107,13 @@ def test_the_mark_stands_in_the_header_beside_the_others(tmp_path: Path) -> None
 RGBE, PFM = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8192 +X 16384\n", b"PF\n16384 8192\n-1.0\n"
 
 
+PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + struct.pack(">IIBBBBB", 128, 64, 8, 2, 0, 0, 0)
+PNG += struct.pack(">II", zlib.crc32(PNG[12:]), 9) + b"IDAT"
+
+
 @pytest.mark.parametrize(
-    ("name", "start", "texels"), [("a.hdr", RGBE, 2**27), ("a.pfm", PFM, 2**27), ("a.exr", None, 2**13)]
+    ("name", "start", "texels"),
+    [("a.hdr", RGBE, 2**27), ("a.pfm", PFM, 2**27), ("a.exr", None, 2**13), ("a.png", PNG, 2**13)],
 )
 def test_a_map_that_the_machine_is_too_small_for_is_refused_by_its_header(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, start: bytes | None, texels: int

@@ -11,12 +11,15 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, srgb_encode, unpremultiply
 from unirender.composite import composite_image, split_sum_image
 from unirender.intrinsics import Intrinsics
+from unirender.pipelines.carried_light import agreement, with_carried_light
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.editing import anchor
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide, unit_normal
+from unirender.pipelines.results import combine
 
 HEIGHT, WIDTH = 45, 61
+LIGHT = np.linspace(0, 1, 16 * 32 * 3, dtype=np.float32).reshape(16, 32, 3)
 
 
 def maps(height: int = HEIGHT, width: int = WIDTH) -> dict[str, np.ndarray]:
@@ -27,6 +30,11 @@ def maps(height: int = HEIGHT, width: int = WIDTH) -> dict[str, np.ndarray]:
     return made | {"normal": unit_normal(rng.normal(size=(height, width, 3)).astype(np.float32))}
 
 
+def sample(of: Intrinsics, albedo: str) -> Intrinsics:
+    """One whose albedo is another of its maps."""
+    return of.replace(albedo=of.require(albedo)[albedo], environment=LIGHT)
+
+
 def answers() -> dict[str, np.ndarray]:
     """What is made in blocks, of one picture."""
     all_maps = Intrinsics().replace(**maps())
@@ -35,7 +43,12 @@ def answers() -> dict[str, np.ndarray]:
     left = Frame(HEIGHT, WIDTH, 16).leave_maps(
         {"a": of["albedo"][:16, :16], "r": of["roughness"][:16, :16]}, of["mask"]
     )
+    found = combine(tuple(sample(all_maps, name) for name in ("albedo", "specular", "diffuse")))
+    assert found.std is not None
     return {
+        "mean of samples": found.intrinsics.require("albedo")["albedo"],
+        "spread of samples": found.std["albedo"],
+        "carried": with_carried_light(all_maps, all_maps, ["diffuse"], LIGHT).require("diffuse")["diffuse"],
         "encode": srgb_encode(of["specular"]),
         "decode": srgb_decode(of["specular"]),
         "picture": image_srgb(2 * of["specular"]),
@@ -88,3 +101,5 @@ def test_temporaries_are_small() -> None:
     assert planes(split_sum_image, all_maps) < 5.2  # 12 before
     assert planes(close_decomposition, all_maps, given["albedo"], given["specular"]) < 4.9  # 7 before
     assert planes(composite_image, all_maps) < 1.6  # 5 before
+    assert planes(combine, tuple(all_maps.replace(environment=LIGHT) for _ in range(8))) < 13  # 57 before
+    assert planes(agreement, given["specular"], given["diffuse"], given["mask"]) < 3.6  # 5 before

@@ -123,8 +123,9 @@ def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path
         run(pictures, tmp_path / "out", decompose=stop_at_b)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.png"]
     assert run(pictures, tmp_path / "out").kept == 1
-    again = run(pictures, tmp_path / "out")
-    assert (again.kept, len(again.figures)) == (2, 2)
+    seen: list[int] = []
+    again = run([*pictures, save(tmp_path / "d.png")], tmp_path / "out", watch=seen.append)
+    assert (again.kept, len(again.figures), seen) == (2, 3, [3])
     save(pictures[0], 30)
     changed = run(pictures, tmp_path / "out")
     assert "another picture or mask (a file changed since)" in changed.failed["a.png"]

@@ -1,5 +1,6 @@
 """How a picture of any size comes into the network's square: small objects are cut out."""
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +9,11 @@ import pytest
 from PIL import Image
 from tiny_models import make_pipeline
 
+from unirender import blocks
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import mean_radiance
-from unirender.pipelines.framing import FAINT, Frame, visible_parts
+from unirender.pipelines.framing import FAINT, Frame, resize, visible_parts
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 SIZE = 32
@@ -151,3 +153,35 @@ def test_a_small_object_is_what_it_is_when_somebody_cuts_it_out_before() -> None
     again = pipeline.render(found)
     np.testing.assert_allclose(again[inner], pipeline.render(alone), atol=1e-3)
     assert not again[canvas[..., 3] == 0].any()
+
+
+@pytest.mark.parametrize("size", [(90, 60), (33, 120), (120, 1), (64, 64)])
+def test_the_square_is_never_there_as_a_whole_and_its_bytes_are_the_same(
+    monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
+) -> None:
+    monkeypatch.setattr(blocks, "BLOCK", 500)
+    rng, frame, side = np.random.default_rng(0), Frame(*size, SIZE), max(size)
+    picture, mask = (rng.random((*size, channels), np.float32) for channels in (3, 1))
+    square = np.zeros((side, side, 3), np.float32)
+    top, left = -frame.corner[0], -frame.corner[1]
+    there = np.s_[top : top + size[0], left : left + size[1]]
+    square[there] = picture * mask
+    small = resize(square, (SIZE, SIZE))
+    assert frame.enter(picture, mask).tobytes() == frame.enter(picture * mask).tobytes() == small.tobytes()
+    assert frame.leave(small).tobytes() == resize(small, (side, side))[there].tobytes()
+
+
+def test_a_panorama_takes_the_memory_of_its_own_pixels() -> None:
+    picture = np.ones((8, 4000, 3), np.float32)
+    frame = Frame(8, 4000, SIZE)
+    tracemalloc.start()
+    frame.enter(picture)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 8 * picture.nbytes, "its square would be 500 times as large"
+
+
+def test_one_column_is_resampled_like_several() -> None:
+    column = np.arange(8, dtype=np.float32).reshape(8, 1, 1)
+    np.testing.assert_array_equal(resize(column, (4, 1)), resize(np.repeat(column, 3, axis=1), (4, 3))[:, :1])
+    assert resize(column, (16, 4)).shape == (16, 4, 1)

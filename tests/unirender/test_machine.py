@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from unirender.machine import GIB, memory_bytes, memory_excess
+from unirender.machine import GIB, memory_bytes, memory_excess, needs_swap, unswapped_bytes
 
 NONE = 9223372036854771712  # what the first version of control groups says where nothing is limited
 INNER = "system.slice/job.scope"
@@ -62,6 +62,17 @@ def test_memory_is_the_least_that_is_allowed(machine: Path, files: dict[str, obj
 def test_too_much_memory_is_told_with_numbers_that_differ(machine: Path) -> None:
     assert memory_excess(8 * GIB) is None
     assert memory_excess(8 * GIB + 1) == "would take about 8.1 GiB of memory, and this machine has 8.0 GiB for it"
+
+
+@pytest.mark.parametrize(
+    ("files", "gib"), [(SWAP, 8), (SWAP | JOB | {f"groups/{INNER}/memory.max": 3 * GIB}, 3), ({}, 8)]
+)
+def test_what_only_swap_holds_is_told(machine: Path, files: dict[str, object], gib: float) -> None:
+    write(machine, files)
+    assert unswapped_bytes() == gib * GIB
+    assert needs_swap(gib * GIB) is None
+    said = f"takes about {gib}.1 GiB, and this machine has {gib}.0 GiB without swap: it may be very slow"
+    assert needs_swap(gib * GIB + 1) == said
 
 
 def test_a_machine_that_does_not_count_its_memory_has_enough(monkeypatch: pytest.MonkeyPatch) -> None:

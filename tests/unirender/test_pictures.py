@@ -1,5 +1,6 @@
 """Pictures and masks from files: what the pixels become, and which files are refused."""
 
+import dataclasses
 import struct
 import zlib
 from collections.abc import Callable
@@ -13,11 +14,11 @@ from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
-from unirender.commands import Relight
+from unirender.commands import Relight, Render
 from unirender.display_files import MAX_PIXELS, display_values, open_picture, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, read_input
+from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, RENDERED_BYTES_A_PIXEL, read_input
 from unirender.options import InputOptions, OutputOptions
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
@@ -416,6 +417,9 @@ def test_clipped_is_the_share_of_the_object_at_display_white(tmp_path: Path) -> 
         (b"\0\0\0\x18ftypheic", "a HEIC picture"),
         (b"\xff\x0a12345", "a JPEG XL picture"),
         (b"#?RADIANCE\n\n", "a Radiance file"),
+        (b"\0\0\0\x20ftypisom", "a video, whose frames"),
+        (b"\x1a\x45\xdf\xa3\1", "a video"),
+        (b"RIFF\0\1\2\3AVI LIST", "a video"),
         (b"", "is empty"),
         (b"GIF", r"not a readable picture \("),
     ],
@@ -462,11 +466,30 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     read_input(tmp_path / "a.png", None)
     with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
         Relight(InputOptions(tmp_path / "a.png"), tmp_path / "a.hdr", OutputOptions(tmp_path / "out")).run(np.asarray)
+    with pytest.raises(UnirenderError, match=r"for it; scale it down first, or ask for fewer --samples"):
+        read_input(tmp_path / "a.png", None, samples=2)
+    monkeypatch.setattr("unirender.machine.unswapped_bytes", lambda: needed - 1)
+    assert read_input(tmp_path / "a.png", None)[1]["memory"].endswith(
+        "without swap: it may be very slow; scale it down"
+    )
     monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed - 1)
     with pytest.raises(
         UnirenderError, match=r"a picture of 0\.12 megapixels.* about 0\.5 GiB .* has 0\.4 GiB for it; scale"
     ):
         read_input(tmp_path / "a.png", None)
+
+
+def test_maps_that_the_machine_is_too_small_for_are_refused_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_exr(tmp_path / "a.exr", {"roughness.Y": np.zeros((300, 400), np.float32)})
+    needed = BYTES_OF_NONE + RENDERED_BYTES_A_PIXEL * 400 * 300
+    render = Render(tmp_path / "a.exr", OutputOptions(tmp_path / "out"))
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
+    with pytest.raises(UnirenderError, match="normal"):  # read, and found wanting
+        render.run(np.asarray)
+    with pytest.raises(UnirenderError, match=r"a\.exr: a picture of 0\.12 megapixels, which would take about"):
+        dataclasses.replace(render, environment=tmp_path / "light.exr").run(np.asarray)
 
 
 def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:

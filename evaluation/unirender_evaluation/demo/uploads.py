@@ -26,6 +26,7 @@ from unirender.pictures import Picture
 from unirender_evaluation.figures.pictures import framed
 from unirender_reference.lights import load_light
 
+BYTES_A_PIXEL = 50  # of memory: what it takes to read a picture and bring it to the square
 SIDES = (64, 128)  # pixels of the square in which the page works
 LIGHT_SHAPE = (128, 256)  # rows and columns to which a larger light is brought: finer ones do not show at these sides
 RADIANCE_SIZE = re.compile(rb"^[-+]Y +(\d+) +[-+]X +(\d+)\s*$", re.MULTILINE)
@@ -90,7 +91,7 @@ def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[P
     with contextlib.ExitStack() as files:
         path = files.enter_context(_as_file(picture, limits))
         beside = None if mask is None else files.enter_context(_as_file(mask, limits))
-        found, remarks = read_input(path, beside, option="")
+        found, remarks = read_input(path, beside, option="", bytes_a_pixel=BYTES_A_PIXEL)
     return found, tuple(f"{remark[0].upper()}{remark[1:]}." for remark in remarks.values())
 
 

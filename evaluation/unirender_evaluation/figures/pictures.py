@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image as PillowImage
 
+from unirender.blocks import row_blocks
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
@@ -64,19 +65,47 @@ def framed(picture: Picture, side: int = SIDE) -> Picture:
         for s, e, n in zip(starts, ends, (height, width), strict=True)
     ]
     image, mask = (values[inside[0], inside[1]] for values in (picture.image_srgb, picture.mask))
-    cut = np.pad(np.concatenate([srgb_decode(image) * mask, mask], axis=-1), (*outside, (0, 0)))
-    top, left = (start - math.floor(start) for start in starts)
-    channels = [
-        PillowImage.fromarray(np.ascontiguousarray(channel, np.float32)).resize(
-            (side, side),
-            PillowImage.Resampling.BOX if 2 * half > side else PillowImage.Resampling.BILINEAR,
-            box=(left, top, left + 2 * half, top + 2 * half),
-        )
-        for channel in np.moveaxis(cut, -1, 0)
-    ]
-    resampled = np.stack([np.asarray(channel) for channel in channels], axis=-1)
+    cut = np.concatenate([srgb_decode(image) * mask, mask], axis=-1)
+    spans = [(begin := start - math.floor(start), begin + 2 * half) for start in starts]
+    resampled = _resampled(cut, outside, spans, side)
     mask = np.clip(resampled[..., 3:], 0, 1)
     return Picture(np.clip(image_srgb(unpremultiply(resampled[..., :3], mask)), 0, 1), mask, picture.name)
+
+
+def _resampled(
+    cut: Float[np.ndarray, "h w c"],
+    outside: Sequence[tuple[int, int]],
+    spans: Sequence[tuple[float, float]],
+    side: int,
+) -> Float[np.ndarray, "s s c"]:
+    """A square of a picture that is padded with 0. First along the rows, some at a time, so that the padded picture,
+    which may be many times as large, is never there as a whole.
+
+    Args:
+        cut: the picture.
+        outside: rows and columns of padding, before and after.
+        spans: rows and columns of the padded picture where the square begins and ends.
+        side: that the square gets, pixels.
+    """
+    (above, below), (rows_span, columns_span) = outside[0], spans
+    how = PillowImage.Resampling.BOX if columns_span[1] - columns_span[0] > side else PillowImage.Resampling.BILINEAR
+    narrow = np.zeros((above + len(cut) + below, side, cut.shape[-1]), np.float32)
+    for rows in row_blocks(len(cut), sum(outside[1]) + cut.shape[1]):
+        strip = np.pad(cut[rows], ((0, 0), outside[1], (0, 0)))
+        box = (columns_span[0], 0, columns_span[1], len(strip))
+        narrow[above:][rows] = _resized(strip, (side, len(strip)), how, box)
+    return _resized(narrow, (side, side), how, (0, rows_span[0], side, rows_span[1]))
+
+
+def _resized(
+    picture: Float[np.ndarray, "h w c"],
+    size: tuple[int, int],
+    how: PillowImage.Resampling,
+    box: tuple[float, float, float, float],
+) -> Float[np.ndarray, "h2 w2 c"]:
+    """The box of a picture by Pillow, which takes floats of one channel; `size` and `box` as it has them."""
+    channels = (PillowImage.fromarray(np.ascontiguousarray(c, np.float32)) for c in np.moveaxis(picture, -1, 0))
+    return np.stack([np.asarray(channel.resize(size, how, box=box)) for channel in channels], axis=-1)
 
 
 def pictures_sheet(

@@ -35,6 +35,7 @@ from unirender.lighting import check_shape, resample_environment
 from unirender.machine import memory_excess
 from unirender.pictures import check_finite, negative_share
 from unirender.primaries import REC709, in_rec709
+from unirender.sixteen_bits import opened
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
 
@@ -92,8 +93,7 @@ def load_light(
     if shape is not None:
         check_shape(shape)
     hdr = path.suffix.lower() in HDR_SUFFIXES
-    if hdr:
-        _check_memory(path)
+    _check_memory(path, hdr)
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     check_finite(pixels, f"light {path}")
     as_photograph = photograph if photograph is not None else not hdr
@@ -163,15 +163,29 @@ def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     return np.ascontiguousarray(srgb_values(path, f"light {path}")[..., :3])
 
 
-def _check_memory(path: Path) -> None:
-    """Looks at the size of a map in its header, if that can be read."""
-    texels = pixel_count(path)
-    if not texels:
-        with path.open("rb") as file:
-            found = SIZES.match(file.read(MOST_HEADER_BYTES))
-        texels = math.prod(int(side) for side in found.groups() if side) if found else 0
+def _check_memory(path: Path, hdr: bool) -> None:
+    """Looks at the size of a map or a photograph in its header, if that can be read."""
+    texels = _texels(path) if hdr else _photograph_pixels(path)
     if excess := memory_excess(BYTES_OF_NONE + BYTES_A_TEXEL * texels):
         raise UnirenderError(f"light {path}: {texels / 1e6:,.3g} million texels, which {excess}; scale it down first")
+
+
+def _texels(path: Path) -> int:
+    """Of a map, by its header; 0 where that cannot be read."""
+    if texels := pixel_count(path):
+        return texels
+    with path.open("rb") as file:
+        found = SIZES.match(file.read(MOST_HEADER_BYTES))
+    return math.prod(int(side) for side in found.groups() if side) if found else 0
+
+
+def _photograph_pixels(path: Path) -> int:
+    """The same of a file of Pillow's."""
+    try:
+        with opened(path) as file:
+            return file.width * file.height
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # told where it is read
+        return 0
 
 
 def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:

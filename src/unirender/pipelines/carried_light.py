@@ -66,13 +66,20 @@ def with_carried_light(
         camera=before.camera,
     )
     explained = _explained(MapsKey(surface), tuple(names), shadows)
-    carried = {}
-    for name in names:
-        trust = agreement(new[name], explained[name], mask)
-        bounded = by_rows(_bounded_log_ratio, old[name], explained[name])
-        smooth = _smoothed(bounded, mask, SMOOTHING * (1 - trust) * math.sqrt(mask.sum()))
-        carried[name] = by_rows(partial(_scaled, trust), new[name], smooth)
-    return after.replace(**carried)
+    return after.replace(**{name: _carried(old[name], new[name], explained[name], mask) for name in names})
+
+
+def _carried(
+    old: Float[np.ndarray, "h w 3"],
+    new: Float[np.ndarray, "h w 3"],
+    explained: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w 1"],
+) -> Float[np.ndarray, "h w 3"]:
+    """d_1 of d_0, D(L_1) and D(L_0)."""
+    trust = agreement(new, explained, mask)
+    sigma = SMOOTHING * (1 - trust) * math.sqrt(mask.sum())
+    smooth = _smoothed(by_rows(_bounded_log_ratio, old, explained), mask, sigma)
+    return by_rows(partial(_scaled, trust), new, smooth)
 
 
 def _bounded_log_ratio(
@@ -107,14 +114,26 @@ def agreement(
     """
     if not mask.any():
         return 0.0
-    logs = [np.log(light + FLOOR) for light in (one, other)]
-    first, second = (log - np.average(log, axis=(0, 1), weights=np.broadcast_to(mask, log.shape)) for log in logs)
+    first, second = (_log_about_mean(light, mask) for light in (one, other))
 
     def product(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]) -> float:
-        return float((mask * a * b).sum(dtype=np.float64) / (3 * mask.sum(dtype=np.float64))) + EVEN**2
+        weighted = mask * a
+        weighted *= b
+        return float(weighted.sum(dtype=np.float64) / (3 * mask.sum(dtype=np.float64))) + EVEN**2
 
     alike = product(first, second) / math.sqrt(product(first, first) * product(second, second))
     return min(max(alike, 0.0), 1.0)
+
+
+def _log_about_mean(light: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
+    """log(light + e), each channel about its mean over the mask."""
+    log = by_rows(_log, light)
+    mean = np.average(log, axis=(0, 1), weights=np.broadcast_to(mask, log.shape))
+    return np.subtract(log, mean, out=log)
+
+
+def _log(light: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    return np.log(light + FLOOR)
 
 
 def _smoothed(
@@ -124,7 +143,17 @@ def _smoothed(
     side = 1 + 2 * round((math.sqrt(6 * sigma**2 + 1) - 1) / 2)  # odd, so that nothing moves
     if side <= 1:
         return values
-    weighted = np.concatenate([values * mask, mask], axis=-1).astype(np.float32)
+    weighted = by_rows(_with_weight, values, mask)
     for axis in (0, 1, 0, 1):
-        weighted = uniform_filter1d(weighted, side, axis=axis, mode="constant")
+        uniform_filter1d(weighted, side, axis=axis, mode="constant", output=weighted)
+    return by_rows(_weighted_mean, weighted, mask)
+
+
+def _with_weight(values: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 4"]:
+    return np.concatenate([values * mask, mask], axis=-1).astype(np.float32)
+
+
+def _weighted_mean(
+    weighted: Float[np.ndarray, "h w 4"], mask: Float[np.ndarray, "h w 1"]
+) -> Float[np.ndarray, "h w 3"]:
     return np.where(mask > 0, weighted[..., :3] / np.maximum(weighted[..., 3:], 1e-6), 0)

@@ -18,12 +18,13 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
+from unirender.intrinsics import Intrinsics
 from unirender.pipelines.calibration import Lines, calibrated
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.flat_albedo import with_flat_albedo
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
-from unirender.pipelines.rendering import render_any_size
+from unirender.pipelines.rendering import renderings
 from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics, with_agreeing_light
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
@@ -85,19 +86,16 @@ def decompose_views(
     ]
     for i, (view, frame) in enumerate(zip(views, frames, strict=True)):
         if tile and frame.side > network.size:
-            blended = _tiled(network, view, how, _one(how, i).draw_seed())
-            samples[i] = [add_detail(whole, fine, frame) for whole, fine in zip(samples[i], blended, strict=True)]
+            samples[i] = _with_detail(network, view, frame, samples[i], how, _one(how, i).draw_seed())
     if closed:
-        rendered = iter(render_any_size(network, [sample for own in samples for sample in own], Sampling.of()))
-        samples = [
-            [close_decomposition(sample, view.image_linear, next(rendered)) for sample in own]
-            for view, own in zip(views, samples, strict=True)
-        ]
+        rendered = renderings(network, [sample for own in samples for sample in own], Sampling.of())
+        for view, own in zip(views, samples, strict=True):
+            for i in range(len(own)):  # one after another, so that what each was before is let go
+                own[i] = close_decomposition(own[i], view.image_linear, next(rendered))
     if flat:
-        samples = [
-            [with_flat_albedo(sample, view.image_linear, frame) for sample in own]
-            for view, frame, own in zip(views, frames, samples, strict=True)
-        ]
+        for view, frame, own in zip(views, frames, samples, strict=True):
+            for i in range(len(own)):
+                own[i] = with_flat_albedo(own[i], view.image_linear, frame)
     combined = [combine(tuple(own)) for own in samples]
     return [with_agreeing_light(found) for found in combined] if closed else combined
 
@@ -105,6 +103,14 @@ def decompose_views(
 def _one(how: Sampling, picture: int) -> Sampling:
     """The settings of one picture of a batch."""
     return replace(how, generator=how.generator[picture]) if isinstance(how.generator, Sequence) else how
+
+
+def _with_detail(
+    network: Network, view: View, frame: Frame, samples: list[Intrinsics], how: Sampling, seed: int
+) -> list[Intrinsics]:
+    """The samples of a picture with the detail of its tiles, which are let go of."""
+    blended = _tiled(network, view, how, seed)
+    return [add_detail(whole, fine, frame) for whole, fine in zip(samples, blended, strict=True)]
 
 
 def _tiled(network: Network, view: View, how: Sampling, seed: int) -> list[dict[str, np.ndarray]]:

@@ -22,6 +22,7 @@ from jaxtyping import Float
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from skimage.restoration import denoise_tv_chambolle
 
+from unirender.blocks import by_rows
 from unirender.color import srgb_decode, srgb_encode
 from unirender.composite import composite
 from unirender.intrinsics import Intrinsics
@@ -33,6 +34,7 @@ WEIGHT = 0.08 / 128  # w for each pixel along the square
 NEIGHBOURHOOD = 2 / 128  # of v: standard deviation of its Gaussian, in sides of the square
 CHROMA = 0.1  # c
 DARK = 0.1  # display value below which colours say little
+MAPS_OF_GAIN = ("albedo", "metallic", "specular", "diffuse")
 ITERATIONS, TOLERANCE = 200, 1e-4  # of Chambolle's projection
 
 
@@ -51,11 +53,23 @@ def with_flat_albedo(intrinsics: Intrinsics, image_linear: Float[np.ndarray, "h 
         return intrinsics
     small, picture = frame.enter_map(albedo, mask), divide(frame.enter(image_linear), inside)
     change = frame.leave_map(flattened(small, np.clip(picture, 0, 1), inside) - small, mask)
-    flat = np.clip(albedo + change, 0, 1)
-    before, after = composite(**maps), composite(**maps | {"albedo": flat})
-    gain = np.where(mask > 0, np.clip((before + FLOOR) / (after + FLOOR), 1 / MAX_GAIN, MAX_GAIN), 1)
-    light = {name: (maps[name] * gain).astype(np.float32) for name in ("specular", "diffuse")}
+    flat = by_rows(_changed, albedo, change)
+    gain = by_rows(_gain, flat, mask, *(maps[name] for name in MAPS_OF_GAIN))
+    light = {name: by_rows(np.multiply, maps[name], gain) for name in ("specular", "diffuse")}
     return intrinsics.replace(albedo=flat, **light)
+
+
+def _changed(albedo: Float[np.ndarray, "h w 3"], change: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    return np.clip(albedo + change, 0, 1)
+
+
+def _gain(
+    flat: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"], *maps: Float[np.ndarray, "h w _"]
+) -> Float[np.ndarray, "h w 3"]:
+    """k of s and d for an albedo that became `flat`; `maps`: those of `MAPS_OF_GAIN`. 1 outside the mask."""
+    known = dict(zip(MAPS_OF_GAIN, maps, strict=True))
+    before, after = composite(**known), composite(**known | {"albedo": flat})
+    return np.where(mask > 0, np.clip((before + FLOOR) / (after + FLOOR), 1 / MAX_GAIN, MAX_GAIN), 1)
 
 
 def flattened(

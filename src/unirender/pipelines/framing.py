@@ -1,7 +1,8 @@
 """Any picture size <-> the model's square: cut out a small object or pad to a square, resample; and back.
 
 Pictures are resampled premultiplied and in linear light, so that no background bleeds in. A picture that has the
-model's size passes through untouched.
+model's size passes through untouched. The square of a large or elongated picture, whose padding may be many times the
+picture, is never there as a whole: along rows and along columns it is resampled in strips, to the same bytes.
 """
 
 import math
@@ -14,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.ndimage import label
 
-from unirender.blocks import by_rows
+from unirender.blocks import by_rows, row_blocks
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
@@ -110,22 +111,32 @@ class Frame:
         """The same camera for the square."""
         return camera.of_square(*self.corner, self.side, self.height, self.width)
 
-    def enter(self, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "s s c"]:
-        """Picture -> square; for premultiplied pictures and coverage."""
+    def enter(
+        self, picture: Float[np.ndarray, "h w c"], mask: Float[np.ndarray, "h w 1"] | None = None
+    ) -> Float[np.ndarray, "s s c"]:
+        """Picture -> square; for premultiplied pictures and coverage, and for others with the mask to multiply by."""
         if self.identity:
-            return picture
-        seen, there = self._slices()
-        square = np.zeros((self.side, self.side, picture.shape[-1]), picture.dtype)
-        square[there] = picture[seen]
-        return resize(square, (self.size, self.size))
+            return picture if mask is None else picture * mask
+        seen, (there_rows, there_columns) = self._slices()
+        part, weight = picture[seen], None if mask is None else mask[seen]
+        narrow = np.zeros((self.side, self.size, picture.shape[-1]), np.float32)  # the square, resampled along its rows
+        inside = narrow[there_rows]
+        for rows in row_blocks(len(part), self.side):
+            strip = np.zeros((rows.stop - rows.start, self.side, picture.shape[-1]), np.float32)
+            strip[:, there_columns] = part[rows] if weight is None else part[rows] * weight[rows]
+            inside[rows] = resize(strip, (len(strip), self.size))
+        return resize(narrow, (self.size, self.size))
 
     def leave(self, picture: Float[np.ndarray, "s s c"]) -> Float[np.ndarray, "h w c"]:
         """Square -> picture; for premultiplied pictures and coverage. 0 outside the square."""
         if self.identity:
             return picture
-        seen, there = self._slices()
+        seen, (there_rows, there_columns) = self._slices()
         whole = np.zeros((self.height, self.width, picture.shape[-1]), np.float32)
-        whole[seen] = resize(picture, (self.side, self.side))[there]
+        wide, inside = resize(picture, (self.size, self.side))[:, there_columns], whole[seen]
+        for columns in row_blocks(wide.shape[1], self.side):
+            strip = wide[:, columns]
+            inside[:, columns] = resize(strip, (self.side, strip.shape[1]))[there_rows]
         return whole
 
     def _slices(self) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -149,7 +160,7 @@ class Frame:
         if self.identity:
             return maps
         inside = self.enter(mask)
-        return {name: divide(self.enter(value * mask), inside) for name, value in maps.items()}
+        return {name: divide(self.enter(value, mask), inside) for name, value in maps.items()}
 
     def leave_map(
         self, value: Float[np.ndarray, "s s c"], mask: Float[np.ndarray, "h w 1"]
@@ -198,6 +209,8 @@ def _left(
 
 def resize(picture: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 c"]:
     """Bilinear, with an antialiasing support where it shrinks."""
+    if picture.shape[1] == 1:  # of one column alone torch repeats the first value
+        return resize(np.repeat(picture, 2, axis=1), (size[0], max(size[1], 2)))[:, : size[1]]
     tensor = torch.from_numpy(np.ascontiguousarray(picture, dtype=np.float32)).permute(2, 0, 1)[None]
     return F.interpolate(tensor, size=size, mode="bilinear", antialias=True)[0].permute(1, 2, 0).numpy()
 

@@ -1,6 +1,7 @@
 """Rendering intrinsics of any size with a network that knows one size."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -42,16 +43,28 @@ def render_any_size(
         shadows: whether what is derived here, since the intrinsics lack it, has the shadows that the picture's own
             surfaces cast, and what they reflect.
     """
+    return list(renderings(network, scenes, how, watch, derived, shadows))
+
+
+def renderings(
+    network: Network,
+    scenes: Sequence[Intrinsics],
+    how: Sampling,
+    watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
+    derived: Collection[str] = (),
+    shadows: bool = True,
+) -> Iterator[Float[np.ndarray, "h w 3"]]:
+    """The images of `render_any_size`, one after another: the network sees all at once, but of each scene only its
+    small size is kept when its image is there."""
     without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
-    ready = [ready_to_render(scene, shadows) for scene in scenes]
+    ready = deque(ready_to_render(scene, shadows) for scene in scenes)
+    del scenes
     entered = [enter(network, scene) for scene in ready]
     for _, small in entered:
         watch(network.overflow(small))
     rendered = network.images([small for _, small in entered], how, without_shadows)
-    return [
-        _leave(network, scene, frame, small, image)
-        for scene, (frame, small), image in zip(ready, entered, rendered, strict=True)
-    ]
+    for (frame, small), image in zip(entered, rendered, strict=True):
+        yield _leave(network, ready.popleft(), frame, small, image)
 
 
 def _leave(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from unirender.blocks import by_rows
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.framing import Frame
@@ -118,10 +119,18 @@ def combine(samples: tuple[Intrinsics, ...]) -> Decomposition:
     mean = samples[0]
     std: dict[str, np.ndarray] | None = None
     if len(samples) > 1:
-        stacks = {name: np.stack([getattr(sample, name) for sample in samples]) for name in PREDICTED}
-        averages = {name: stack.mean(axis=0) for name, stack in stacks.items()}
+        maps = {name: [getattr(sample, name) for sample in samples] for name in PREDICTED}
+        averages = {name: by_rows(_mean, *values) for name, values in maps.items()}
         mean = mean.replace(**averages | {"normal": unit_normal(averages["normal"])})
-        std = {name: stack.std(axis=0) for name, stack in stacks.items()}
-    maps = mean.require("roughness", "metallic", "mask")
-    roughness, metallic = (masked_mean(maps[name], maps["mask"]) for name in ("roughness", "metallic"))
+        std = {name: by_rows(_spread, *values) for name, values in maps.items()}
+    own = mean.require("roughness", "metallic", "mask")
+    roughness, metallic = (masked_mean(own[name], own["mask"]) for name in ("roughness", "metallic"))
     return Decomposition(mean, roughness, metallic, std, samples if len(samples) > 1 else ())
+
+
+def _mean(*values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    return np.stack(values).mean(axis=0)
+
+
+def _spread(*values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    return np.stack(values).std(axis=0)

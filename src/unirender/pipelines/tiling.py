@@ -119,7 +119,11 @@ def blend_tiles(
             for into, maps in zip(sums, samples, strict=True):
                 for name, value in into.items():
                     value[tile.slices] += inside * maps[name][:rows, :columns]
-    return [{name: value / np.where(total > 0, total, 1) for name, value in maps.items()} for maps in sums]
+    total[total == 0] = 1
+    for maps in sums:
+        for value in maps.values():
+            value /= total
+    return sums
 
 
 def add_detail(whole: Intrinsics, blended: dict[str, np.ndarray], frame: Frame) -> Intrinsics:

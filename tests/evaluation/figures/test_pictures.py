@@ -1,5 +1,6 @@
 """The figure of one's own pictures: how they are framed, what is asked of whom, what is refused."""
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -142,3 +143,14 @@ def test_a_method_that_writes_into_the_picture_spoils_no_other_row() -> None:
     for alone, beside in zip(last[0].tiles[1:], last[1].tiles[1:], strict=True):
         assert (alone is None) == (beside is None)
         assert alone is None or beside is None or np.array_equal(alone.picture, beside.picture)
+
+
+def test_a_panorama_takes_the_memory_of_its_own_pixels() -> None:
+    picture = Picture(np.ones((8, 2000, 3), np.float32), np.ones((8, 2000, 1), np.float32), "wide.png")
+    tracemalloc.start()
+    found = framed(picture, 64)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.mask is not None
+    assert found.mask.max() > 0
+    assert taken < 10e6, "its square would take 100 megabytes"
