@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from seen_shapes import CAMERA, SIZE, as_maps, ball, gutter, rays
 
 from unirender.camera import Camera
@@ -15,7 +16,7 @@ from unirender.pipelines.derived_light import derived_diffuse, derived_light, de
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.pipelines.remembered import forget_pictures
-from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits, _distance_to_ends
+from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _angle, _bits, _distance_to_ends, _middles
 from unirender.pipelines.shadowed_light import (
     LEAST_ROUGHNESS,
     SHADOW_SIDE,
@@ -320,8 +321,20 @@ def test_a_surface_ends_on_both_sides_of_a_step(turn: bool) -> None:
 
 
 def test_bits_are_those_of_the_sectors_between_two_angles() -> None:
-    cases = [(0, 64), (0, 0), (63, 64), (10, 20), (20, 10), (9.4, 9.6), (9.6, 10.4), (-3, 70)]
-    found = _bits(*np.array(cases, float).T)
-    for (first, last), mask in zip(cases, found, strict=True):
+    cases = np.array([(0, 64), (0, 0), (63, 64), (10, 20), (20, 10), (9.4, 9.6), (9.6, 10.4)], np.float32).T
+    found = _bits(*(_middles(np.cos(angles * np.float32(math.pi / SECTORS))) for angles in cases))
+    for (first, last), mask in zip(cases.T, found, strict=True):
         expected = sum(1 << sector for sector in range(SECTORS) if first <= sector + 0.5 < last)
         assert int(mask) == expected, (first, last)
+    assert _middles(np.array([-1.1, 1.1], np.float32)).tolist() == [SECTORS, 0]  # cosines, but for rounding
+
+
+@pytest.mark.parametrize("border", [0, 0.5])
+def test_angles_fall_on_the_side_of_a_border_on_which_numpy_has_them(border: float) -> None:
+    """At cosines within a few last bits of all borders, and anywhere."""
+    scale = SECTORS / math.pi
+    cosine = np.cos((np.arange(SECTORS) + border) / scale).astype(np.float32)
+    near = [cosine + k * np.spacing(cosine) for k in range(-8, 9)]
+    cosine = np.clip(np.concatenate([*near, np.linspace(-1, 1, 999, dtype=np.float32)]), -1, 1)
+    found = _angle(torch.acos, np.arccos, scale, border, cosine)
+    np.testing.assert_array_equal(np.floor(found + border), np.floor(scale * np.arccos(cosine) + border))
