@@ -24,6 +24,7 @@ from unirender.pipelines.shadowed_light import (
     _distribution,
     seen_shadows,
     visible_shares,
+    visible_shares_under,
 )
 from unirender.surface_light import QUADRATURE_SHAPE
 from unirender.symmetries import mirror, quarter_turn
@@ -166,10 +167,10 @@ def test_shadows_of_s_are_weighed_by_a_ggx_lobe() -> None:
     """Seen along the normal, D sums to 4 pi / alpha^2 over all directions of light; it is largest in the mirror's."""
     directions, up = texel_directions((128, 256)), np.array([[0, 0, 1]], np.float32)
     for alpha in (0.09, 0.36, 1.0):
-        lobe = _distribution(up, up, np.array([[alpha]], np.float32), directions)[0]
+        lobe = _distribution(up @ directions, up @ up.T, up @ directions, np.array([[alpha]], np.float32))[0]
         assert lobe @ texel_solid_angles(128, 256).ravel() == pytest.approx(4 * math.pi / alpha**2, rel=0.01)
     tilted = np.array([[0.48, 0.36, 0.8]], np.float32)
-    lobe = _distribution(tilted, up, np.array([[0.09]], np.float32), directions)[0]
+    lobe = _distribution(tilted @ directions, tilted @ up.T, up @ directions, np.array([[0.09]], np.float32))[0]
     assert directions[:, lobe.argmax()] @ (2 * 0.8 * tilted[0] - up[0]) > math.cos(math.radians(1.5))
 
 
@@ -199,6 +200,18 @@ def test_shadows_of_d_are_linear_in_the_light() -> None:
     single = derived_light(maps, one, ["specular", "diffuse"])
     for name, value in single.items():
         np.testing.assert_allclose(2 * value, doubled[name], rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_left_under_a_light_does_not_depend_on_the_others() -> None:
+    """To the bit: a light alone is one of several."""
+    normal, mask, _ = gutter()
+    maps, lights = as_maps(normal, mask), (sky(), np.ones((2, 4, 3), np.float32))
+    names = ("specular", "diffuse")
+    together = visible_shares_under(maps, lights, names)
+    for light, found in zip(lights, together, strict=True):
+        for name, alone in visible_shares(maps, light, names).items():
+            np.testing.assert_array_equal(found[name], alone)
+    assert np.abs(together[0]["diffuse"] - together[1]["diffuse"]).max() > 0.05
 
 
 def uneven() -> Intrinsics:

@@ -27,7 +27,7 @@ from unirender.ggx import dot
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.vectors import nonzero
 
-HALF_PLANES = 32  # evenly around the viewer's direction
+HALF_PLANES = 32  # evenly around the viewer's direction; a power of two
 SECTORS = 64  # of theta, from 0 to pi: the bits of a mask
 STEPS = 24  # along each line, ever longer ones
 NEAREST = 1.5  # pixels: the first step
@@ -108,7 +108,7 @@ class SelfShadow:
                 directions[1] + y * directions[2],
                 directions[0] + x * directions[2],
             )
-            plane = np.rint(azimuth, out=azimuth).astype(np.int32) % HALF_PLANES
+            plane = np.rint(azimuth, out=azimuth).astype(np.int32) & (HALF_PLANES - 1)  # `%` is slow
             theta = _angle(torch.acos, np.arccos, SECTORS / math.pi, 0, np.clip(cosine[some], -1, 1))
             sector = np.minimum(theta, SECTORS - 1, out=theta).astype(np.int32)
             found[some] = of_rows(masks[some], plane * SECTORS + sector)
