@@ -14,7 +14,7 @@ from unirender.lighting import environment_directions, texel_solid_angles
 from unirender.lobes import texel_directions, texels
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
-from unirender.pipelines.normal_integration import integrate_normals
+from unirender.pipelines.normal_integration import RIGHT, TETHER, _neighbours, _system, integrate_normals
 from unirender.pipelines.remembered import forget_pictures
 from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _angle, _bits, _distance_to_ends, _middles
 from unirender.pipelines.shadowed_light import (
@@ -55,6 +55,26 @@ def test_planes_that_meet_keep_their_edge() -> None:
     found = integrate_normals(normal, mask[..., 0] > 0, CAMERA)
     ratio = found / depth
     assert np.abs(ratio / np.median(ratio) - 1).max() < 2e-4  # 5e-4 where one side of each pair counts whole
+
+
+def test_the_normal_equations_are_those_of_the_weighted_differences() -> None:
+    """Row by row: w (N (z_neighbour - z) - slope)^2 over the sides on which there is a pixel."""
+    rng = np.random.default_rng(0)
+    sides = _neighbours(rng.random((4, 5)) > 0.2)
+    count = sides.shape[1]
+    facing, slopes = rng.random(count), rng.normal(size=(4, count))
+    weights = rng.random((4, count)) * (sides < count)
+    weights[RIGHT, 2] = 0
+    system, right = _system(sides, facing, weights, slopes)
+    expected, expected_right = TETHER * np.eye(count), np.zeros(count)
+    for side in range(4):
+        for pixel in np.flatnonzero(sides[side] < count):
+            row = np.zeros(count)
+            row[sides[side, pixel]], row[pixel] = facing[pixel], -facing[pixel]
+            expected += weights[side, pixel] * np.outer(row, row)
+            expected_right += weights[side, pixel] * slopes[side, pixel] * row
+    np.testing.assert_allclose(system.toarray(), expected, atol=1e-14)
+    np.testing.assert_allclose(right, expected_right, atol=1e-14)
 
 
 def test_parts_that_do_not_touch_lie_at_one_depth_and_nothing_is_nothing() -> None:
