@@ -122,8 +122,13 @@ class SelfShadow:
 
 def of_rows(table: Shaped[np.ndarray, "q t"], index: Integer[np.ndarray, "q m"]) -> Shaped[np.ndarray, "q m"]:
     """What stands in each row of a table in the columns that the same row of the index names."""
-    rows = np.arange(0, table.size, table.shape[1], dtype=np.int32)[:, None]
-    return table.reshape(-1).take(rows + index)
+    found = np.empty(index.shape, table.dtype)
+    step = max(1, _BLOCK // index.shape[1])
+    first = np.arange(min(step, len(table)), dtype=np.int32)[:, None] * np.int32(table.shape[1])  # of a row
+    for some in (slice(i, i + step) for i in range(0, len(table), step)):
+        rows = table[some]
+        found[some] = rows.reshape(-1).take(first[: len(rows)] + index[some])
+    return found
 
 
 def _as_bytes(masks: UInt64[np.ndarray, "q a"]) -> UInt8[np.ndarray, "q t"]:
@@ -157,8 +162,8 @@ def _hidden(
     step = _BLOCK // STEPS
     for part in (slice(i, i + step) for i in range(0, len(points), step)):
         for plane in range(HALF_PLANES):
-            at = rows[plane].take(row[part], axis=1), columns[plane].take(column[part], axis=1)
-            masks[:, part, plane] = walls.hide(part.start, number[at])  # rows and columns: [s q] each
+            met = rows[plane].take(row[part], axis=1) * number.shape[1] + columns[plane].take(column[part], axis=1)
+            masks[:, part, plane] = walls.hide(part.start, number.take(met))
     return masks
 
 

@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 
 from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions, texels
-from unirender.models.visibility import bin_weights, direction_bins, hidden_chance
+from unirender.models.visibility import BINS, bin_weights, direction_bins, hidden_chance
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.remembered import MapsKey, remembered
 from unirender.pipelines.self_shadow import SelfShadow, of_rows
@@ -172,10 +172,9 @@ def _percent_hidden(
     chance = hidden_chance(normal, shadow.where, shadow.depth, np.concatenate(weight))
     percent = np.round(100 * chance).astype(np.uint8)
     bins = direction_bins(directions)
-    by_class = np.arange(percent.shape[1], dtype=np.int32) * percent.shape[2]
+    column = (of_part * np.uint8(BINS) + bins.astype(np.uint8) for of_part in classes)  # of classes times bins: a byte
     return [
-        (part, of_rows(percent[part].reshape(len(of_part), -1), by_class.take(of_part) + bins.astype(np.int32)))
-        for part, of_part in zip(parts, classes, strict=True)
+        (part, of_rows(percent[part].reshape(len(index), -1), index)) for part, index in zip(parts, column, strict=True)
     ]
 
 
