@@ -96,6 +96,7 @@ FORBIDDEN = [
     ("reference/unirender_reference/__init__.py", "unirender.models", "independent of the model"),
     ("reference/unirender_reference/shade.py", "unirender.scene_export", "independent of the model"),
     ("evaluation/unirender_evaluation/__init__.py", "unirender.cli", "composition root"),
+    ("evaluation/unirender_evaluation/tables/build.py", "unirender_evaluation.report.page", "results > tables"),
     ("src/unirender/exr.py", "unirender_reference", "unirender_evaluation > unirender_reference"),
 ]
 

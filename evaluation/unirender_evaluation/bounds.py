@@ -11,18 +11,18 @@ import numpy as np
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
-from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
 from unirender_evaluation.engine import record_of
 from unirender_evaluation.light_metrics import SHAPE as LIGHT_SHAPE
 from unirender_evaluation.light_metrics import score_light
-from unirender_evaluation.methods import Image
+from unirender_evaluation.methods.ceiling import noise_ceiling, similarity_ceiling
+from unirender_evaluation.methods.method import Image
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.store import Job
-from unirender_evaluation.suites import Scene, Suite, material_key
+from unirender_evaluation.suites.suite import Scene, Suite, material_key
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth_check import TruthCheck
+from unirender_evaluation.truth.check import TruthCheck
 from unirender_evaluation.versions import LPIPS, REFERENCE
 
 KeyOf = Callable[[str, MethodInfo, Collection[str]], str]  # question, row, parts that it uses -> content key

@@ -10,8 +10,8 @@ from unirender.option_checks import at_least
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
 from unirender_evaluation.physics.command import BenchPhysics
 from unirender_evaluation.public.command import BenchPublic
-from unirender_evaluation.results_commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.results.commands import BenchCompare, BenchLs, BenchTables, BenchValidate, asked_variants
+from unirender_evaluation.runs.command import BenchRun
 from unirender_evaluation.shard_scores_command import BenchShards
 from unirender_evaluation.studies.derived_light.command import BenchDerivedLight
 from unirender_evaluation.studies.optimiser.commands import BenchIngredients, BenchRace
@@ -20,7 +20,7 @@ from unirender_evaluation.studies.speed.command import BenchSpeed
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
 from unirender_evaluation.studies.warm_start.command import BenchWarmStart
-from unirender_evaluation.truth_commands import BenchCheck, BenchTruth
+from unirender_evaluation.truth.commands import BenchCheck, BenchTruth
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class BenchReport:
     def run(self) -> int:
         """Writes `report.html` into the folder."""
         self.check()
-        from unirender_evaluation.report_run import rebuild
+        from unirender_evaluation.runs.report import rebuild
 
         path = rebuild(self.folder, self.suite, asked_variants(self.variant))
         print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
@@ -68,7 +68,7 @@ class BenchExport:
         self.check()
         from unirender.files import new_folder
         from unirender_evaluation.export import export_inputs
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
 
         with new_folder(self.out) as folder:
             count = export_inputs(load_suite(self.suite), folder, self.limit)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import Estimate, beats, paired_difference
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 AGREEMENT = 1e-4  # relative difference up to which two values are one measurement: another CPU rounds otherwise
 OTHERS = ("trivial", "baseline", "optimisation")  # kinds of rows that ours are held against

@@ -23,9 +23,9 @@ from unirender.errors import UnirenderError
 from unirender_evaluation import lpips, metrics
 from unirender_evaluation.lpips import Backbone
 from unirender_evaluation.lpips_convert import GOLDEN, pattern
-from unirender_evaluation.methods import quantise
+from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.rows import evenly
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import installed_version
 
 Picture = Float[np.ndarray, "_ _ 3"]  # display values in [0, 1], float64; pairs differ in size

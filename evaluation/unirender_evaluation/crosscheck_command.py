@@ -35,7 +35,7 @@ class BenchCrosscheck:
 
         from unirender_evaluation import lpips
         from unirender_evaluation.crosscheck import agreements, random_pairs, real_pairs
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
 
         pairs = [*random_pairs(self.pairs, self.seed), *real_pairs(load_suite(self.suite), self.scenes)]
         table = Table(title="Largest difference", title_justify="left")

@@ -11,15 +11,15 @@ import numpy as np
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender_evaluation.light_metrics import score_light
-from unirender_evaluation.methods import Image
-from unirender_evaluation.plausible import picture_doubt
-from unirender_evaluation.plugin_source import raised_in
-from unirender_evaluation.predictions import BRIGHTEST
+from unirender_evaluation.methods.method import Image
+from unirender_evaluation.methods.plausible import picture_doubt
+from unirender_evaluation.methods.plugin_source import raised_in
+from unirender_evaluation.methods.suspicions import suspicions
+from unirender_evaluation.predictions.folder import BRIGHTEST
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job, content_key
-from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.suspicions import suspicions
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import Versions

@@ -20,7 +20,7 @@ import numpy as np
 
 from unirender.exr import CAMERA_ATTRIBUTE, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import scene_ids, tasks
 

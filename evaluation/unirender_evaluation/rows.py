@@ -11,18 +11,14 @@ import numpy as np
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.composite_methods import Composite, CompositeOf, ShadowedSplitSum, SplitSum
-from unirender_evaluation.decompositions import Decompositions
-from unirender_evaluation.kept_defaults import OwnDefaults
-from unirender_evaluation.light_methods import MeanLight, UniformLight
-from unirender_evaluation.methods import capabilities
-from unirender_evaluation.pipeline_method import PipelineMethod
-from unirender_evaluation.plugins import Plugin
-from unirender_evaluation.predictions import PredictionFolder
-from unirender_evaluation.records import MethodInfo, MethodKind
-from unirender_evaluation.suites import Scene, material_key
-from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
-from unirender_evaluation.trivial_methods import (
+from unirender_evaluation.methods.composite import Composite, CompositeOf, ShadowedSplitSum, SplitSum
+from unirender_evaluation.methods.decompositions import Decompositions
+from unirender_evaluation.methods.kept_defaults import OwnDefaults
+from unirender_evaluation.methods.light import MeanLight, UniformLight
+from unirender_evaluation.methods.method import capabilities
+from unirender_evaluation.methods.pipeline import PipelineMethod
+from unirender_evaluation.methods.plugins import Plugin
+from unirender_evaluation.methods.trivial import (
     ConstantMaterial,
     InputAsAlbedo,
     MeanAlbedo,
@@ -30,6 +26,10 @@ from unirender_evaluation.trivial_methods import (
     SphereNormal,
     UneditedInput,
 )
+from unirender_evaluation.predictions.folder import PredictionFolder
+from unirender_evaluation.records import MethodInfo, MethodKind
+from unirender_evaluation.suites.suite import Scene, material_key
+from unirender_evaluation.task import LIGHT, PROTOCOLS, Task
 from unirender_evaluation.versions import LPIPS, MODEL
 
 T = TypeVar("T")

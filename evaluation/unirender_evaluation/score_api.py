@@ -79,7 +79,7 @@ def score(
 
 def _checked_pictures(prediction: Any, truth: Any, mask: Any) -> tuple[Picture, Picture, Float[np.ndarray, "h w 1"]]:
     """The two pictures, of one size and in the same units, and the true coverage."""
-    from unirender_evaluation.plausible import range_doubt
+    from unirender_evaluation.methods.plausible import range_doubt
 
     if mask is None:
         raise UnirenderError(

@@ -16,12 +16,12 @@ from unirender.intrinsics import Intrinsics
 from unirender.training.data import GroupDataset
 from unirender.training.groups import Pair
 from unirender.training.same_objects import object_of
-from unirender_evaluation.composite_methods import ShadowedSplitSum
+from unirender_evaluation.methods.composite import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
-from unirender_evaluation.table_formats import estimate_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import estimate_text
+from unirender_evaluation.tables.text import TextTable
 
 COLUMNS = {  # header -> metric of `score_maps`, decimals
     "albedo (dB) ↑": (metric_key("albedo", "psnr"), 2),

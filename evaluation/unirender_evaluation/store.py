@@ -16,7 +16,7 @@ from typing import Any
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.records import Record, append_record, write_records
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.versions import SEPARATOR
 
 KEY_PREFIX = 12

@@ -1,10 +1,10 @@
 """Every table that a run fills, and every metric that stands in one."""
 
-from unirender_evaluation.light_tables import LIGHT_TABLE
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics.tests import PHYSICS_TABLE
-from unirender_evaluation.specs import TABLES, TableSpec
+from unirender_evaluation.tables.lights import LIGHT_TABLE
+from unirender_evaluation.tables.specs import TABLES, TableSpec
 
 BESIDE_THE_PAPERS = (LIGHT_TABLE, MULTIVIEW_TABLE, PHYSICS_TABLE)
 ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in BESIDE_THE_PAPERS}}

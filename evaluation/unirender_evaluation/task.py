@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import Image, Mask
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.methods.method import Image, Mask
+from unirender_evaluation.suites.suite import Scene
 from unirender_reference.shapes import MeshObject
 
 Capability = Literal["decompose", "edit", "relight", "render"]

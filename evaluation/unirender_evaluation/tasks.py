@@ -23,9 +23,9 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import quantise
-from unirender_evaluation.suite_objects import known_mesh
-from unirender_evaluation.suites import Material, Scene, Suite, material_key
+from unirender_evaluation.methods.method import quantise
+from unirender_evaluation.suites.objects import known_mesh
+from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
 from unirender_evaluation.task import LIGHT, LIGHT_ANSWER, PROTOCOLS, Asked, Task
 
 

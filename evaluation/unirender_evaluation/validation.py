@@ -16,7 +16,7 @@ from unirender.errors import UsageError
 from unirender.score import Score
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS, metric_key
 from unirender_evaluation.scoring import score_image, score_maps
-from unirender_evaluation.suites import Scene, Suite, load_suite
+from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.tasks import scene_ids, tasks
 
 MAP_SCORES = (("albedo", "psnr"), ("normal", "cosine"), ("metallic", "mse"), ("roughness", "mse"))

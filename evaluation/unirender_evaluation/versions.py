@@ -50,52 +50,40 @@ LIGHT_READER = ("lights/files.py", "lights/light.py")  # of lights in folders of
 # Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
 # the records anew at the end of every run.
 COMMANDS = (
-    "__init__",
+    "*/__init__",
     "*_command",
-    "*_commands",
-    "bench_config",
-    "benchmark",
-    "cluster_run",
+    "*/command",
+    "*/commands",
+    "__init__",
     "commands",
-    "crosscheck*",
-    "dry_run",
+    "crosscheck",
     "export",
     "lpips_convert",
-    "physics/__init__",
     "physics/ambiguity",
-    "physics/command",
     "physics/region",
     "physics/run",
     "physics/tracer",
     "physics/twins",
-    "prediction_check",
-    "run_folder",
+    "predictions/check",
+    "runs/benchmark",
+    "runs/cluster",
+    "runs/config",
+    "runs/dry_run",
+    "runs/folder",
+    "runs/report",
+    "runs/workers",
     "score_api",
     "shard_scores",
     "subsets",
-    "suite_check",
-    "suite_definition",
-    "suite_home",
-    "suite_lights",
-    "truth",
-    "truth_files",
+    "suites/check",
+    "suites/definition",
+    "suites/home",
+    "suites/lights",
+    "truth/make",
+    "truth/sources",
     "validation",
-    "workers",
 )
-FROM_RECORDS = (
-    "claims",
-    "comparisons",
-    "light_tables",
-    "merge",
-    "protocol",
-    "published",
-    "readme",
-    "results_*",
-    "schema*",
-    "statistics",
-    "table*",
-    "verdict",
-)
+FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
 # Of the shared vocabulary's folder: the command line, what is said where a file cannot be written, and processes.
 OUTSIDE = (
     "__main__",
@@ -114,12 +102,14 @@ OUTSIDE = (
     "worker_pool",
     "writing",
 )
-PICTURES = ("gallery*", "pictures*", "report*")
+# The rooms that records are made in, and of the tables what is asked. Results and the report are made from records.
+ROOMS = ("*.py", "methods/*.py", "physics/*.py", "predictions/*.py", "runs/*.py", "suites/*.py", "truth/*.py")
+QUESTIONS = "tables/specs.py"
 # Parts of their own: a change there concerns no other row.
-OPTIMIZED = ("optimized_*",)
+OPTIMIZED = ("methods/optimized*",)
 VIEWS = ("multiview/*",)
-ADAPTERS = ("adapters_*",)  # of other people's pipelines, which enter as plug-ins do
-MITSUBA_ROW = ("mitsuba_method",)
+ADAPTERS = ("adapters/*",)  # of other people's pipelines, which enter as plug-ins do
+MITSUBA_ROW = ("methods/mitsuba",)
 # What makes data sets, checks the ground truth, measures it or reads files: no record is made with it.
 NOT_IN_RECORDS = (
     "checks/*",
@@ -161,7 +151,7 @@ PARTS: Mapping[str, Part] = {
     "core": Part(
         {
             "unirender": ("*.py", "*.npy"),
-            "unirender_evaluation": ("*.py", "physics/*.py"),
+            "unirender_evaluation": (*ROOMS, QUESTIONS),
             "unirender_reference": LIGHT_READER,
         },
         ("numpy", "scipy", "scikit-image", "colour-science", "OpenEXR", "pillow"),
@@ -169,10 +159,7 @@ PARTS: Mapping[str, Part] = {
             *(f"unirender/{name}.py" for name in OUTSIDE),
             *(
                 f"unirender_evaluation/{name}.py"
-                for name in (
-                    *(*COMMANDS, *FROM_RECORDS, *PICTURES, "versions"),
-                    *(*OPTIMIZED, *ADAPTERS, *MITSUBA_ROW),
-                )
+                for name in (*COMMANDS, *FROM_RECORDS, "versions", *OPTIMIZED, *MITSUBA_ROW)
             ),
         ),
     ),
@@ -182,6 +169,7 @@ PARTS: Mapping[str, Part] = {
             "unirender_evaluation": tuple(f"{name}.py" for name in ADAPTERS),
         },
         ("torch", "diffusers"),
+        ("unirender_evaluation/adapters/__init__.py",),
     ),
     REFERENCE: Part(
         {

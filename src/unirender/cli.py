@@ -36,14 +36,14 @@ from unirender_evaluation.commands import Bench
 from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.figures.command import Figures
 from unirender_evaluation.public.command import BenchPublic
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.runs.command import BenchRun
 from unirender_evaluation.studies.derived_light.command import BenchDerivedLight
 from unirender_evaluation.studies.optimiser.commands import BenchIngredients, BenchRace
 from unirender_evaluation.studies.sampling.command import BenchSampling
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.unknown_mesh.command import BenchUnknownMesh
 from unirender_evaluation.studies.warm_start.command import BenchWarmStart
-from unirender_evaluation.truth_commands import BenchTruth
+from unirender_evaluation.truth.commands import BenchTruth
 from unirender_reference.commands import Dataset
 from unirender_reference.measure.commands import Reference
 from unirender_reference.measure.lights import Lights

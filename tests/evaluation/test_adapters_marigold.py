@@ -24,9 +24,9 @@ from tiny_adapter_folders import (
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
 from unirender.errors import UnirenderError
-from unirender_evaluation.adapters_folder import on_background
-from unirender_evaluation.adapters_marigold import MarigoldIntrinsics, MarigoldNormals
-from unirender_evaluation.adapters_marigold_maps import check_properties, decoded_targets, target_maps
+from unirender_evaluation.adapters.folder import on_background
+from unirender_evaluation.adapters.marigold import MarigoldIntrinsics, MarigoldNormals
+from unirender_evaluation.adapters.marigold_maps import check_properties, decoded_targets, target_maps
 
 
 @pytest.fixture(scope="module")

@@ -14,16 +14,16 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.adapters_folder import folder_sha256
-from unirender_evaluation.adapters_marigold import MarigoldNormals
-from unirender_evaluation.adapters_rgbx import RgbToX
+from unirender_evaluation.adapters.folder import folder_sha256
+from unirender_evaluation.adapters.marigold import MarigoldNormals
+from unirender_evaluation.adapters.rgbx import RgbToX
 from unirender_evaluation.engine import method_jobs
-from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.plugins import named_plugin
+from unirender_evaluation.methods.plugins import named_plugin
 from unirender_evaluation.records import RunInfo
+from unirender_evaluation.report.pictures import Pictures
 from unirender_evaluation.rows import plugin_rows
-from unirender_evaluation.table_formats import to_markdown
-from unirender_evaluation.tables import build_tables
+from unirender_evaluation.tables.build import build_tables
+from unirender_evaluation.tables.formats import to_markdown
 from unirender_evaluation.versions import LPIPS, MODEL, Versions
 
 SOURCE = """
@@ -45,7 +45,7 @@ class Given:
 
 made = Given()
 """
-MARIGOLD = "unirender_evaluation.adapters_marigold"
+MARIGOLD = "unirender_evaluation.adapters.marigold"
 
 
 @pytest.fixture
@@ -222,7 +222,7 @@ def test_from_a_spec_to_a_scored_table(normals: Path, tmp_path: Path) -> None:
         f"{MARIGOLD}:MarigoldIntrinsics?folder={appearance}&steps=1",
         f"{MARIGOLD}:MarigoldIntrinsics?folder={lighting}&steps=1",
         f"{MARIGOLD}:MarigoldNormals?folder={normals}&steps=1",
-        f"unirender_evaluation.adapters_rgbx:RgbToX?folder={rgbx}&steps=1&resolution=0",
+        f"unirender_evaluation.adapters.rgbx:RgbToX?folder={rgbx}&steps=1&resolution=0",
     ]
     suite = make_suite(tmp_path / "suite", objects=1, per_scene=1)
     rows, scenes = plugin_rows([named_plugin(spec) for spec in specs]), list(suite.scenes)

@@ -18,8 +18,8 @@ from tiny_adapter_folders import ANSWER, APPEARANCE, SCHEDULE, SIZE, TRAILING, o
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_evaluation.adapters_conditioned import ConditionedDiffusion, fit
-from unirender_evaluation.adapters_rgbx import PROMPTS, RgbToX
+from unirender_evaluation.adapters.conditioned import ConditionedDiffusion, fit
+from unirender_evaluation.adapters.rgbx import PROMPTS, RgbToX
 
 
 @pytest.fixture(scope="module")

@@ -13,17 +13,17 @@ from rich.progress import Progress
 from tiny_suites import make_suite, write_suite
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows
-from unirender_evaluation.benchmark import _work, prepare
 from unirender_evaluation.bounds import CEILING_KEY
-from unirender_evaluation.cluster_run import AHEAD, Order, cluster_scene, run_on_cluster
 from unirender_evaluation.records import Record
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.runs.benchmark import _work, prepare
+from unirender_evaluation.runs.cluster import AHEAD, Order, cluster_scene, run_on_cluster
+from unirender_evaluation.runs.command import BenchRun
+from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows
+from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.store import Job, Store
 from unirender_evaluation.subsets import Subsets
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.versions import Versions
-from unirender_evaluation.workers import Run
 from unirender_reference import cluster
 
 SMALL = Subsets(sample=0, optimise=0, views=0, shade=1, physics=1, mitsuba=0)

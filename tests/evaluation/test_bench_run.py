@@ -17,16 +17,16 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
-from unirender_evaluation.bench_config import BenchConfig, anywhere, build_rows, load_pipeline
-from unirender_evaluation.benchmark import run
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import ALL_VARIANTS
-from unirender_evaluation.prediction_check import PredictionError
+from unirender_evaluation.predictions.check import PredictionError
 from unirender_evaluation.rows import make_row, trivial_rows
-from unirender_evaluation.run_command import BenchRun
-from unirender_evaluation.suites import Suite, load_suite
+from unirender_evaluation.runs.benchmark import run
+from unirender_evaluation.runs.command import BenchRun
+from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows, load_pipeline
+from unirender_evaluation.suites.suite import Suite, load_suite
 from unirender_evaluation.tasks import scene_ids, tasks
-from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.truth.check import chosen_scenes
 from unirender_evaluation.verdict import ceiling_breaches
 
 

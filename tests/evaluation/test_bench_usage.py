@@ -14,12 +14,12 @@ from tiny_suites import write_suite
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
-from unirender_evaluation.bench_config import BenchConfig, build_rows
-from unirender_evaluation.benchmark import run
 from unirender_evaluation.metrics import chosen_variants
-from unirender_evaluation.run_command import BenchRun, print_verdict
+from unirender_evaluation.runs.benchmark import run
+from unirender_evaluation.runs.command import BenchRun, print_verdict
+from unirender_evaluation.runs.config import BenchConfig, build_rows
 from unirender_evaluation.subsets import STANDARD
-from unirender_evaluation.truth import make_truth
+from unirender_evaluation.truth.make import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 
 
@@ -159,7 +159,7 @@ def test_every_option_of_a_run_reaches_it(tmp_path: Path, monkeypatch: pytest.Mo
         found.append(config)
         raise UnirenderError("far enough")
 
-    monkeypatch.setattr("unirender_evaluation.benchmark.run", stop)
+    monkeypatch.setattr("unirender_evaluation.runs.benchmark.run", stop)
     given: dict[str, Any] = {"suite": "standard", "out": tmp_path, "checkpoint": tmp_path / "c", "methods": ("ours",)}
     given |= {"method": ("m:A",), "limit": 3, "seed": 5, "check_scenes": 2, "check_seed": 9, "recheck": True}
     given |= {"device": "mps"}

@@ -24,26 +24,26 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
-from unirender_evaluation.bench_config import BenchConfig
-from unirender_evaluation.benchmark import _work
-from unirender_evaluation.composite_methods import Composite
-from unirender_evaluation.dry_run import planned
 from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
+from unirender_evaluation.methods.composite import Composite
+from unirender_evaluation.methods.trivial import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.metrics import OWN_MASK
-from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.protocol import doubts, mask_source
 from unirender_evaluation.records import Record, read_records
+from unirender_evaluation.report.pictures import Pictures
 from unirender_evaluation.rows import Row, make_row, prediction_rows, trivial_rows
+from unirender_evaluation.runs.benchmark import _work
+from unirender_evaluation.runs.config import BenchConfig
+from unirender_evaluation.runs.dry_run import planned
+from unirender_evaluation.runs.workers import Run, run_in_workers
 from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.tables.protocol import doubts, mask_source
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.trivial_methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
-from unirender_evaluation.workers import Run, run_in_workers
 
 NO_MITSUBA = Subsets(mitsuba=0)
 TEST_VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
@@ -209,7 +209,7 @@ def test_jobs_of_one_scene_at_a_time_are_in_memory(
     store = Store.open(tmp_path / "records.jsonl")
     _work(run, config, store, Progress(disable=True))
     assert len(store.used) == 2 * len(scenes)
-    monkeypatch.setattr("unirender_evaluation.dry_run.prepare", lambda _: run)
+    monkeypatch.setattr("unirender_evaluation.runs.dry_run.prepare", lambda _: run)
     assert sum(row.missing for row in planned(replace(config, methods=())).rows) == 2 * len(scenes)
     assert len(run.made) == 3 * 2 * len(scenes)
     assert run.most <= 1
@@ -244,7 +244,7 @@ def test_a_cluster_gets_what_is_missing_most_first(
         store.lay_by(job.make())
     given: list[dict[str, frozenset[str]]] = []
     monkeypatch.setattr(
-        "unirender_evaluation.benchmark.run_on_cluster",
+        "unirender_evaluation.runs.benchmark.run_on_cluster",
         lambda _run, _build, _suite, wanted, _: given.append(wanted) or (records for records in ()),
     )
     _work(run, BenchConfig(out=tmp_path / "run", cluster="tcp://nowhere:1"), store, Progress(disable=True))

@@ -9,7 +9,7 @@ from tiny_suites import write_suite
 from unirender_evaluation import lpips, metrics
 from unirender_evaluation.crosscheck import OFFICIAL, Agreement, agreements, random_pairs, real_pairs
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 
 PAIRS = list(random_pairs(2, seed=3))
 

@@ -8,10 +8,10 @@ from rich.console import Console
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.bench_config import BenchConfig
-from unirender_evaluation.benchmark import prepare
-from unirender_evaluation.dry_run import PlannedRow, planned, print_plan
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.runs.benchmark import prepare
+from unirender_evaluation.runs.command import BenchRun
+from unirender_evaluation.runs.config import BenchConfig
+from unirender_evaluation.runs.dry_run import PlannedRow, planned, print_plan
 from unirender_evaluation.store import Job, Store
 
 METHOD = """

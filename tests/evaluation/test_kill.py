@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from unirender_evaluation.records import read_records, read_run
-from unirender_evaluation.suites import load_suite
-from unirender_evaluation.table_formats import to_markdown
+from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import build_tables
+from unirender_evaluation.tables.build import build_tables
+from unirender_evaluation.tables.formats import to_markdown
 from unirender_evaluation.tasks import scene_ids
-from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.truth.check import chosen_scenes
 
 FILES = ("tables.md", "tables.tex", "tables.json", "verdict.txt")
 KILLED_AT = 25  # records on disk

@@ -16,17 +16,17 @@ from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
 from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, ball_values, balls
-from unirender_evaluation.light_methods import MeanLight, UniformLight
 from unirender_evaluation.light_statistics import light_means, light_statistics, write_statistics
+from unirender_evaluation.methods.light import MeanLight, UniformLight
+from unirender_evaluation.methods.mitsuba import mitsuba_jobs
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.mitsuba_method import mitsuba_jobs
-from unirender_evaluation.prediction_check import PredictionError, check_predictions
-from unirender_evaluation.predictions import PredictionFolder
+from unirender_evaluation.predictions.check import PredictionError, check_predictions
+from unirender_evaluation.predictions.folder import PredictionFolder
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.rows import make_row, prediction_rows, trivial_rows
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import build_table
+from unirender_evaluation.tables.build import build_table
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.verdict import findings

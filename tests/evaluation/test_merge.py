@@ -7,12 +7,12 @@ import pytest
 from small_results import METHODS, small_results
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.merge import check_comparable, differences, merge, obstacles
 from unirender_evaluation.metrics import OWN_MASK, metric_key
-from unirender_evaluation.protocol import doubts
-from unirender_evaluation.results_data import Results
-from unirender_evaluation.table_formats import to_markdown
-from unirender_evaluation.tables import Table, build_tables
+from unirender_evaluation.results.data import Results
+from unirender_evaluation.results.merge import check_comparable, differences, merge, obstacles
+from unirender_evaluation.tables.build import Table, build_tables
+from unirender_evaluation.tables.formats import to_markdown
+from unirender_evaluation.tables.protocol import doubts
 
 
 def tables(*files: Results) -> list[Table]:

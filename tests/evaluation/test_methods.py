@@ -12,19 +12,11 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation import methods
 from unirender_evaluation.claims import SHADOWED
-from unirender_evaluation.composite_methods import Composite, CompositeOf, SplitSum
 from unirender_evaluation.engine import Prediction, answer, method_jobs, score
-from unirender_evaluation.physics.rows import _record
-from unirender_evaluation.physics.stage import Stage
-from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
-from unirender_evaluation.suites import Suite
-from unirender_evaluation.task import PROTOCOLS
-from unirender_evaluation.tasks import tasks
-from unirender_evaluation.training_statistics import training_statistics
-from unirender_evaluation.trivial_methods import (
+from unirender_evaluation.methods import method as methods
+from unirender_evaluation.methods.composite import Composite, CompositeOf, SplitSum
+from unirender_evaluation.methods.trivial import (
     ConstantMaterial,
     InputAsAlbedo,
     MeanAlbedo,
@@ -32,6 +24,14 @@ from unirender_evaluation.trivial_methods import (
     SphereNormal,
     UneditedInput,
 )
+from unirender_evaluation.physics.rows import _record
+from unirender_evaluation.physics.stage import Stage
+from unirender_evaluation.report.pictures import Pictures
+from unirender_evaluation.rows import check_rows, make_row, slug, trivial_rows
+from unirender_evaluation.suites.suite import Suite
+from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.tasks import tasks
+from unirender_evaluation.training_statistics import training_statistics
 from unirender_evaluation.versions import LPIPS, Versions
 
 
@@ -258,7 +258,7 @@ def test_answer_asks_only_for_what_a_method_can(suite: Suite) -> None:
 
 
 def test_predictions_folder_is_needed(tmp_path: Path) -> None:
-    from unirender_evaluation.predictions import PredictionFolder
+    from unirender_evaluation.predictions.folder import PredictionFolder
 
     with pytest.raises(UnirenderError, match="has no subfolders, expected one per picture"):
         PredictionFolder(tmp_path)

@@ -7,11 +7,11 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender_evaluation.engine import score
-from unirender_evaluation.mitsuba_method import MITSUBA, MitsubaScene, mitsuba_jobs, prediction
+from unirender_evaluation.methods.mitsuba import MITSUBA, MitsubaScene, mitsuba_jobs, prediction
 from unirender_evaluation.physics import rows as physics_rows
 from unirender_evaluation.physics.stage import Stage
-from unirender_evaluation.suites import Scene, Suite, load_suite
-from unirender_evaluation.tables import RANKED_KINDS
+from unirender_evaluation.suites.suite import Scene, Suite, load_suite
+from unirender_evaluation.tables.build import RANKED_KINDS
 from unirender_evaluation.tasks import tasks
 
 SCENE = "test-000015_l1"  # its truth took the fewest samples

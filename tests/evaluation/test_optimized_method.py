@@ -11,16 +11,16 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.decompositions import KEPT
 from unirender_evaluation.engine import answer
-from unirender_evaluation.methods import quantise, seen_linear
+from unirender_evaluation.methods.decompositions import KEPT
+from unirender_evaluation.methods.method import quantise, seen_linear
+from unirender_evaluation.methods.optimized import OptimizedMethod
+from unirender_evaluation.methods.optimized_rows import optimized_rows
 from unirender_evaluation.metrics import psnr
-from unirender_evaluation.optimized_method import OptimizedMethod
-from unirender_evaluation.optimized_rows import optimized_rows
 from unirender_evaluation.rows import make_row
-from unirender_evaluation.suite_objects import GREY
-from unirender_evaluation.suite_spec import read_spec
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.objects import GREY
+from unirender_evaluation.suites.spec import read_spec
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.tasks import tasks
 from unirender_reference.optimize.single_config import SingleConfig
 from unirender_reference.render import Renderer

@@ -10,10 +10,10 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import environment_directions
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.pictures import Pictures, chosen_places, question, ranking
 from unirender_evaluation.records import Record
-from unirender_evaluation.report_samples import make_sheets
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.report.pictures import Pictures, chosen_places, question, ranking
+from unirender_evaluation.report.samples import make_sheets
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 

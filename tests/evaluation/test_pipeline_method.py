@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from unirender.camera import Camera
-from unirender_evaluation.decompositions import KEPT, Decompositions
-from unirender_evaluation.pipeline_method import PipelineMethod
+from unirender_evaluation.methods.decompositions import KEPT, Decompositions
+from unirender_evaluation.methods.pipeline import PipelineMethod
 
 
 class Counting:

@@ -12,9 +12,10 @@ import pytest
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation import engine, kept_defaults
-from unirender_evaluation.plugin_source import source_sha256
-from unirender_evaluation.plugins import installed_plugins, named_plugin
+from unirender_evaluation import engine
+from unirender_evaluation.methods import kept_defaults
+from unirender_evaluation.methods.plugin_source import source_sha256
+from unirender_evaluation.methods.plugins import installed_plugins, named_plugin
 from unirender_evaluation.rows import plugin_rows
 from unirender_reference.backend import LLVM_VARIABLE, find_llvm, mitsuba
 

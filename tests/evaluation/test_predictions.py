@@ -20,12 +20,12 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
-from unirender_evaluation.conventions import Conventions, read_conventions
 from unirender_evaluation.export import export_inputs
-from unirender_evaluation.png import read_png
-from unirender_evaluation.prediction_check import PredictionError, check_predictions
+from unirender_evaluation.predictions.check import PredictionError, check_predictions
+from unirender_evaluation.predictions.conventions import Conventions, read_conventions
+from unirender_evaluation.predictions.png import read_png
 from unirender_evaluation.rows import make_row, prediction_rows
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import tasks
 

@@ -11,11 +11,11 @@ from safetensors.numpy import save_file
 
 from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
-from unirender_evaluation import readme
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
+from unirender_evaluation.results import readme
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import build_tables
+from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.task import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
@@ -181,11 +181,13 @@ def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: st
     _, _, checkpoint = suite.partition("-")
     # In a process of its own: the checks of every call that tests run under take ten times as long as the work.
     options = ["--stored", str(tmp_path), *(["--of", checkpoint] if checkpoint else ["--readme", str(target)])]
-    subprocess.run([sys.executable, "-m", "unirender_evaluation.readme", str(STORED / suite), *options], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "unirender_evaluation.results.readme", str(STORED / suite), *options], check=True
+    )
     folders = STORED / suite, tmp_path / suite
     committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
     again = (
-        "make them again: python -m unirender_evaluation.readme evaluation/results/SUITE --readme README.md "
+        "make them again: python -m unirender_evaluation.results.readme evaluation/results/SUITE --readme README.md "
         "--stored evaluation/results (SUITE-CHECKPOINT: --of CHECKPOINT instead of --readme)"
     )
     assert committed == made, again

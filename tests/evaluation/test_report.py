@@ -17,7 +17,9 @@ from tiny_suites import make_suite
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import Prediction
-from unirender_evaluation.gallery import (
+from unirender_evaluation.metrics import METRICS, Variant, metric_key
+from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
+from unirender_evaluation.report.gallery import (
     BYTES_PER_PIXEL,
     GALLERY_BYTES,
     data_uri,
@@ -30,15 +32,13 @@ from unirender_evaluation.gallery import (
     shown_width,
     shrink_covered,
 )
-from unirender_evaluation.metrics import METRICS, Variant, metric_key
-from unirender_evaluation.pictures import Pictures
-from unirender_evaluation.records import MethodInfo, Record, write_records, write_run
-from unirender_evaluation.report import write_report
-from unirender_evaluation.report_plots import Scale, heading, strip_plots, tiles
-from unirender_evaluation.report_run import leading_row, rebuild, report_run
-from unirender_evaluation.report_samples import make_sheets
+from unirender_evaluation.report.page import write_report
+from unirender_evaluation.report.pictures import Pictures
+from unirender_evaluation.report.plots import Scale, heading, strip_plots, tiles
+from unirender_evaluation.report.samples import make_sheets
+from unirender_evaluation.runs.report import leading_row, rebuild, report_run
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import build_tables
+from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.tasks import tasks
 
 

@@ -10,10 +10,10 @@ from small_results import HASH, small_document, small_results, written
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
-from unirender_evaluation.bench_config import GROUPS
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
-from unirender_evaluation.results_compare import Rank, chosen_pairs, compare_pair, rank
-from unirender_evaluation.results_listing import LISTINGS, METHOD_GROUPS
+from unirender_evaluation.results.compare import Rank, chosen_pairs, compare_pair, rank
+from unirender_evaluation.results.listing import LISTINGS, METHOD_GROUPS
+from unirender_evaluation.runs.config import GROUPS
 from unirender_evaluation.statistics import paired_difference
 from unirender_evaluation.table_list import ALL_TABLES
 

@@ -12,10 +12,10 @@ from small_results import RUN, small_document, small_records, small_results, wri
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.records import write_records, write_run
-from unirender_evaluation.results_check import content_problems, remarks
-from unirender_evaluation.results_data import Results, definitions
-from unirender_evaluation.results_file import from_document, read_results, write_results
-from unirender_evaluation.suites import Scene, load_suite, material_key
+from unirender_evaluation.results.check import content_problems, remarks
+from unirender_evaluation.results.data import Results, definitions
+from unirender_evaluation.results.file import from_document, read_results, write_results
+from unirender_evaluation.suites.suite import Scene, load_suite, material_key
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 
 PSNR = "albedo.psnr@masked-srgb-raw"

@@ -7,10 +7,9 @@ from small_results import METHODS, RUN, small_records, small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import SCALES, Variant, metric_key
-from unirender_evaluation.published import published_tables
 from unirender_evaluation.records import Record
-from unirender_evaluation.results_data import Results, definitions
-from unirender_evaluation.results_findings import (
+from unirender_evaluation.results.data import Results, definitions
+from unirender_evaluation.results.findings import (
     NOT_RUN,
     Question,
     against_trivial,
@@ -24,6 +23,7 @@ from unirender_evaluation.results_findings import (
     seconds,
     together,
 )
+from unirender_evaluation.tables.published import published_tables
 
 ALBEDO = ("albedo", "psnr")
 

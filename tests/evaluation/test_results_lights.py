@@ -4,8 +4,8 @@ import pytest
 from small_results import small_results
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results_findings import NOT_RUN, Question
-from unirender_evaluation.results_lights import light_of, over_lights
+from unirender_evaluation.results.findings import NOT_RUN, Question
+from unirender_evaluation.results.lights import light_of, over_lights
 
 LIGHTS = {"ball-0_l0": "sun", "ball-0_l1": "sky", "ball-1_l0": "sky", "ball-1_l1": "lamp", "ball-1_l0_l0": "moon"}
 

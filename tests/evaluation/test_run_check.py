@@ -15,15 +15,15 @@ from rich.progress import Progress
 from tiny_suites import make_suite
 
 from unirender_evaluation.bounds import REFERENCE_KEY
-from unirender_evaluation.mitsuba_method import MITSUBA
+from unirender_evaluation.methods.mitsuba import MITSUBA
 from unirender_evaluation.records import RunInfo
-from unirender_evaluation.run_check import CheckRequest, draw_seed, read_check, reference_row, run_check
+from unirender_evaluation.runs.truth_check import CheckRequest, draw_seed, read_check, reference_row, run_check
+from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.store import Store
-from unirender_evaluation.suites import Suite
-from unirender_evaluation.truth_check import chosen_scenes
+from unirender_evaluation.suites.suite import Suite
+from unirender_evaluation.truth.check import chosen_scenes
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
-from unirender_evaluation.workers import Run
 
 VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
 

@@ -8,9 +8,10 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.methods.trivial import UneditedInput
 from unirender_evaluation.records import Record, append_record, write_records
 from unirender_evaluation.rows import make_row, prediction_rows
-from unirender_evaluation.run_folder import (
+from unirender_evaluation.runs.folder import (
     missing_answers,
     say_missing,
     say_rows_without_values,
@@ -19,7 +20,6 @@ from unirender_evaluation.run_folder import (
     writing_run,
 )
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.trivial_methods import UneditedInput
 
 
 def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:

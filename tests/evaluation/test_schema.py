@@ -12,13 +12,13 @@ import pytest
 from small_results import small_document
 
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.schema import json_schema, schema_text, shipped_schema_path
-from unirender_evaluation.schema_check import schema_problems
+from unirender_evaluation.results.schema import json_schema, schema_text, shipped_schema_path
+from unirender_evaluation.results.schema_check import schema_problems
 
 
 def test_the_shipped_schema_is_the_codes() -> None:
     shipped = shipped_schema_path().read_text(encoding="utf-8")
-    assert shipped == schema_text(), "run python -m unirender_evaluation.schema"
+    assert shipped == schema_text(), "run python -m unirender_evaluation.results.schema"
     jsonschema.Draft202012Validator.check_schema(json.loads(shipped))
 
 

@@ -11,11 +11,11 @@ from unirender.intrinsics import Intrinsics
 from unirender.lighting import texel_solid_angles
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import load
+from unirender_evaluation.methods.plausible import facing_away, picture_doubt, range_doubt
+from unirender_evaluation.methods.suspicions import decoding_gain, suspicions, turning_gain
 from unirender_evaluation.metrics import FACING_AWAY, LOG_EPSILON, OWN_MASK, SCALES, TURNED, metric_key
-from unirender_evaluation.plausible import facing_away, picture_doubt, range_doubt
 from unirender_evaluation.scoring import MATERIALS, score_colour, score_image, score_maps
-from unirender_evaluation.suites import Scene
-from unirender_evaluation.suspicions import decoding_gain, suspicions, turning_gain
+from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.task import Asked, Task
 
 SIZE = 32

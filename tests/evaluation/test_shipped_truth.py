@@ -13,17 +13,13 @@ import pytest
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UsageError
 from unirender_evaluation.bounds import ceiling_values
-from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
 from unirender_evaluation.metrics import psnr
-from unirender_evaluation.suite_home import definition, found_spec, shared
-from unirender_evaluation.suite_lights import assign_lights, light_sources
-from unirender_evaluation.suite_objects import suite_sources
-from unirender_evaluation.suite_spec import read_spec
-from unirender_evaluation.suites import Suite, load_suite
-from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth import quality_summary
-from unirender_evaluation.truth_check import _check_image, check_truth, chosen_scenes, member_test, scenes_here
-from unirender_evaluation.truth_file import (
+from unirender_evaluation.suites.home import definition, found_spec, shared
+from unirender_evaluation.suites.lights import assign_lights, light_sources
+from unirender_evaluation.suites.objects import suite_sources
+from unirender_evaluation.suites.spec import read_spec
+from unirender_evaluation.suites.suite import Suite, load_suite
+from unirender_evaluation.suites.truth_file import (
     CEILING,
     PREFIX,
     diffuse_member,
@@ -34,7 +30,11 @@ from unirender_evaluation.truth_file import (
     shared_member,
     specular_member,
 )
-from unirender_evaluation.truth_render import stored_ceiling_db
+from unirender_evaluation.tasks import tasks
+from unirender_evaluation.truth.check import _check_image, check_truth, chosen_scenes, member_test, scenes_here
+from unirender_evaluation.truth.geometry import compare_geometry, twin_geometry
+from unirender_evaluation.truth.make import quality_summary
+from unirender_evaluation.truth.render import stored_ceiling_db
 from unirender_reference.render import shared_scene_hash
 
 COUNTS_OF_STANDARD = {"image": 1186, "specular": 600, "diffuse": 200}

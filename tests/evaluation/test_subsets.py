@@ -6,17 +6,17 @@ from pathlib import Path
 import pytest
 from tiny_suites import make_suite
 
-from unirender_evaluation.bench_config import BenchConfig, build_rows
-from unirender_evaluation.optimized_rows import optimized_rows
+from unirender_evaluation.methods.optimized_rows import optimized_rows
 from unirender_evaluation.physics.rows import physics_scenes
 from unirender_evaluation.rows import Row
-from unirender_evaluation.run_command import BenchRun
+from unirender_evaluation.runs.command import BenchRun
+from unirender_evaluation.runs.config import BenchConfig, build_rows
+from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets, partial
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
-from unirender_evaluation.workers import Run
 
 VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
 SLOW = ("ours-sample", "shade-true-maps")

@@ -16,21 +16,22 @@ from tiny_suites import write_suite
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.whole_files import file_sha256
-from unirender_evaluation import results_check, suite_home
 from unirender_evaluation.lpips import SMALLEST
-from unirender_evaluation.results_listing import suites as listed_suites
-from unirender_evaluation.stratification import constant_mse
-from unirender_evaluation.suite_check import LEAST
-from unirender_evaluation.suite_definition import DEFINITION, check_definition
-from unirender_evaluation.suite_definition import recorded as recorded_values
-from unirender_evaluation.suite_home import definition, found_spec, home, target, truth_command, with_folder
-from unirender_evaluation.suite_lights import SuiteLight, assign_lights, light_sources, load_lights
-from unirender_evaluation.suite_objects import broken_meshes, scene_object, suite_sources
-from unirender_evaluation.suite_spec import SuiteSpec, parse_spec, read_spec, suite_path
-from unirender_evaluation.suites import Suite, load_suite
-from unirender_evaluation.truth import make_truth
-from unirender_evaluation.truth_file import list_tar, write_tar
-from unirender_evaluation.truth_files import check_files
+from unirender_evaluation.results import check as results_check
+from unirender_evaluation.results.listing import suites as listed_suites
+from unirender_evaluation.suites import home as suite_home
+from unirender_evaluation.suites.check import LEAST
+from unirender_evaluation.suites.definition import DEFINITION, check_definition
+from unirender_evaluation.suites.definition import recorded as recorded_values
+from unirender_evaluation.suites.home import definition, found_spec, home, target, truth_command, with_folder
+from unirender_evaluation.suites.lights import SuiteLight, assign_lights, light_sources, load_lights
+from unirender_evaluation.suites.objects import broken_meshes, scene_object, suite_sources
+from unirender_evaluation.suites.spec import SuiteSpec, parse_spec, read_spec, suite_path
+from unirender_evaluation.suites.stratification import constant_mse
+from unirender_evaluation.suites.suite import Suite, load_suite
+from unirender_evaluation.suites.truth_file import list_tar, write_tar
+from unirender_evaluation.truth.make import make_truth
+from unirender_evaluation.truth.sources import check_files
 from unirender_reference.mesh_folder import MeshFile, mesh_folder
 from unirender_reference.recipe import read_recipe
 

@@ -9,9 +9,9 @@ from tiny_suites import make_suite, write_suite
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_evaluation.stratification import constant_mse, level_counts, stratified_materials
-from unirender_evaluation.suite_spec import read_spec, suite_path
-from unirender_evaluation.suites import (
+from unirender_evaluation.suites.spec import read_spec, suite_path
+from unirender_evaluation.suites.stratification import constant_mse, level_counts, stratified_materials
+from unirender_evaluation.suites.suite import (
     load_suite,
     material_key,
 )

@@ -16,16 +16,16 @@ from rich.console import Console
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, compare, verdicts
 from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_variants, metric_key
-from unirender_evaluation.protocol import mask_source
-from unirender_evaluation.published import check_name, published_tables
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.specs import TABLES, Column, TableSpec
 from unirender_evaluation.statistics import UNPRINTED
-from unirender_evaluation.table_formats import format_number, print_table, to_json, to_markdown
-from unirender_evaluation.table_latex import to_latex
-from unirender_evaluation.table_notes import NAMED
-from unirender_evaluation.table_text import TextTable, markdown_row, plain_paragraph
-from unirender_evaluation.tables import Cell, Row, Table, build_table, build_tables
+from unirender_evaluation.tables.build import Cell, Row, Table, build_table, build_tables
+from unirender_evaluation.tables.formats import format_number, print_table, to_json, to_markdown
+from unirender_evaluation.tables.latex import to_latex
+from unirender_evaluation.tables.notes import NAMED
+from unirender_evaluation.tables.protocol import mask_source
+from unirender_evaluation.tables.published import check_name, published_tables
+from unirender_evaluation.tables.specs import TABLES, Column, TableSpec
+from unirender_evaluation.tables.text import TextTable, markdown_row, plain_paragraph
 
 METHODS = (
     MethodInfo("ours", "Ours (mean)", "ours", "Ours", 1, 1, 0),

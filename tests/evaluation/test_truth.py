@@ -15,18 +15,25 @@ from tiny_suites import make_suite
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
 from unirender.whole_files import file_sha256
-from unirender_evaluation.ceiling import noise_ceiling, similarity_ceiling
+from unirender_evaluation.methods.ceiling import noise_ceiling, similarity_ceiling
 from unirender_evaluation.scoring import score_colour, score_image
-from unirender_evaluation.suite_definition import recorded
-from unirender_evaluation.suite_home import target
-from unirender_evaluation.suite_lights import assign_lights, light_sources, load_lights
-from unirender_evaluation.suite_objects import scene_object, suite_sources
-from unirender_evaluation.suite_spec import read_spec, suite_path
-from unirender_evaluation.suites import Suite, load_suite
-from unirender_evaluation.truth import make_truth, quality_summary, with_sha256
-from unirender_evaluation.truth_file import CEILING, PREFIX, Kind, estimate_channels, estimate_mean, estimate_variance
-from unirender_evaluation.truth_object import ObjectJob, object_hash, render_object
-from unirender_evaluation.truth_render import good_spp, render_to_ceiling, stored_ceiling_db
+from unirender_evaluation.suites.definition import recorded
+from unirender_evaluation.suites.home import target
+from unirender_evaluation.suites.lights import assign_lights, light_sources, load_lights
+from unirender_evaluation.suites.objects import scene_object, suite_sources
+from unirender_evaluation.suites.spec import read_spec, suite_path
+from unirender_evaluation.suites.suite import Suite, load_suite
+from unirender_evaluation.suites.truth_file import (
+    CEILING,
+    PREFIX,
+    Kind,
+    estimate_channels,
+    estimate_mean,
+    estimate_variance,
+)
+from unirender_evaluation.truth.make import make_truth, quality_summary, with_sha256
+from unirender_evaluation.truth.object import ObjectJob, object_hash, render_object
+from unirender_evaluation.truth.render import good_spp, render_to_ceiling, stored_ceiling_db
 from unirender_reference.noise import noise_floor_db
 from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
 

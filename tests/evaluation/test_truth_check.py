@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.geometry_check import compare_geometry, twin_geometry
-from unirender_evaluation.truth_check import Check, TruthCheck, look_twice, twin_roughness
+from unirender_evaluation.truth.check import Check, TruthCheck, look_twice, twin_roughness
+from unirender_evaluation.truth.geometry import compare_geometry, twin_geometry
 
 
 def flat(albedo: float, normal: tuple[float, float, float] = (0, 0, 1), coverage: float = 1.0) -> Intrinsics:

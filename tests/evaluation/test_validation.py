@@ -10,7 +10,7 @@ from tiny_suites import write_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.scoring import score_maps
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.validation import SCORES, suite_validation
 

@@ -7,7 +7,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender_evaluation import lpips
-from unirender_evaluation.bench_config import BenchConfig, build_rows
+from unirender_evaluation.runs.config import BenchConfig, build_rows
 from unirender_evaluation.versions import (
     LPIPS,
     MODEL,
@@ -60,20 +60,21 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
     ("part", "package", "files"),
     [
         ("core", "unirender", ("composite.py", "environment_brdf.npy", "lighting.py", "symmetries.py")),
-        ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "methods.py", "tasks.py", "predictions.py")),
+        ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "tasks.py", "tables/specs.py")),
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
         (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
-        (OPTIMIZER, "unirender_evaluation", ("optimized_method.py",)),
+        (OPTIMIZER, "unirender_evaluation", ("methods/optimized.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
         ("core", "unirender_evaluation", ("physics/formulas.py", "physics/rows.py", "records.py")),
         (
             "core",
             "unirender_evaluation",
-            ("light_balls.py", "light_methods.py", "light_metrics.py", "trivial_methods.py", "composite_methods.py"),
+            ("light_balls.py", "light_metrics.py", "methods/light.py", "methods/trivial.py", "methods/composite.py"),
         ),
+        ("core", "unirender_evaluation", ("methods/method.py", "predictions/folder.py", "suites/suite.py")),
         ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
     ],
 )
@@ -87,7 +88,7 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender_evaluation", ("optimized_method.py", "light_tables.py")),
+        ("core", "unirender_evaluation", ("methods/optimized.py",)),
         (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
         (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
     ],
@@ -100,16 +101,19 @@ def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str
 @pytest.mark.parametrize(
     "name",
     [
-        *("__init__", "schema", "schema_check", "merge", "score_api", "commands", "results_commands", "results_check"),
-        *("crosscheck", "report_pages"),
-        *("table_list", "suite_check", "suite_home", "suite_lights"),
+        *("__init__", "commands", "crosscheck", "methods/__init__", "runs/command", "score_api", "statistics"),
+        *("report/page", "results/check", "results/commands", "results/merge", "results/schema", "runs/report"),
+        *("suites/check", "suites/home", "suites/lights", "table_list", "tables/lights", "truth/commands"),
+        "truth/make",
     ],
 )
 def test_what_no_value_depends_on_is_in_no_key(name: str) -> None:
-    path = f"unirender_evaluation/{name}.py"
-    assert any(fnmatch(path, pattern) for pattern in PARTS["core"].without)
-    patterns = [p for part in PARTS.values() for p in part.files.get("unirender_evaluation", ()) if p != "*.py"]
-    assert not [pattern for pattern in patterns if fnmatch(f"{name}.py", pattern)]
+    root = package_folder("unirender_evaluation")
+    path = root / f"{name}.py"
+    assert path.is_file()
+    for part in PARTS.values():
+        read = {found for pattern in part.files.get("unirender_evaluation", ()) for found in root.glob(pattern)}
+        assert path not in read or any(fnmatch(f"unirender_evaluation/{name}.py", left) for left in part.without)
 
 
 def test_packages_beside_the_benchmark_are_in_no_key() -> None:
@@ -120,8 +124,8 @@ def test_packages_beside_the_benchmark_are_in_no_key() -> None:
         if (patterns := part.files.get("unirender_evaluation"))
     }
     assert folders.pop(MULTIVIEW) == {"multiview"}
-    assert folders.pop("core") == {".", "physics"}
-    assert set().union(*folders.values()) == {"."}
+    assert folders.pop("core") == {".", "methods", "physics", "predictions", "runs", "suites", "tables", "truth"}
+    assert set().union(*folders.values()) == {"adapters", "methods"}
 
 
 def test_a_study_whose_modules_were_moved_does_not_go_on_without_them() -> None:
@@ -149,13 +153,17 @@ def test_a_record_follows_the_weights_and_not_where_they_lie() -> None:
         assert one.config != other.config
 
 
-@pytest.mark.parametrize(("name", "part"), [("adapters_marigold", MODEL), ("mitsuba_method", REFERENCE)])
+@pytest.mark.parametrize(("name", "part"), [("adapters/marigold", MODEL), ("methods/mitsuba", REFERENCE)])
 def test_a_row_of_other_code_follows_the_part_of_that_code_alone(name: str, part: str) -> None:
+    root = package_folder("unirender_evaluation")
+    path = root / f"{name}.py"
     owners = [
-        key for key, p in PARTS.items() for q in p.files.get("unirender_evaluation", ()) if fnmatch(f"{name}.py", q)
+        key
+        for key, p in PARTS.items()
+        if any(path in root.glob(pattern) for pattern in p.files.get("unirender_evaluation", ()))
+        and not any(fnmatch(f"unirender_evaluation/{name}.py", pattern) for pattern in p.without)
     ]
-    assert owners == ["core", part]
-    assert any(fnmatch(f"unirender_evaluation/{name}.py", pattern) for pattern in PARTS["core"].without)
+    assert owners == [part]
 
 
 def test_a_record_follows_the_parts_that_its_row_uses() -> None:

@@ -20,14 +20,14 @@ from tiny_suites import write_suite
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_evaluation import workers
 from unirender_evaluation.figures.grid import Grid, Line, Tile, save
-from unirender_evaluation.pictures import write_sheet
+from unirender_evaluation.methods.trivial import UneditedInput
+from unirender_evaluation.report.pictures import write_sheet
 from unirender_evaluation.rows import make_row
-from unirender_evaluation.suites import load_suite
-from unirender_evaluation.trivial_methods import UneditedInput
+from unirender_evaluation.runs import workers
+from unirender_evaluation.runs.workers import Run
+from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.versions import LPIPS, Versions
-from unirender_evaluation.workers import Run
 
 SECONDS = 120  # to start a worker, and to see it end: a busy machine takes its time
 
@@ -44,9 +44,9 @@ def hold(*_):
 BENCH = """
 from pathlib import Path
 from hold import hold
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.versions import Versions
-from unirender_evaluation.workers import Run, run_in_workers
+from unirender_evaluation.runs.workers import Run, run_in_workers
 
 if __name__ == "__main__":
     suite = load_suite(sys.argv[1])
@@ -56,7 +56,7 @@ if __name__ == "__main__":
 TRUTH = """
 from pathlib import Path
 from hold import hold
-from unirender_evaluation import truth
+from unirender_evaluation.truth import make as truth
 
 if __name__ == "__main__":
     truth.render_object = hold

@@ -16,7 +16,7 @@ from inline_executor import Inline
 from PIL import Image
 
 from unirender.training.groups import read_groups
-from unirender_evaluation.conventions import read_conventions
+from unirender_evaluation.predictions.conventions import read_conventions
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw
 from unirender_reference.dataset import generate

@@ -23,8 +23,8 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.training.groups import read_groups
 from unirender.visualization import write_png
 from unirender_evaluation.export import export_inputs
-from unirender_evaluation.prediction_check import folder_problems, questions
-from unirender_evaluation.predictions import PredictionFolder
+from unirender_evaluation.predictions.check import folder_problems, questions
+from unirender_evaluation.predictions.folder import PredictionFolder
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.render import Renderer

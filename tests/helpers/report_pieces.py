@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from unirender_evaluation.gallery import GalleryItem
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.report import write_report
-from unirender_evaluation.report_samples import make_sheets
-from unirender_evaluation.tables import build_tables
+from unirender_evaluation.report.gallery import GalleryItem
+from unirender_evaluation.report.page import write_report
+from unirender_evaluation.report.samples import make_sheets
+from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.task import LIGHT
 
 SIZE = 24

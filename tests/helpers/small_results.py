@@ -7,8 +7,8 @@ from typing import Any
 
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.results_data import Results, definitions
-from unirender_evaluation.results_file import to_document
+from unirender_evaluation.results.data import Results, definitions
+from unirender_evaluation.results.file import to_document
 
 HASH = "0123456789abcdef" * 4
 METHODS = (

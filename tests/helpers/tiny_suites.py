@@ -12,9 +12,9 @@ from unirender.camera import Camera
 from unirender.composite import composite
 from unirender.exr import exr_bytes, image_channels
 from unirender.surface_light import diffuse_light, specular_light
-from unirender_evaluation.suite_spec import read_spec
-from unirender_evaluation.suites import Scene, Suite, SuiteSpec, load_suite
-from unirender_evaluation.truth_file import (
+from unirender_evaluation.suites.spec import read_spec
+from unirender_evaluation.suites.suite import Scene, Suite, SuiteSpec, load_suite
+from unirender_evaluation.suites.truth_file import (
     CEILING,
     diffuse_member,
     estimate_channels,

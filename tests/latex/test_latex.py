@@ -14,15 +14,15 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_info
+from unirender_evaluation.methods.trivial import InputAsAlbedo
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.rows import make_row, trivial_rows
-from unirender_evaluation.table_latex import to_latex
+from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import Table, build_tables
-from unirender_evaluation.trivial_methods import InputAsAlbedo
+from unirender_evaluation.tables.build import Table, build_tables
+from unirender_evaluation.tables.latex import to_latex
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
-from unirender_evaluation.workers import Run
 
 pytestmark = pytest.mark.latex
 

@@ -28,7 +28,7 @@ from unirender.scene_export import export_scene
 from unirender.surface_light import diffuse_light, specular_light
 from unirender_evaluation import read_results, score
 from unirender_evaluation.scoring import score_maps
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.lights import Light, load_light, make_light
 from unirender_reference.meshes import load_mesh
 from unirender_reference.optimize.folder import read_views

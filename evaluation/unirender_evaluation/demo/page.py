@@ -17,7 +17,7 @@ from unirender_evaluation.demo.session import Controls, Environment, Subject
 from unirender_evaluation.demo.uploads import Limits, Upload
 from unirender_evaluation.demo.widgets import INTRODUCTION, NOTHING, OWN, PREDICTED, Edited, Found, Given
 from unirender_evaluation.demo.worker import Worker
-from unirender_evaluation.gallery import data_uri
+from unirender_evaluation.report.gallery import data_uri
 from unirender_reference.lights import bundled_light
 
 DECIMALS = 2  # of the sliders

@@ -11,7 +11,7 @@ from unirender.color import image_srgb
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender_evaluation.demo.session import Check, Subject, View
-from unirender_evaluation.gallery import data_uri, image_picture, map_pictures
+from unirender_evaluation.report.gallery import data_uri, image_picture, map_pictures
 
 LIGHT_SHAPE = (32, 64)  # rows and columns at which lights are shown
 MOST_SPREAD = 0.5  # standard deviation of a material at which it is shown white: it is somewhere between 0 and 1

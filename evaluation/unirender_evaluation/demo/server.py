@@ -17,7 +17,7 @@ from unirender.errors import UnirenderError
 from unirender.pictures import Picture
 from unirender_evaluation.demo.uploads import Limits
 from unirender_evaluation.demo.worker import Worker
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.tasks import picture
 
 # Read by gradio when it is imported, and by what it imports.

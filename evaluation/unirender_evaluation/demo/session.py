@@ -27,8 +27,8 @@ from unirender.pipelines.inputs import as_environment, as_material
 from unirender.pipelines.results import Decomposition
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender_evaluation.gallery import flip_map, image_picture
 from unirender_evaluation.metrics import psnr
+from unirender_evaluation.report.gallery import flip_map, image_picture
 from unirender_reference.shade import shade
 
 SPP = 256  # of Mitsuba's check

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from unirender.pictures import Picture
     from unirender_evaluation.figures.grid import Grid
     from unirender_evaluation.figures.panels import MitsubaTruth, Subject
-    from unirender_evaluation.suites import Scene, Suite
+    from unirender_evaluation.suites.suite import Scene, Suite
 
 Asked = Literal["metallic", "roughness", "relighting", "comparison", "overview", "light"]  # of checkpoints and methods
 Contract = Literal["maps", "camera"]  # of the documentation of the data contract; of nobody
@@ -96,7 +96,7 @@ class Figures:
 
         from unirender_evaluation.figures.grid import Grid, save
         from unirender_evaluation.figures.panels import MitsubaTruth, Subject
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
 
         suite = load_suite(self.suite)
         scenes = [suite.scene(key) for key in self.scenes] or default_scenes(suite)
@@ -174,10 +174,10 @@ class Figures:
         from unirender.options import ModelOptions
         from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
         from unirender_evaluation.figures.panels import Subject
-        from unirender_evaluation.pipeline_method import PipelineMethod
-        from unirender_evaluation.plugins import named_plugin
+        from unirender_evaluation.methods.pipeline import PipelineMethod
+        from unirender_evaluation.methods.plugins import named_plugin
         from unirender_evaluation.rows import make_row, plugin_rows
-        from unirender_evaluation.suite_spec import read_spec
+        from unirender_evaluation.suites.spec import read_spec
 
         found, device = [], str(resolve_device(self.device))
         folders = tuple(map(checkpoint_folder, self.checkpoint))

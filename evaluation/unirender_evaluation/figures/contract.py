@@ -14,7 +14,7 @@ from unirender.color import image_srgb
 from unirender.lighting import environment_directions
 from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import over_white
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,8 +9,8 @@ from unirender_evaluation.figures.grid import Grid, Line, Shown, Tile
 from unirender_evaluation.figures.panels import Subject, able, input_tile
 from unirender_evaluation.light_balls import GLOSSY, ball_mask, ball_values
 from unirender_evaluation.metrics import Variant, metric_key
-from unirender_evaluation.pictures import BALL_PICTURES, BALLS, ball_pictures
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.report.pictures import BALL_PICTURES, BALLS, ball_pictures
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture
 
 SIZE = 96  # pixels of a ball

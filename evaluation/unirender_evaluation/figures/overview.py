@@ -13,8 +13,8 @@ from unirender.lighting import resample_environment
 from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import Grid, Line, Tile, over_white
 from unirender_evaluation.figures.panels import Subject, able, input_tile, picture_over_white
-from unirender_evaluation.methods import Mask
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.methods.method import Mask
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture
 
 MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")

@@ -18,15 +18,15 @@ from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
 from unirender_evaluation.engine import answer, answered, ask
 from unirender_evaluation.figures.grid import Grid, Line, Tile
-from unirender_evaluation.methods import Image, Mask, capabilities
+from unirender_evaluation.methods.method import Image, Mask, capabilities
+from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.mitsuba_method import MitsubaScene
 from unirender_evaluation.rows import Row, evenly
 from unirender_evaluation.scoring import over_white, score_image, score_maps
-from unirender_evaluation.suites import Material, Scene, Suite
+from unirender_evaluation.suites.suite import Material, Scene, Suite
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import picture, tasks
-from unirender_evaluation.truth_render import good_spp, item_seed
+from unirender_evaluation.truth.render import good_spp, item_seed
 
 Truth = Callable[[Scene, Material, Float[np.ndarray, "eh ew 3"]], Image]
 LIGHT_ROWS = 32  # of a light's picture

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from unirender.color import image_srgb
-from unirender_evaluation.gallery import GalleryItem, Picture, image_picture
 from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.multiview.scoring import Looks
 from unirender_evaluation.multiview.settings import STANDARD
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL
-from unirender_evaluation.pictures import SCORES, chosen_places, read_sheet, sheet_key, write_sheet
 from unirender_evaluation.records import Record
-from unirender_evaluation.suites import Suite
-from unirender_evaluation.table_formats import format_number
+from unirender_evaluation.report.gallery import GalleryItem, Picture, image_picture
+from unirender_evaluation.report.pictures import SCORES, chosen_places, read_sheet, sheet_key, write_sheet
+from unirender_evaluation.suites.suite import Suite
+from unirender_evaluation.tables.formats import format_number
 
 TRUTH = "truth"
 CAMERA = 0  # of the held-out ones

@@ -21,7 +21,7 @@ from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL, SEC
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.store import Job
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE
 
 TRIVIAL_USES = frozenset({MULTIVIEW, REFERENCE})

@@ -13,12 +13,12 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import quantise
+from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.rows import evenly
-from unirender_evaluation.suite_objects import bare_mesh, scene_object
-from unirender_evaluation.suites import Material, Scene, Suite
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.suites.objects import bare_mesh, scene_object
+from unirender_evaluation.suites.suite import Material, Scene, Suite
+from unirender_evaluation.truth.render import item_seed
 from unirender_reference.multiview import orbit
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.passes import Estimate

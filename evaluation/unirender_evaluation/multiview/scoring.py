@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.ceiling import noise_ceiling
 from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.lpips import Lpips
+from unirender_evaluation.methods.ceiling import noise_ceiling
 from unirender_evaluation.multiview.scenes import LitPictures, MultiviewScene
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_reference.optimize.solution import Solution

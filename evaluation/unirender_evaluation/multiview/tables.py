@@ -2,7 +2,7 @@
 
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
 from unirender_evaluation.metrics import LOWER, METRICS, Metric
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 PROTOCOL = "known-mesh"
 SECONDS = Metric("seconds", "time", "s", LOWER, 0.0, (), 1, "wall clock of one object, optimisation only")

@@ -29,11 +29,11 @@ from jaxtyping import Float
 from unirender.color import display_slope, luminance, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import Mask, quantise
+from unirender_evaluation.methods.method import Mask, quantise
+from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.metrics import weighted_mean
-from unirender_evaluation.mitsuba_method import MitsubaScene
-from unirender_evaluation.suites import Material
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.suites.suite import Material
+from unirender_evaluation.truth.render import item_seed
 from unirender_reference.noise import full_spp
 from unirender_reference.sweep import QUADRATIC, lagrange_weights
 

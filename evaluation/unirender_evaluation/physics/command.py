@@ -37,15 +37,15 @@ class BenchPhysics:
         check_out(self.out)
         from rich.progress import track
 
-        from unirender_evaluation.bench_config import BenchConfig, build_rows
         from unirender_evaluation.claims import OURS
         from unirender_evaluation.physics.ambiguity import POSTERIOR
         from unirender_evaluation.physics.run import markdown, measure, write
         from unirender_evaluation.physics.stage import SWEEP_SPP, Stage
         from unirender_evaluation.physics.tests import TESTS
         from unirender_evaluation.rows import SAMPLE_STEPS
+        from unirender_evaluation.runs.config import BenchConfig, build_rows
         from unirender_evaluation.statistics import CONFIDENCE, METHOD
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.tasks import scene_ids
         from unirender_evaluation.versions import versions
 

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
 from unirender.symmetries import mirror, quarter_turn, scale_light
-from unirender_evaluation.composite_methods import Composite
-from unirender_evaluation.methods import Image, Mask
+from unirender_evaluation.methods.composite import Composite
+from unirender_evaluation.methods.method import Image, Mask
 from unirender_evaluation.metrics import weighted_mean
 
 Render = Callable[[Intrinsics], Image]

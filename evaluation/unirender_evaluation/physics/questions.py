@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods import Image
+from unirender_evaluation.methods.method import Image
 from unirender_evaluation.metrics import METRICS, metric_key
 from unirender_evaluation.physics import formulas, region
 from unirender_evaluation.physics.ambiguity import Points
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Light, Shader, Stage
-from unirender_evaluation.suites import Material
+from unirender_evaluation.suites.suite import Material
 
 Decompose = Callable[[Stage, Material, Image], Intrinsics]
 Posterior = Callable[[Stage, Material, Image], Points]  # samples of the object's material

@@ -8,15 +8,15 @@ from typing import Any
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import SHADE_SPP, KeyOf
 from unirender_evaluation.engine import NoAnswer, ask, decomposition
+from unirender_evaluation.methods.mitsuba import MITSUBA
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.mitsuba_method import MITSUBA
 from unirender_evaluation.physics.stage import Light, Stage
 from unirender_evaluation.physics.tests import LOSS, PSNR, TESTS, renderer_tests
 from unirender_evaluation.records import MethodInfo, Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.store import Job
-from unirender_evaluation.suite_objects import object_is_here
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.objects import object_is_here
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture, scene_ids
 from unirender_evaluation.versions import REFERENCE
 

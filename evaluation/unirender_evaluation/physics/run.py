@@ -20,8 +20,8 @@ import numpy as np
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
-from unirender_evaluation.composite_methods import Composite
-from unirender_evaluation.methods import Image, quantise
+from unirender_evaluation.methods.composite import Composite
+from unirender_evaluation.methods.method import Image, quantise
 from unirender_evaluation.physics.ambiguity import POSTERIOR, Points, material_point
 from unirender_evaluation.physics.definition import PhysicsTest
 from unirender_evaluation.physics.questions import Posterior, true_maps
@@ -31,10 +31,10 @@ from unirender_evaluation.physics.tracer import PathTracer
 from unirender_evaluation.rows import SAMPLE_STEPS
 from unirender_evaluation.statistics import Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.folder import write_files
-from unirender_evaluation.suites import Material, Scene, Suite, material_key
-from unirender_evaluation.table_formats import estimate_text
-from unirender_evaluation.table_text import markdown_row
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.suites.suite import Material, Scene, Suite, material_key
+from unirender_evaluation.tables.formats import estimate_text
+from unirender_evaluation.tables.text import markdown_row
+from unirender_evaluation.truth.render import item_seed
 
 MITSUBA, SHADE, OURS, COMPOSITE, TWIN = "Mitsuba", "shade (true maps)", "Ours", "composite", "broken twin"
 HEADING = "### What each row scores"

@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import Shade
-from unirender_evaluation.methods import Image, Mask
-from unirender_evaluation.mitsuba_method import MitsubaScene
+from unirender_evaluation.methods.method import Image, Mask
+from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.physics.ambiguity import Explanations
 from unirender_evaluation.physics.formulas import composite_shader
-from unirender_evaluation.suites import Material, Scene, Suite
+from unirender_evaluation.suites.suite import Material, Scene, Suite
 
 Shader = Literal["shade", "composite"]
 Light = Literal["input", "heldout"]

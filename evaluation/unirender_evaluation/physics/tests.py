@@ -18,7 +18,7 @@ from unirender_evaluation.physics.questions import (
     tau,
 )
 from unirender_evaluation.physics.stage import ROUGH, Light, Shader, Stage
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 PSNR = METRICS["psnr"]
 

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.symmetries import mirror, quarter_turn, turn_rotation
-from unirender_evaluation.methods import Image
+from unirender_evaluation.methods.method import Image
 from unirender_evaluation.physics.formulas import changed
 from unirender_evaluation.physics.stage import Stage
-from unirender_evaluation.truth_render import good_spp, item_seed
+from unirender_evaluation.truth.render import good_spp, item_seed
 from unirender_reference.shapes import MeshObject
 
 MIRROR_DEPTH = 64  # light that is reflected once more in a perfect mirror is not lost

@@ -3,12 +3,12 @@
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.composite_methods import Composite
-from unirender_evaluation.methods import Image
+from unirender_evaluation.methods.composite import Composite
+from unirender_evaluation.methods.method import Image
 from unirender_evaluation.physics.ambiguity import POSTERIOR, Points
 from unirender_evaluation.physics.stage import Stage
-from unirender_evaluation.suites import Material
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.suites.suite import Material
+from unirender_evaluation.truth.render import item_seed
 
 _PERFECT = Composite().render
 

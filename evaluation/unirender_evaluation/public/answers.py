@@ -17,8 +17,8 @@ from unirender.errors import UnirenderError
 from unirender.exr import read_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.engine import answered, ask
-from unirender_evaluation.prediction_check import Question
-from unirender_evaluation.predictions import MAP_FILES, SUFFIXES, PredictionFolder
+from unirender_evaluation.predictions.check import Question
+from unirender_evaluation.predictions.folder import MAP_FILES, SUFFIXES, PredictionFolder
 from unirender_evaluation.public.sets import MAPS, Answer, PublicSet, Sample
 from unirender_evaluation.rows import Row
 

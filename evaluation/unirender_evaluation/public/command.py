@@ -54,7 +54,7 @@ class BenchPublic:
         Raises:
             UsageError: one is outside its range, of another form, or means nothing for the set.
         """
-        from unirender_evaluation.run_command import named_folders
+        from unirender_evaluation.runs.command import named_folders
 
         at_least(1, limit=self.limit, resolution=self.resolution)
         if self.tolerance_deg is not None and (self.set != "stanford-orb" or not 0 <= self.tolerance_deg <= 180):
@@ -79,11 +79,11 @@ class BenchPublic:
         self.check()
         from rich.console import Console
 
-        from unirender_evaluation.prediction_check import PredictionError
+        from unirender_evaluation.predictions.check import PredictionError
         from unirender_evaluation.public.rows import public_rows
         from unirender_evaluation.public.run import PublicRun, run
         from unirender_evaluation.public.sets import PublicSetError
-        from unirender_evaluation.run_command import named_folders
+        from unirender_evaluation.runs.command import named_folders
 
         public = self.reader()
         rows = public_rows(

@@ -18,7 +18,7 @@ from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.metrics import DELTA, WHDR, Judgement, judgements, whdr
 from unirender_evaluation.public.scenes import Scenes, scene_sample
 from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder, parsed_json
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 NAME = "iiw"
 LAYOUT = "IIW's photographs <id>.png and judgements <id>.json, there or in its subfolder data"

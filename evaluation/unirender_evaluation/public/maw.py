@@ -27,7 +27,7 @@ from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.metrics import CHROMATICITY, INTENSITY, chromaticity, intensity, segment_means
 from unirender_evaluation.public.scenes import Scenes, scene_sample
 from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 NAME = "maw"
 LAYOUT = "MAW's folders labels (with meta.csv) and images_png"

@@ -33,7 +33,7 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
 from unirender_evaluation.lpips import Lpips
-from unirender_evaluation.methods import quantise
+from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.public import orb_scoring as scoring
 from unirender_evaluation.public.metrics import ERODED, eroded
@@ -50,7 +50,7 @@ from unirender_evaluation.public.sets import (
     read_display,
     read_photograph,
 )
-from unirender_evaluation.specs import TableSpec
+from unirender_evaluation.tables.specs import TableSpec
 
 NAME = "stanford-orb"
 RESOLUTION = 512  # of the benchmark

@@ -32,7 +32,7 @@ from unirender_evaluation.public.metrics import (
     psnr_l,
 )
 from unirender_evaluation.public.sets import Answer
-from unirender_evaluation.specs import Column, TableSpec
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 SCALES: Mapping[Scale, str] = {"aligned_rgb": "scaled", "raw": "raw"}
 FLOORED = "_floored"  # behind a PSNR's name: 1 where its value is the benchmark's floor

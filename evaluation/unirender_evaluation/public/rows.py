@@ -7,12 +7,12 @@ from typing import Any
 from unirender.errors import UsageError
 from unirender.options import Device, ModelOptions
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
-from unirender_evaluation.decompositions import Decompositions
-from unirender_evaluation.pipeline_method import LazyPipeline, PipelineMethod
-from unirender_evaluation.plugins import installed_plugins, named_plugin
+from unirender_evaluation.methods.decompositions import Decompositions
+from unirender_evaluation.methods.pipeline import LazyPipeline, PipelineMethod
+from unirender_evaluation.methods.plugins import installed_plugins, named_plugin
+from unirender_evaluation.methods.trivial import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.public.sets import PublicSet
 from unirender_evaluation.rows import Row, check_rows, make_row, plugin_rows, prediction_rows
-from unirender_evaluation.trivial_methods import InputAsAlbedo, MeanAlbedo, MeanNormal, SphereNormal, UneditedInput
 from unirender_evaluation.versions import MODEL
 
 GROUPS = ("ours", "trivial", "plugins")

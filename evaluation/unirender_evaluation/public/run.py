@@ -23,18 +23,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from unirender.whole_files import replace_file
 from unirender_evaluation import lpips
-from unirender_evaluation.prediction_check import PredictionError, folder_problems
+from unirender_evaluation.predictions.check import PredictionError, folder_problems
 from unirender_evaluation.public.answers import asked, questions, read_answer, takes_part
 from unirender_evaluation.public.sets import PublicSet, Sample
 from unirender_evaluation.public.tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
-from unirender_evaluation.run_folder import say_missing, say_rows_without_values, write_missing, writing_run
+from unirender_evaluation.runs.folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.subsets import partial as partial_limit
-from unirender_evaluation.table_formats import print_table, to_json, to_markdown
-from unirender_evaluation.table_latex import to_latex
-from unirender_evaluation.tables import Table
+from unirender_evaluation.tables.build import Table
+from unirender_evaluation.tables.formats import print_table, to_json, to_markdown
+from unirender_evaluation.tables.latex import to_latex
 from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
 from unirender_reference.folder_lock import locked, made_folder
 

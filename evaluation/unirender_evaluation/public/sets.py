@@ -23,7 +23,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
-from unirender_evaluation.specs import TableSpec
+from unirender_evaluation.tables.specs import TableSpec
 
 T = TypeVar("T")
 

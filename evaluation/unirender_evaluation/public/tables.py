@@ -9,9 +9,9 @@ import numpy as np
 from unirender_evaluation.public.orb_scoring import FLOORED
 from unirender_evaluation.public.sets import PublicSet
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.specs import Column, TableSpec
 from unirender_evaluation.statistics import CONFIDENCE, METHOD
-from unirender_evaluation.tables import Table, build_table
+from unirender_evaluation.tables.build import Table, build_table
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 SHOWN = 5  # names of photographs without an answer, in a note; `missing.txt` has all
 

@@ -5,7 +5,7 @@ import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import installed_version
 
 

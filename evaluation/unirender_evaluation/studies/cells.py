@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 
 from unirender_evaluation.metrics import METRICS, Metric
-from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate
-from unirender_evaluation.table_formats import format_number, json_number, signed
+from unirender_evaluation.tables.formats import format_number, json_number, signed
+from unirender_evaluation.tables.specs import Column
 
 
 def study_column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from unirender.whole_files import replace_file
 from unirender_evaluation.studies.about import line
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.text import TextTable
 from unirender_reference.folder_lock import locked, made_folder
 
 

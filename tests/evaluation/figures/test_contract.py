@@ -10,7 +10,7 @@ from tiny_suites import make_suite
 from unirender.camera import Camera
 from unirender_evaluation.figures.command import CONTRACT, KINDS, Figures
 from unirender_evaluation.figures.contract import SAID, ball, camera_figure, maps_figure, png, texel_of
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 
 
 @pytest.fixture(scope="module")

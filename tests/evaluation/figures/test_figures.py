@@ -48,10 +48,10 @@ from unirender_evaluation.figures.panels import (
     relighting_grid,
 )
 from unirender_evaluation.light_balls import ball_values
-from unirender_evaluation.light_methods import MeanLight
+from unirender_evaluation.methods.light import MeanLight
+from unirender_evaluation.methods.trivial import InputAsAlbedo, UneditedInput
 from unirender_evaluation.rows import make_row
-from unirender_evaluation.suites import Material, Scene, Suite, load_suite
-from unirender_evaluation.trivial_methods import InputAsAlbedo, UneditedInput
+from unirender_evaluation.suites.suite import Material, Scene, Suite, load_suite
 
 UNEDITED = Subject("unedited", make_row(UneditedInput(), "trivial"))
 ALBEDO = Subject("as albedo", make_row(InputAsAlbedo(), "trivial"))

@@ -16,9 +16,9 @@ from unirender_evaluation.figures.command import Figures
 from unirender_evaluation.figures.overview import MAPS
 from unirender_evaluation.figures.panels import Subject
 from unirender_evaluation.figures.pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
+from unirender_evaluation.methods.trivial import InputAsAlbedo
 from unirender_evaluation.rows import make_row
-from unirender_evaluation.suites import load_suite
-from unirender_evaluation.trivial_methods import InputAsAlbedo
+from unirender_evaluation.suites.suite import load_suite
 
 
 def disc(height: int, width: int, centre: tuple[float, float], radius: float) -> Picture:
@@ -97,7 +97,7 @@ def test_the_command_draws_pictures_of_ones_own(tmp_path: Path, capsys: pytest.C
     assert cut.mask is not None
     rgba = np.round(np.concatenate([cut.image_srgb, cut.mask], axis=-1) * 255).astype(np.uint8)
     Image.fromarray(rgba).save(tmp_path / "cut.png")
-    method = "unirender_evaluation.trivial_methods:InputAsAlbedo"
+    method = "unirender_evaluation.methods.trivial:InputAsAlbedo"
     paths = (tmp_path / "cut.png",)
     assert Figures(out=tmp_path / "out", suite=str(suite), method=(method,), pictures=paths, lights=1).run() == 0
     assert "pictures.png" in capsys.readouterr().out.replace("\n", "")

@@ -16,14 +16,14 @@ from unirender_evaluation.multiview.rows import TRIVIAL_USES, multiview_jobs
 from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.report import write_report
+from unirender_evaluation.report.page import write_report
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.store import Job, Store, content_key
-from unirender_evaluation.suites import Suite, load_suite
-from unirender_evaluation.table_formats import to_json, to_markdown
-from unirender_evaluation.table_latex import to_latex
+from unirender_evaluation.suites.suite import Suite, load_suite
 from unirender_evaluation.table_list import ALL_TABLES
-from unirender_evaluation.tables import Table, build_tables
+from unirender_evaluation.tables.build import Table, build_tables
+from unirender_evaluation.tables.formats import to_json, to_markdown
+from unirender_evaluation.tables.latex import to_latex
 from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.optimize.solution import Solution

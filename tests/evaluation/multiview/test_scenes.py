@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from multiview_pieces import MATERIAL, SMALL, ball_scene, painted_ball
 
-from unirender_evaluation.methods import quantise
+from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.multiview.scenes import (
     MultiviewScene,
     multiview_scenes,
@@ -12,8 +12,8 @@ from unirender_evaluation.multiview.scenes import (
     suite_scene,
     turned,
 )
-from unirender_evaluation.suite_objects import GREY, known_mesh, scene_object
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.objects import GREY, known_mesh, scene_object
+from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.render import Renderer
 
 

@@ -8,13 +8,13 @@ import pytest
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError
-from unirender_evaluation.methods import quantise
+from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.physics import ambiguity
 from unirender_evaluation.physics.ambiguity import EXPLANATIONS, POSTERIOR, SIGMAS, Points, material_point
 from unirender_evaluation.physics.region import RESOLUTION, inside, perfect_share, volume
 from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.physics.tests import TESTS
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.render import Renderer
 
 SCENE = "test-000015_l1"  # its truth took the fewest samples

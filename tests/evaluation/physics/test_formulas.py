@@ -11,14 +11,14 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
-from unirender_evaluation.composite_methods import Composite
-from unirender_evaluation.methods import Image
+from unirender_evaluation.methods.composite import Composite
+from unirender_evaluation.methods.method import Image
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics.questions import loop_by_roughness, true_maps
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Stage
 from unirender_evaluation.physics.tests import PHYSICS_TABLE, TESTS, renderer_tests
-from unirender_evaluation.suites import Material, Scene, Suite, load_suite
+from unirender_evaluation.suites.suite import Material, Scene, Suite, load_suite
 
 PERFECT = Composite().render
 EXACT = tuple(test.name for test in TESTS.values() if test.asks == "render" and test.expected == 0)

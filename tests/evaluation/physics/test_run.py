@@ -11,7 +11,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.symmetries import turn_rotation
-from unirender_evaluation.composite_methods import Composite
+from unirender_evaluation.methods.composite import Composite
 from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics import run as physics_run
 from unirender_evaluation.physics.ambiguity import POSTERIOR
@@ -30,7 +30,7 @@ from unirender_evaluation.physics.run import (
 from unirender_evaluation.physics.stage import Stage
 from unirender_evaluation.physics.tests import TESTS
 from unirender_evaluation.physics.tracer import MIRROR, PathTracer, moved
-from unirender_evaluation.suites import load_suite
+from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.shapes import MeshObject, make_object
 
 SCENE = "test-000015_l1"  # its truth took the fewest samples

@@ -19,8 +19,9 @@ from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender.visualization import write_png
-from unirender_evaluation.plugins import Plugin
-from unirender_evaluation.prediction_check import PredictionError
+from unirender_evaluation.methods.plugins import Plugin
+from unirender_evaluation.methods.trivial import InputAsAlbedo
+from unirender_evaluation.predictions.check import PredictionError
 from unirender_evaluation.public import answers
 from unirender_evaluation.public import rows as public_rows
 from unirender_evaluation.public import run as public_run
@@ -35,7 +36,6 @@ from unirender_evaluation.public.sets import PublicSet
 from unirender_evaluation.public.tables import averaged
 from unirender_evaluation.records import Record, read_records
 from unirender_evaluation.rows import Row, plugin_rows, prediction_rows
-from unirender_evaluation.trivial_methods import InputAsAlbedo
 from unirender_evaluation.versions import Versions, package_folder
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 

@@ -51,7 +51,7 @@ from unirender_evaluation.studies.optimiser.tables import (
     to_json,
     to_markdown,
 )
-from unirender_evaluation.table_formats import signed
+from unirender_evaluation.tables.formats import signed
 from unirender_evaluation.versions import OPTIMIZER, Versions
 
 OWN = "studies/optimiser/measure"

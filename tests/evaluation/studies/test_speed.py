@@ -45,8 +45,8 @@ from unirender_evaluation.studies.speed.run import run
 from unirender_evaluation.studies.speed.start import SPLIT, cold_starts, run_process, start_table
 from unirender_evaluation.studies.speed.timing import Part, Timing, medians, side_by_side, timed
 from unirender_evaluation.studies.speed.training import throughput, training_table
-from unirender_evaluation.suites import Suite
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.suites.suite import Suite
+from unirender_evaluation.tables.text import TextTable
 from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
 
 CPU = torch.device("cpu")

@@ -19,7 +19,7 @@ from unirender_evaluation.studies.warm_start.command import BenchWarmStart
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, WARM, Case, WarmStart, measure
 from unirender_evaluation.studies.warm_start.run import our_method, run
 from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, difference, tables
-from unirender_evaluation.suites import Suite
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.optimize.single_config import SingleConfig
 

@@ -21,8 +21,8 @@ from unirender_evaluation.studies.derived_light.measure import (
     TRUTH,
     roughness_of,
 )
-from unirender_evaluation.table_formats import json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import json_text
+from unirender_evaluation.tables.text import TextTable
 
 AIM_DB = 35.0
 COLUMNS = {

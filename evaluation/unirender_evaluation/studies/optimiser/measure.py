@@ -20,7 +20,7 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.store import Store
 from unirender_evaluation.studies.optimiser.ingredients import Ingredient
 from unirender_evaluation.studies.optimiser.study import Study, work_through
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.suite import Scene
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.transport_config import TransportConfig

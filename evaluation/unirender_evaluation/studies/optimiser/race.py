@@ -22,7 +22,7 @@ from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.scoring import score_colour
 from unirender_evaluation.studies.optimiser.curves import Curve, Point
 from unirender_evaluation.studies.optimiser.study import Study, work_through
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.suite import Scene
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.refine_config import RefineConfig
 from unirender_reference.optimize.solution import Solution

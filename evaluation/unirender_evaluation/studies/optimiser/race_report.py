@@ -5,11 +5,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.studies.optimiser.curves import Finish, finish, geometric_mean
 from unirender_evaluation.studies.optimiser.race import ObjectRace
-from unirender_evaluation.table_formats import json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import json_text
+from unirender_evaluation.tables.protocol import protocol_text
+from unirender_evaluation.tables.text import TextTable
 
 TITLES = (
     "Object",

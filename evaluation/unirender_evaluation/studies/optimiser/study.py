@@ -13,7 +13,7 @@ from unirender_evaluation.multiview.scenes import MultiviewScene, multiview_scen
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
 from unirender_evaluation.store import content_key
 from unirender_evaluation.studies.progress import study_bar
-from unirender_evaluation.suites import Scene, Suite, load_suite
+from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.versions import (
     MULTIVIEW,
     OPTIMIZER,

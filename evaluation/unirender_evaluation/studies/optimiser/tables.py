@@ -9,14 +9,14 @@ from rich.console import Console
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
-from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
-from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import CONFIDENCE, METHOD, paired_difference, unprinted_note
 from unirender_evaluation.studies.cells import Cell, as_json, cell_text
 from unirender_evaluation.studies.optimiser.ingredients import FULL, GROUPS, Ingredient, changes
-from unirender_evaluation.table_formats import header, json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import header, json_text
+from unirender_evaluation.tables.protocol import protocol_text
+from unirender_evaluation.tables.specs import Column
+from unirender_evaluation.tables.text import TextTable
 
 LEFT_OUT = ("ssim", "lpips_vgg", "lpips_alex", "peak_deg")  # columns of the multi-view table that the study has not
 EVERY = slice(None)

@@ -61,11 +61,11 @@ class BenchSampling:
         from unirender.models.precision import resolve_device
         from unirender.options import ModelOptions
         from unirender.shipped import checkpoint_folder, checkpoint_sha256
-        from unirender_evaluation.pipeline_method import LazyPipeline
+        from unirender_evaluation.methods.pipeline import LazyPipeline
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.studies.sampling.measure import SamplingStudy
         from unirender_evaluation.studies.sampling.run import run
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.versions import versions
 
         suite = load_suite(self.suite)

@@ -19,10 +19,10 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.studies.sampling.calibration import scene_calibration
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import picture, tasks
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.truth.render import item_seed
 from unirender_evaluation.versions import MODEL, SEPARATOR, Versions, modules_version
 
 TABLE, DECOMPOSE, RENDER = "sampling", "decompose", "render"

@@ -8,11 +8,11 @@ from typing import Any
 from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
-from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import Estimate, paired_difference
 from unirender_evaluation.studies.sampling.calibration import MAPS, Calibration, pool
 from unirender_evaluation.studies.sampling.measure import MEAN, Setting
 from unirender_evaluation.studies.sampling.tables import COLUMNS, calibrations
+from unirender_evaluation.tables.specs import Column
 
 COLOURS = ("#93c5fd", "#3b82f6", "#1e3a8a")  # from few samples to many
 LINE, LEVEL = "#2563eb", {"color": "0.3", "linestyle": "--", "linewidth": 0.9}

@@ -12,7 +12,7 @@ from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.studies.sampling import tables
 from unirender_evaluation.studies.sampling.measure import PROTOCOLS, SamplingStudy, measure
 from unirender_evaluation.studies.sampling.plots import draw_reliability, draw_steps
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.versions import installed_version
 
 NAME = "sampling"

@@ -5,14 +5,14 @@ from dataclasses import asdict
 from typing import Any
 
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.cells import as_json, study_column
 from unirender_evaluation.studies.sampling.calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Setting
-from unirender_evaluation.table_formats import MISSING, estimate_text, format_number, header, json_number, json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import MISSING, estimate_text, format_number, header, json_number, json_text
+from unirender_evaluation.tables.protocol import protocol_text
+from unirender_evaluation.tables.text import TextTable
 
 DIGITS = 3
 

@@ -96,14 +96,14 @@ class BenchSpeed:
     def _measures(self, parts: tuple[PartName, ...]) -> "Measures":
         """What measures each part."""
         from unirender.models.precision import resolve_device, resolve_dtype
-        from unirender_evaluation.pipeline_method import LazyPipeline
+        from unirender_evaluation.methods.pipeline import LazyPipeline
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.studies.speed.mitsuba import mitsuba_part
         from unirender_evaluation.studies.speed.network import network_part
         from unirender_evaluation.studies.speed.overfit import overfit_part
         from unirender_evaluation.studies.speed.start import start_part
         from unirender_evaluation.studies.speed.training import training_part
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
 
         suite = load_suite(self.suite)
         scenes, few = evenly(suite.scenes, self.scenes), max(1, self.repeats // 2)

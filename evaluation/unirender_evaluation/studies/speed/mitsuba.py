@@ -19,11 +19,11 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.studies.optimiser.curves import geometric_mean
 from unirender_evaluation.studies.speed.timing import Part, timed
-from unirender_evaluation.suite_objects import scene_object
-from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.table_formats import MISSING, format_number
-from unirender_evaluation.table_text import TextTable
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.suites.objects import scene_object
+from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.tables.formats import MISSING, format_number
+from unirender_evaluation.tables.text import TextTable
+from unirender_evaluation.truth.render import item_seed
 
 GIVEN = {"given": ("environment",), "given light": ("specular", "diffuse")}  # what the model is not given
 MOST_SPP = 1 << 14

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender_evaluation.studies.speed.timing import Part, Timing, timed
-from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.table_formats import MISSING
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.tables.formats import MISSING
+from unirender_evaluation.tables.text import TextTable
 from unirender_evaluation.tasks import picture
 
 STEPS = (1, 4, 10)

@@ -26,8 +26,8 @@ from unirender.training.presets import get_preset
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key, psnr_from_mse
 from unirender_evaluation.scoring import score_image
 from unirender_evaluation.studies.speed.timing import Part, side_by_side
-from unirender_evaluation.table_formats import format_number
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import format_number
+from unirender_evaluation.tables.text import TextTable
 
 AIM_DB = 35.0
 PRESET = "tiny_plain"

@@ -5,11 +5,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unirender_evaluation.protocol import protocol_text
 from unirender_evaluation.studies.folder import open_folder, write_files
 from unirender_evaluation.studies.speed.parts import PartName
 from unirender_evaluation.studies.speed.timing import Part
-from unirender_evaluation.table_formats import json_text
+from unirender_evaluation.tables.formats import json_text
+from unirender_evaluation.tables.protocol import protocol_text
 
 NAME = "speed"
 

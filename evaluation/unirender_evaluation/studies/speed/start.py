@@ -26,8 +26,8 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.studies.speed.timing import Part, aim_text, medians
-from unirender_evaluation.suites import Scene, Suite
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.tables.text import TextTable
 from unirender_evaluation.tasks import picture
 
 AIM = 2.5  # times a bare import of torch

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from unirender_evaluation.studies.speed.parts import PartName
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.text import TextTable
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import Any
 
 from unirender.training.config import TrainConfig
 from unirender_evaluation.studies.speed.timing import Part, aim_text, medians, side_by_side
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.text import TextTable
 
 AIM = 0.85
 SETTLING = 3  # steps at the start of a block that do not count: batches that the reader made during the other's block

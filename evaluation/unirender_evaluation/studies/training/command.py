@@ -69,7 +69,7 @@ class BenchTraining:
 
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.studies.training.run import TrainingStudy, run
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
 
         suite = load_suite(self.suite)
         study = TrainingStudy(suite, self.data, self.out, self.steps, self.device, self.parallel, self.preset)

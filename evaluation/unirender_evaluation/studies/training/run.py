@@ -23,7 +23,7 @@ from unirender_evaluation.studies.about import description
 from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.training import tables
 from unirender_evaluation.studies.training.choices import BASE_PRESET, Choice
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture
 from unirender_evaluation.validation import score_scene
 from unirender_evaluation.versions import (

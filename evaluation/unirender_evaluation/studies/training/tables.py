@@ -12,8 +12,8 @@ from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import INTERVAL, paired_difference, unprinted_note
 from unirender_evaluation.studies.cells import Cell, as_json, cell_text, study_column
 from unirender_evaluation.studies.training.choices import PLAIN, QUESTIONS, Choice
-from unirender_evaluation.table_formats import header, json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import header, json_text
+from unirender_evaluation.tables.text import TextTable
 
 COLUMNS = (
     study_column("albedo", "albedo", "psnr"),

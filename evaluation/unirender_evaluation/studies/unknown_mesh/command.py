@@ -56,7 +56,7 @@ class BenchUnknownMesh:
         from unirender_evaluation.multiview.settings import STANDARD
         from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh
         from unirender_evaluation.studies.unknown_mesh.run import run
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.versions import versions
 
         suite = load_suite(self.suite)

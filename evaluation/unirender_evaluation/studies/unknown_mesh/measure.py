@@ -18,7 +18,7 @@ from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
 from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.studies.folder import write_files
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
 from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.report import OnReport

@@ -6,9 +6,9 @@ from PIL import Image
 from unirender.color import image_srgb, unpremultiply
 from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import Grid, Line, Tile, draw, over_white
-from unirender_evaluation.gallery import Picture
 from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.multiview.scoring import Looks, true_looks
+from unirender_evaluation.report.gallery import Picture
 
 CAMERAS = 2  # of the held-out ones are shown
 MAPS = ("albedo", "normal", "roughness", "metallic")

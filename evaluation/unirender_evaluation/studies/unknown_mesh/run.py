@@ -7,12 +7,12 @@ from rich.console import Console
 
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.records import Record
-from unirender_evaluation.stratification import Material
 from unirender_evaluation.studies.about import description
 from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.stratification import Material
+from unirender_evaluation.suites.suite import Scene
 from unirender_reference.optimize.live import live_report
 from unirender_reference.optimize.report import OnReport
 

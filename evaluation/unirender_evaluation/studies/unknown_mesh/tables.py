@@ -9,12 +9,12 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.settings import MultiviewSettings
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, SECONDS
 from unirender_evaluation.records import Record
-from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
 from unirender_evaluation.studies.cells import as_json
 from unirender_evaluation.studies.unknown_mesh.scoring import CHAMFER, MASK_IOU, NORMAL_COSINE, SHAPE, STEEP, STEEP_DEG
-from unirender_evaluation.table_formats import estimate_text, format_number, header, json_text
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import estimate_text, format_number, header, json_text
+from unirender_evaluation.tables.specs import Column
+from unirender_evaluation.tables.text import TextTable
 from unirender_reference.multiview import ELEVATIONS_DEG
 
 SHAPE_COLUMNS = (

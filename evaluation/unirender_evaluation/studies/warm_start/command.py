@@ -45,7 +45,7 @@ class BenchWarmStart:
         from unirender_evaluation.rows import evenly
         from unirender_evaluation.studies.warm_start.measure import Geometry, WarmStart
         from unirender_evaluation.studies.warm_start.run import our_method, run
-        from unirender_evaluation.suites import load_suite
+        from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.versions import versions
 
         suite = load_suite(self.suite)

@@ -23,18 +23,18 @@ from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import light_values
-from unirender_evaluation.methods import seen_linear
+from unirender_evaluation.methods.method import seen_linear
+from unirender_evaluation.methods.optimized import SHADE_SPP
 from unirender_evaluation.metrics import LOWER, Metric, metric_key
 from unirender_evaluation.multiview.scenes import scene_material
 from unirender_evaluation.multiview.tables import SECONDS
-from unirender_evaluation.optimized_method import SHADE_SPP
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image, score_maps
 from unirender_evaluation.store import Store, content_key
-from unirender_evaluation.suite_objects import known_mesh, scene_object
-from unirender_evaluation.suites import Scene, Suite
+from unirender_evaluation.suites.objects import known_mesh, scene_object
+from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture
-from unirender_evaluation.truth_render import item_seed
+from unirender_evaluation.truth.render import item_seed
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
 from unirender_reference.optimize.single_config import SingleConfig
 

@@ -12,7 +12,7 @@ from unirender_evaluation.studies.folder import open_folder, write_study
 from unirender_evaluation.studies.progress import collect
 from unirender_evaluation.studies.warm_start import tables
 from unirender_evaluation.studies.warm_start.measure import WarmStart, measure
-from unirender_evaluation.suites import Scene
+from unirender_evaluation.suites.suite import Scene
 
 NAME = "warm_start"
 
@@ -23,8 +23,8 @@ def our_method(checkpoint: Path | None) -> Any:
     Args:
         checkpoint: its folder; None: the shipped one.
     """
-    from unirender_evaluation.bench_config import BenchConfig, build_rows
     from unirender_evaluation.claims import OURS
+    from unirender_evaluation.runs.config import BenchConfig, build_rows
 
     rows = build_rows(BenchConfig(methods=("ours",), checkpoint=checkpoint))
     return next(row.method for row in rows if row.info.key == OURS)

@@ -10,12 +10,12 @@ from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.tables import SECONDS
 from unirender_evaluation.records import Record
-from unirender_evaluation.specs import Column
 from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference
 from unirender_evaluation.studies.cells import as_json, study_column
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, STEPS, WARM
-from unirender_evaluation.table_formats import format_estimate, header, json_text, signed
-from unirender_evaluation.table_text import TextTable
+from unirender_evaluation.tables.formats import format_estimate, header, json_text, signed
+from unirender_evaluation.tables.specs import Column
+from unirender_evaluation.tables.text import TextTable
 
 TITLES = {
     "known-mesh": "known mesh (normals and shadows)",

@@ -1,0 +1,1 @@
+"""Other people's published pipelines as benchmark methods."""

@@ -1,0 +1,1 @@
+"""Methods, which are what a benchmark's rows are made of: ours, the trivial ones, Mitsuba's, and strangers'."""

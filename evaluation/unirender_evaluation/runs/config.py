@@ -1,0 +1,131 @@
+"""What a benchmark run is asked for: its settings, and the rows that follow from them."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from unirender.errors import UsageError
+from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
+from unirender_evaluation import bounds
+from unirender_evaluation.claims import OURS
+from unirender_evaluation.methods.mitsuba import MITSUBA
+from unirender_evaluation.methods.optimized_rows import optimized_rows
+from unirender_evaluation.methods.pipeline import LazyPipeline
+from unirender_evaluation.methods.plugins import absolute, installed_plugins, named_plugin
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.multiview.methods import NAMES as MULTIVIEW_NAMES
+from unirender_evaluation.physics import rows as physics_rows
+from unirender_evaluation.rows import Row, check_rows, our_rows, plugin_rows, prediction_rows, slug, trivial_rows
+from unirender_evaluation.subsets import STANDARD, Subsets
+from unirender_evaluation.suites.spec import read_spec
+
+GROUPS = ("ours", "optimisation", "trivial", "plugins")
+BOUNDS = (  # keys that no row of a stranger may have
+    bounds.CEILING_KEY,
+    bounds.REFERENCE_KEY,
+    slug(bounds.Shade.name),
+    *(info.key for info in (bounds.TRUE_LIGHT, MITSUBA, *physics_rows.INFOS)),
+    *map(slug, MULTIVIEW_NAMES),
+)
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """A benchmark run.
+
+    Attributes:
+        suite: name of a bundled suite, or path of a TOML file.
+        out: folder of the run; an earlier run in it is continued.
+        checkpoint: folder of our model, or the name of a shipped one; None = the shipped one for the suite's pictures.
+        methods: groups of rows: ours; optimisation (each picture, and the multi-view table); trivial; plugins
+            (installed). A stranger's row always brings the trivial ones.
+        method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
+        predictions: name -> folder of somebody's predictions.
+        limit: scenes (evenly spaced); the tables are then watermarked.
+        seed: of sampling methods.
+        check_scenes: scenes that Mitsuba renders again on the spot.
+        check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
+        recheck: render them again also where the folder holds the same check.
+        jobs: worker processes, each with one thread; 0 = all in this one.
+        cluster: workers of a cluster instead, see `unirender_reference.cluster.connect`; the truth check and the
+            multi-view table stay in this process.
+        device: of our model: auto, cpu, cuda or mps.
+        subsets: scenes of the slow parts.
+        variants: of the tables (see `tables.build_tables`); records have all of them.
+    """
+
+    suite: str = "tiny"
+    out: Path = Path("results")
+    checkpoint: Path | None = None
+    methods: tuple[str, ...] = GROUPS
+    method: tuple[str, ...] = ()
+    predictions: dict[str, Path] = field(default_factory=dict)
+    limit: int | None = None
+    seed: int = 0
+    check_scenes: int = 4
+    check_seed: int | None = None
+    recheck: bool = False
+    jobs: int = 2
+    cluster: str | None = None
+    device: str = "cpu"
+    subsets: Subsets = STANDARD
+    variants: tuple[Variant, ...] | None = None
+
+    def weights(self) -> Path:
+        """The folder of our model."""
+        if self.checkpoint is None:
+            return shipped_for(read_spec(self.suite).resolution)
+        return checkpoint_folder(self.checkpoint)
+
+
+def build_rows(config: BenchConfig) -> list[Row]:
+    """The rows that a configuration asks for.
+
+    Raises:
+        UnirenderError: unknown group, no checkpoint, a device that is not there, broken plug-in or predictions folder,
+            two rows of one name, or one with that of a bound.
+    """
+    unknown = sorted(set(config.methods) - set(GROUPS))
+    if unknown:
+        raise UsageError(f"methods: got {', '.join(unknown)}, expected some of {', '.join(GROUPS)}")
+    rows: list[Row] = []
+    if "ours" in config.methods:
+        from unirender.models.precision import resolve_device
+
+        folder, device = config.weights(), str(resolve_device(config.device))
+        pipeline = LazyPipeline(lambda: load_pipeline(folder, device))
+        rows += our_rows(pipeline, checkpoint_sha256(folder), config.seed, config.subsets.sample, device)
+    if "optimisation" in config.methods and config.subsets.optimise != 0:
+        main = next((row.method for row in rows if row.info.key == OURS), None)
+        rows += optimized_rows(config.subsets.optimise, config.subsets.pictures, main)
+    plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
+    strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
+    if "trivial" in config.methods or strangers:
+        rows += trivial_rows()
+    if "trivial" in config.methods:
+        rows.append(bounds.shade_row(config.subsets.shade))
+    return check_rows(rows + strangers, BOUNDS)
+
+
+def load_pipeline(folder: Path, device: str) -> Any:
+    """Our model from its folder, silent, on that device."""
+    import diffusers
+
+    from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+
+    diffusers.utils.logging.disable_progress_bar()  # of loading: two small files, and a bar for each worker
+    pipeline = UniRenderPipeline.from_pretrained(folder).to(device)
+    pipeline.set_progress_bar_config(disable=True)
+    return pipeline
+
+
+def anywhere(config: BenchConfig) -> BenchConfig:
+    """The same with absolute paths of what is read, since a cluster's workers may run in another folder."""
+    named = config.checkpoint
+    return replace(
+        config,
+        suite=str(Path(config.suite).resolve()) if config.suite.endswith(".toml") else config.suite,
+        checkpoint=named.resolve() if named is not None and named.is_dir() else named,
+        method=tuple(map(absolute, config.method)),
+        predictions={name: folder.resolve() for name, folder in config.predictions.items()},
+    )

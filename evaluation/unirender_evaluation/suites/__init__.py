@@ -1,0 +1,1 @@
+"""Suites: the objects, lights and materials of the scenes that a run scores."""

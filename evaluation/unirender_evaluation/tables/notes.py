@@ -1,0 +1,79 @@
+"""What is said below a table: the rows' notes, who has fewer samples, what a sign in a cell means, what is stored."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from unirender_evaluation.comparisons import exact_fit, values_of
+from unirender_evaluation.metrics import Variant
+from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import unprinted_note
+from unirender_evaluation.tables.counts import cell_counts, label_n
+from unirender_evaluation.tables.specs import TableSpec
+
+NAMED = (
+    "[Name]: the system whose values in the paper stand in this row. What is measured is the row that is named before "
+    "it, another implementation, if its note does not say otherwise."
+)
+
+if TYPE_CHECKING:
+    from unirender_evaluation.tables.build import Row
+
+
+def table_notes(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant) -> tuple[str, ...]:
+    """The notes, in their order.
+
+    Args:
+        spec: of the table.
+        records: behind it.
+        rows: ranked.
+        variant: how its numbers are taken.
+    """
+    notes = [spec.description] if spec.description else []
+    notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
+    if any(row.info and row.label != row.info.label for row in rows):
+        notes.append(NAMED)
+    fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
+    if fewer:
+        notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
+    notes += unprinted_note(cell.measured for row in rows for cell in row.cells)
+    if any(cell.dagger for row in rows for cell in row.cells):
+        notes.append(
+            "† The published value is worse than what the constant 0.5 scores on materials that are spread evenly over "
+            "the paper's grid, as here; how those of its test objects are spread the paper does not say."
+        )
+    if any(cell.unavailable for row in rows for cell in row.cells):
+        notes.append(
+            "n/a: the weights of this LPIPS backbone are not on this machine; "
+            "`python -m unirender_evaluation.lpips_convert vgg` fetches and converts them."
+        )
+    origins = dict.fromkeys(row.stored for row in rows if row.stored)
+    stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
+    notes += _exact_fits(spec, records, rows, variant)
+    return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))
+
+
+def _counts_said(spec: TableSpec, rows: Sequence["Row"], row: "Row") -> str:
+    """On how many samples a row's cells stand that are on fewer than others: that behind its label, then others."""
+    label, columns = label_n(rows, row), spec.columns
+    others: dict[str, set[int]] = {}
+    for i, n in cell_counts(rows, row).items():
+        others.setdefault(columns[i].group, set()).add(n)
+    found = [] if label is None else [f"n = {label}"]
+    for group, counts in others.items():
+        found.append(f"{group} n = {' and '.join(map(str, sorted(counts)))}")
+    return ", ".join(found)
+
+
+def _exact_fits(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant) -> tuple[str, ...]:
+    """The note on infinite means under a fitted scale; empty where there is none."""
+    found = []
+    for row in rows:
+        for column, cell in zip(spec.columns, row.cells, strict=True):
+            key = column.key(variant)
+            if cell.measured is not None and exact_fit(key, cell.measured.mean):
+                exact = sum(map(math.isinf, values_of(records, row.key, key).values()))
+                what = f"{column.group} {column.metric.label}"
+                found.append(f"{row.label} ({what}: {exact} of {cell.measured.n} samples)")
+    said = "∞ under a fitted scale is an exact fit, as any constant has on an object of one colour, and is not ranked"
+    return (f"{said}: {'; '.join(found)}.",) if found else ()

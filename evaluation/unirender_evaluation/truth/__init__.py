@@ -1,0 +1,1 @@
+"""The truth of a suite: how it is made and tested."""
