@@ -44,8 +44,10 @@ def diffuse_light(
     out = np.zeros((*normal.shape[:-1], 3), dtype=np.float32)
     lit = np.empty((len(n), 3), dtype=np.float32)
     step = max(1, _CHUNK // len(radiance))
+    cosines = np.empty((min(step, len(n)), len(radiance)), dtype=np.float32)  # one memory for all parts
     for part in (slice(i, i + step) for i in range(0, len(n), step)):
-        lit[part] = np.maximum(n[part] @ directions, 0) @ radiance
+        cosine = np.matmul(n[part], directions, out=cosines[: len(n[part])])
+        lit[part] = np.maximum(cosine, 0, out=cosine) @ radiance
     out[there] = lit / np.pi
     return out
 

@@ -1,12 +1,14 @@
 """What a hidden direction shows instead of the light."""
 
+from collections.abc import Collection
+
 import numpy as np
 import pytest
 from seen_shapes import SIZE, as_maps, ball, gutter
 
 from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
-from unirender.pipelines.bounced_light import AROUND, REFLECTED, _mean_radiance, bounced_light
+from unirender.pipelines.bounced_light import AROUND, REFLECTED, WHITE_SKY, _mean_radiance, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.inputs import ready_to_render
@@ -15,6 +17,10 @@ from unirender.pipelines.shadowed_light import visible_shares
 LIGHT = ("specular", "diffuse")
 SKY = np.ones((16, 32, 3), np.float32)
 MIDDLE = slice(SIZE // 4, -SIZE // 4)
+
+
+def bounced(maps: Intrinsics, names: Collection[str]) -> dict[str, np.ndarray]:
+    return bounced_light(maps, visible_shares(maps, WHITE_SKY, names))
 
 
 def painted(normal: np.ndarray, mask: np.ndarray, albedo: float = 0.8, metallic: float = 0.0) -> Intrinsics:
@@ -30,12 +36,12 @@ def lit(maps: Intrinsics, specular: float = 1.0) -> Intrinsics:
 def test_a_corner_shows_its_own_colour_where_it_hides_the_sky() -> None:
     normal, mask, _ = gutter()
     maps = lit(painted(normal, mask))
-    found = bounced_light(maps, LIGHT)
+    found = bounced(maps, LIGHT)
     hidden = {name: 1 - share for name, share in visible_shares(maps, SKY, LIGHT).items()}
     for name in LIGHT:
         assert found[name].min() >= 0
         assert found[name][MIDDLE, MIDDLE].mean() > 0.02, name
-        black = bounced_light(lit(painted(normal, mask, albedo=0.0), specular=0.5), [name])[name]
+        black = bounced(lit(painted(normal, mask, albedo=0.0), specular=0.5), [name])[name]
         ratio = black[MIDDLE, MIDDLE] / hidden[name][MIDDLE, MIDDLE] / REFLECTED
         assert ratio.max() < 0.06, name  # what a black one sends out: its gloss alone
     red, green, blue = found["diffuse"][MIDDLE, MIDDLE].mean(axis=(0, 1))
@@ -45,7 +51,7 @@ def test_a_corner_shows_its_own_colour_where_it_hides_the_sky() -> None:
 def test_b_is_the_mean_around_a_pixel() -> None:
     normal, mask, _ = gutter()
     even = lit(painted(normal, mask, albedo=0.5, metallic=1.0))  # a metal sends out F s: nearly albedo where s is 1
-    found = bounced_light(even, ["specular"])["specular"]
+    found = bounced(even, ["specular"])["specular"]
     hidden = 1 - visible_shares(even, SKY, ("specular",))["specular"]
     radiance = found[MIDDLE, MIDDLE] / hidden[MIDDLE, MIDDLE] / REFLECTED
     assert radiance[..., 0].mean() == pytest.approx(0.5, abs=0.1)
@@ -53,7 +59,7 @@ def test_b_is_the_mean_around_a_pixel() -> None:
     # the left half black: less and less of the right one's light towards the left edge
     right = np.broadcast_to((np.arange(SIZE) >= SIZE // 2)[:, None], normal.shape).astype(np.float32)
     half = even.replace(specular=right)
-    beside = bounced_light(half, ["specular"])["specular"] / found
+    beside = bounced(half, ["specular"])["specular"] / found
     assert beside[SIZE // 2, SIZE // 2 - 12, 0] < beside[SIZE // 2, SIZE // 2, 0] < beside[SIZE // 2, SIZE // 2 + 12, 0]
 
 
@@ -79,7 +85,7 @@ def test_how_far_around_a_pixel_goes_with_the_size_of_the_object(side: int) -> N
 @pytest.mark.long
 def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:
     normal, mask, _ = ball()
-    found = bounced_light(lit(painted(normal, mask)), LIGHT)
+    found = bounced(lit(painted(normal, mask)), LIGHT)
     inside = mask[..., 0] > 0
     for name in LIGHT:
         assert np.abs(found[name][~inside]).max() == 0
@@ -94,11 +100,11 @@ def test_nothing_is_added_where_nothing_is_hidden_or_known() -> None:
 def test_rendering_adds_it_to_what_is_derived_and_to_nothing_that_is_given() -> None:
     maps = painted(*gutter()[:2]).replace(environment=SKY)
     direct = derived_light(maps, SKY, LIGHT)
-    bounced = bounced_light(maps.replace(**direct), LIGHT)
+    added = bounced(maps.replace(**direct), LIGHT)
     ready = ready_to_render(maps).require(*LIGHT)
     for name in LIGHT:
-        assert np.array_equal(ready[name], direct[name] + bounced[name])
-        assert bounced[name].max() > 0.02
+        assert np.array_equal(ready[name], direct[name] + added[name])
+        assert added[name].max() > 0.02
     told = ready_to_render(maps.replace(**direct), derived=LIGHT).require(*LIGHT)
     assert all(np.array_equal(told[name], ready[name]) for name in LIGHT)
     given = ready_to_render(maps.replace(**direct)).require(*LIGHT)
@@ -135,12 +141,12 @@ def test_it_doubles_with_the_light() -> None:
 
 @pytest.mark.long
 def test_a_larger_picture_has_the_same() -> None:
-    small, large = (bounced_light(lit(painted(*gutter(size)[:2])), LIGHT) for size in (SIZE, 4 * SIZE))
+    small, large = (bounced(lit(painted(*gutter(size)[:2])), LIGHT) for size in (SIZE, 4 * SIZE))
     for name in LIGHT:
         assert large[name].shape == (4 * SIZE, 4 * SIZE, 3)
         few, many = (np.stack(np.array_split(found[name][..., 0], 6, axis=1)) for found in (small, large))
         np.testing.assert_allclose(many.mean(axis=(1, 2)), few.mean(axis=(1, 2)), rtol=0.3, atol=0.01)
     half = ball(4 * SIZE)
     outside = half[1][..., 0] == 0
-    for value in bounced_light(lit(painted(half[0], half[1])), LIGHT).values():
+    for value in bounced(lit(painted(half[0], half[1])), LIGHT).values():
         assert not value[outside].any()

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from seen_shapes import CAMERA, SIZE, as_maps, ball, gutter, rays
 
 from unirender.camera import Camera
@@ -13,9 +14,9 @@ from unirender.lighting import environment_directions, texel_solid_angles
 from unirender.lobes import texel_directions, texels
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
-from unirender.pipelines.normal_integration import integrate_normals
+from unirender.pipelines.normal_integration import RIGHT, TETHER, _neighbours, _system, integrate_normals
 from unirender.pipelines.remembered import forget_pictures
-from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _bits, _distance_to_ends
+from unirender.pipelines.self_shadow import SECTORS, SelfShadow, _angle, _bits, _distance_to_ends, _middles
 from unirender.pipelines.shadowed_light import (
     LEAST_ROUGHNESS,
     SHADOW_SIDE,
@@ -23,6 +24,7 @@ from unirender.pipelines.shadowed_light import (
     _distribution,
     seen_shadows,
     visible_shares,
+    visible_shares_under,
 )
 from unirender.surface_light import QUADRATURE_SHAPE
 from unirender.symmetries import mirror, quarter_turn
@@ -53,6 +55,26 @@ def test_planes_that_meet_keep_their_edge() -> None:
     found = integrate_normals(normal, mask[..., 0] > 0, CAMERA)
     ratio = found / depth
     assert np.abs(ratio / np.median(ratio) - 1).max() < 2e-4  # 5e-4 where one side of each pair counts whole
+
+
+def test_the_normal_equations_are_those_of_the_weighted_differences() -> None:
+    """Row by row: w (N (z_neighbour - z) - slope)^2 over the sides on which there is a pixel."""
+    rng = np.random.default_rng(0)
+    sides = _neighbours(rng.random((4, 5)) > 0.2)
+    count = sides.shape[1]
+    facing, slopes = rng.random(count), rng.normal(size=(4, count))
+    weights = rng.random((4, count)) * (sides < count)
+    weights[RIGHT, 2] = 0
+    system, right = _system(sides, facing, weights, slopes)
+    expected, expected_right = TETHER * np.eye(count), np.zeros(count)
+    for side in range(4):
+        for pixel in np.flatnonzero(sides[side] < count):
+            row = np.zeros(count)
+            row[sides[side, pixel]], row[pixel] = facing[pixel], -facing[pixel]
+            expected += weights[side, pixel] * np.outer(row, row)
+            expected_right += weights[side, pixel] * slopes[side, pixel] * row
+    np.testing.assert_allclose(system.toarray(), expected, atol=1e-14)
+    np.testing.assert_allclose(right, expected_right, atol=1e-14)
 
 
 def test_parts_that_do_not_touch_lie_at_one_depth_and_nothing_is_nothing() -> None:
@@ -165,10 +187,10 @@ def test_shadows_of_s_are_weighed_by_a_ggx_lobe() -> None:
     """Seen along the normal, D sums to 4 pi / alpha^2 over all directions of light; it is largest in the mirror's."""
     directions, up = texel_directions((128, 256)), np.array([[0, 0, 1]], np.float32)
     for alpha in (0.09, 0.36, 1.0):
-        lobe = _distribution(up, up, np.array([[alpha]], np.float32), directions)[0]
+        lobe = _distribution(up @ directions, up @ up.T, up @ directions, np.array([[alpha]], np.float32))[0]
         assert lobe @ texel_solid_angles(128, 256).ravel() == pytest.approx(4 * math.pi / alpha**2, rel=0.01)
     tilted = np.array([[0.48, 0.36, 0.8]], np.float32)
-    lobe = _distribution(tilted, up, np.array([[0.09]], np.float32), directions)[0]
+    lobe = _distribution(tilted @ directions, tilted @ up.T, up @ directions, np.array([[0.09]], np.float32))[0]
     assert directions[:, lobe.argmax()] @ (2 * 0.8 * tilted[0] - up[0]) > math.cos(math.radians(1.5))
 
 
@@ -198,6 +220,18 @@ def test_shadows_of_d_are_linear_in_the_light() -> None:
     single = derived_light(maps, one, ["specular", "diffuse"])
     for name, value in single.items():
         np.testing.assert_allclose(2 * value, doubled[name], rtol=1e-4, atol=1e-5)
+
+
+def test_what_is_left_under_a_light_does_not_depend_on_the_others() -> None:
+    """To the bit: a light alone is one of several."""
+    normal, mask, _ = gutter()
+    maps, lights = as_maps(normal, mask), (sky(), np.ones((2, 4, 3), np.float32))
+    names = ("specular", "diffuse")
+    together = visible_shares_under(maps, lights, names)
+    for light, found in zip(lights, together, strict=True):
+        for name, alone in visible_shares(maps, light, names).items():
+            np.testing.assert_array_equal(found[name], alone)
+    assert np.abs(together[0]["diffuse"] - together[1]["diffuse"]).max() > 0.05
 
 
 def uneven() -> Intrinsics:
@@ -320,8 +354,20 @@ def test_a_surface_ends_on_both_sides_of_a_step(turn: bool) -> None:
 
 
 def test_bits_are_those_of_the_sectors_between_two_angles() -> None:
-    cases = [(0, 64), (0, 0), (63, 64), (10, 20), (20, 10), (9.4, 9.6), (9.6, 10.4), (-3, 70)]
-    found = _bits(*np.array(cases, float).T)
-    for (first, last), mask in zip(cases, found, strict=True):
+    cases = np.array([(0, 64), (0, 0), (63, 64), (10, 20), (20, 10), (9.4, 9.6), (9.6, 10.4)], np.float32).T
+    found = _bits(*(_middles(np.cos(angles * np.float32(math.pi / SECTORS))) for angles in cases))
+    for (first, last), mask in zip(cases.T, found, strict=True):
         expected = sum(1 << sector for sector in range(SECTORS) if first <= sector + 0.5 < last)
         assert int(mask) == expected, (first, last)
+    assert _middles(np.array([-1.1, 1.1], np.float32)).tolist() == [SECTORS, 0]  # cosines, but for rounding
+
+
+@pytest.mark.parametrize("border", [0, 0.5])
+def test_angles_fall_on_the_side_of_a_border_on_which_numpy_has_them(border: float) -> None:
+    """At cosines within a few last bits of all borders, and anywhere."""
+    scale = SECTORS / math.pi
+    cosine = np.cos((np.arange(SECTORS) + border) / scale).astype(np.float32)
+    near = [cosine + k * np.spacing(cosine) for k in range(-8, 9)]
+    cosine = np.clip(np.concatenate([*near, np.linspace(-1, 1, 999, dtype=np.float32)]), -1, 1)
+    found = _angle(torch.acos, np.arccos, scale, border, cosine)
+    np.testing.assert_array_equal(np.floor(found + border), np.floor(scale * np.arccos(cosine) + border))

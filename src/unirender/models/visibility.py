@@ -102,7 +102,8 @@ def bin_weights(
     bins = direction_bins(directions)
     in_bin = np.zeros((len(bins), BINS), np.float32)
     in_bin[np.arange(len(bins)), bins] = np.sqrt(1 - np.square(directions[1])) * (math.pi / 2)
-    weights = [np.where(classes == number, cosine, 0).astype(np.float32) @ in_bin for number in range(len(CLASSES))]
+    cosine = np.asarray(cosine, np.float32)
+    weights = [(cosine * (classes == number)) @ in_bin for number in range(len(CLASSES))]
     return np.stack(weights, axis=1)
 
 

@@ -9,7 +9,7 @@ what the picture shows, and B has been lit once only. B is taken to be alike in 
 and knows nothing of depth: what is beside a pixel in the picture counts as beside it.
 """
 
-from collections.abc import Collection
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -18,24 +18,25 @@ from scipy.ndimage import gaussian_filter
 from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.framing import Frame
-from unirender.pipelines.shadowed_light import SHADOW_SIDE, visible_shares
+from unirender.pipelines.shadowed_light import SHADOW_SIDE
 
 REFLECTED = 0.4  # c: chosen by pictures of no suite, where 0.3 and 0.5 are as good
 AROUND = 0.11  # of the object's size, the root of its area: standard deviation of the mean around a pixel
 
-_WHITE = np.ones((2, 4, 3), np.float32)
+WHITE_SKY = np.ones((2, 4, 3), np.float32)
 
 
-def bounced_light(intrinsics: Intrinsics, names: Collection[str]) -> dict[str, Float[np.ndarray, "h w 3"]]:
+def bounced_light(
+    intrinsics: Intrinsics, shares: Mapping[str, Float[np.ndarray, "h w 3"]]
+) -> dict[str, Float[np.ndarray, "h w 3"]]:
     """What is added to s and d that have shadows.
 
     Args:
         intrinsics: with all that the split-sum image needs; s and d direct light, derived ones with the shadows that
             the picture shows.
-        names: of specular and diffuse, those that are wanted.
+        shares: V_s and V_d by name, those that are wanted: `visible_shares` under `WHITE_SKY`.
     """
     radiance = _mean_radiance(intrinsics.replace(environment=None))
-    shares = visible_shares(intrinsics, _WHITE, names)
     return {name: REFLECTED * (1 - share) * radiance for name, share in shares.items()}
 
 

@@ -15,12 +15,13 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.lighting import as_light
 from unirender.pictures import coverage
-from unirender.pipelines.bounced_light import bounced_light
+from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.framing import thumbnail
 from unirender.pipelines.masked_maps import constant_map
 from unirender.pipelines.results import Decomposition
 from unirender.pipelines.settings import TAKING_APART
+from unirender.pipelines.shadowed_light import visible_shares_under
 from unirender.vectors import dots, nonzero
 
 RENDER_NEEDS = ("normal", "roughness", "metallic")
@@ -167,11 +168,15 @@ def ready_to_render(intrinsics: Intrinsics, shadows: bool = True, derived: Colle
         return intrinsics
     light = as_light(intrinsics.environment)
     names = to_derive(intrinsics)
-    direct = intrinsics.replace(**derived_light(intrinsics, light, names, shadows=shadows))
-    names = names.union(derived)
-    if not shadows or not names or direct.albedo is None:
+    direct = derived_light(intrinsics, light, names, shadows=False)
+    wanted = names.union(derived)
+    if not shadows or not wanted:
+        return intrinsics.replace(**direct)
+    left, left_of_sky = visible_shares_under(intrinsics, (light, WHITE_SKY), wanted)
+    direct = intrinsics.replace(**{name: value * left[name] for name, value in direct.items()})
+    if direct.albedo is None:
         return direct
-    bounced = bounced_light(direct, names)
+    bounced = bounced_light(direct, left_of_sky)
     return direct.replace(**{name: getattr(direct, name) + value for name, value in bounced.items()})
 
 

@@ -16,8 +16,8 @@ What normals cannot say stays open: how far parts are from one another that do n
 import math
 
 import numpy as np
-import scipy.sparse as sp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 from scipy.special import expit
 
@@ -27,6 +27,8 @@ ROUNDS = 12  # of weighting
 SHARPNESS = 8.0  # k
 GRAZING = 0.02  # the least N: a surface seen from the side has no slope that a pixel shows
 TETHER = 1e-6  # weight of z = 0, by which parts that do not touch lie at one depth
+RIGHT, LEFT, UP, DOWN = range(4)
+OPPOSITE = (LEFT, RIGHT, DOWN, UP)
 
 
 def integrate_normals(
@@ -46,21 +48,17 @@ def integrate_normals(
     n = normal[inside].astype(np.float64)
     facing = np.maximum(-(n * (rays / -rays[..., 2:])[inside]).sum(axis=-1), GRAZING)
     pixel = 2 * math.tan(math.radians(camera.fov_deg) / 2) / inside.shape[0]
-    sides = [_differences(inside, step) for step in ((0, 1), (0, -1), (-1, 0), (1, 0))]  # right, left, up, down
-    slopes = [sp.diags(facing) @ (d * sign) for (d, _), sign in zip(sides, (1, -1, 1, -1), strict=True)]
-    there = [exists for _, exists in sides]
-    expected = [n[:, 0] * pixel, n[:, 0] * pixel, n[:, 1] * pixel, n[:, 1] * pixel]
-    weights = [0.5 * exists for exists in there]
+    sides = _neighbours(inside)
+    there = sides < len(n)
+    slopes = np.stack([n[:, 0], -n[:, 0], n[:, 1], -n[:, 1]]) * pixel  # N dz towards each side
+    weights = 0.5 * there
     z = np.zeros(len(n))
     for _ in range(ROUNDS):
-        system = TETHER * sp.identity(len(n))
-        right = np.zeros(len(n))
-        for slope, weight, value in zip(slopes, weights, expected, strict=True):
-            system = system + slope.T @ sp.diags(weight) @ slope
-            right += slope.T @ (weight * value)
-        z = splu(system.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)
-        squared = [np.square(slope @ z / pixel) for slope in slopes]
-        for one, other in ((0, 1), (2, 3)):
+        system, right = _system(sides, facing, weights, slopes)
+        z = splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(right)
+        rise = np.where(there, facing * np.append(z, 0).take(sides) - facing * z, 0)
+        squared = np.square(rise / pixel)
+        for one, other in ((RIGHT, LEFT), (UP, DOWN)):
             share = expit(SHARPNESS * (squared[other] - squared[one]))
             share = np.where(there[other], share, 1.0)
             weights[one] = np.where(there[one], share, 0.0)
@@ -69,15 +67,44 @@ def integrate_normals(
     return depth
 
 
-def _differences(inside: Bool[np.ndarray, "h w"], step: tuple[int, int]) -> tuple[sp.csr_array, Bool[np.ndarray, " p"]]:
-    """The matrix of z(pixel + step) - z(pixel) over the pixels inside, and which of them have that neighbour."""
-    count = int(inside.sum())
-    number = np.full(inside.shape, -1)
-    number[inside] = np.arange(count)
-    rows, columns = step
-    neighbour = np.roll(np.pad(number, 1, constant_values=-1), (-rows, -columns), axis=(0, 1))[1:-1, 1:-1][inside]
-    exists = neighbour >= 0
-    own = np.flatnonzero(exists)
-    ones = np.ones(len(own))
-    entries = (np.r_[ones, -ones], (np.r_[own, own], np.r_[neighbour[exists], own]))
-    return sp.csr_array(entries, shape=(count, count)), exists
+def _neighbours(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "4 p"]:
+    """The numbers of the pixels beside each of p pixels inside; p where there is none."""
+    padded = np.pad(inside, 1)
+    at = np.flatnonzero(padded)
+    number = np.full(padded.size, len(at), np.int32)
+    number[at] = np.arange(len(at))
+    down = padded.shape[1]
+    return np.stack([number[at + step] for step in (1, -1, -down, down)])
+
+
+def _system(
+    sides: Int[np.ndarray, "4 p"],
+    facing: Float[np.ndarray, " p"],
+    weights: Float[np.ndarray, "4 p"],
+    slopes: Float[np.ndarray, "4 p"],
+) -> tuple[csc_array, Float[np.ndarray, " p"]]:
+    """Matrix and right side of the normal equations.
+
+    Args:
+        sides: numbers of the pixels on each side.
+        facing: N.
+        weights: of the differences to each side; 0 where there is no pixel.
+        slopes: N dz towards each side, as the normals have it.
+    """
+    squares, falls = facing * weights * facing, facing * (weights * slopes)
+    # what the pixel on a side says of this one, beside what this one says of it
+    square_of, fall_of = (
+        np.stack([np.append(values[OPPOSITE[side]], 0).take(sides[side]) for side in range(4)])
+        for values in (squares, falls)
+    )
+    own, right = np.full(len(facing), TETHER), np.zeros(len(facing))
+    for side in range(4):
+        own = own + (squares[side] + square_of[OPPOSITE[side]])
+        right = right + (fall_of[OPPOSITE[side]] - falls[side])
+    beside = -(squares + square_of)
+    # the entries of each row in the order of their columns, which are those of each column: the matrix is symmetric
+    values = np.stack([*beside[[UP, LEFT]], own, *beside[[RIGHT, DOWN]]], axis=1)
+    rows = np.stack([*sides[[UP, LEFT]], np.arange(len(facing), dtype=np.int32), *sides[[RIGHT, DOWN]]], axis=1)
+    known = values != 0
+    ends = np.concatenate([[0], np.cumsum(known.sum(axis=1))])
+    return csc_array((values[known], rows[known], ends.astype(np.int32)), shape=(len(facing), len(facing))), right

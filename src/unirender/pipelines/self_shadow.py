@@ -12,19 +12,22 @@ What the picture does not show is in neither mask: the back of the object, and w
 masks are worth, and what they miss, a network has learned (`unirender.models.visibility`).
 """
 
+import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt64
+import torch
+from jaxtyping import Bool, Float, Int, Integer, Shaped, UInt8, UInt64
 from scipy.ndimage import distance_transform_edt
 
 from unirender.camera import Camera
+from unirender.ggx import dot
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.vectors import nonzero
 
-HALF_PLANES = 32  # evenly around the viewer's direction
+HALF_PLANES = 32  # evenly around the viewer's direction; a power of two
 SECTORS = 64  # of theta, from 0 to pi: the bits of a mask
 STEPS = 24  # along each line, ever longer ones
 NEAREST = 1.5  # pixels: the first step
@@ -35,6 +38,8 @@ THICKENING = 0.05  # by so much more for each unit of distance: directions betwe
 LEAST_RISE = 0.05  # sine of the angle above the surface below which it does not hide itself
 COVERED = 0.5  # coverage from which a pixel is a surface that hides others
 _CHUNK = 1 << 20  # pixels times directions at a time
+_BLOCK = 1 << 16  # of these, and pixels times steps: many passes go over them, so they stay in the processor's cache
+_BORDER = 1e-4  # of a sector or half plane: far more than two libraries' angles differ by
 
 
 @dataclass(frozen=True)
@@ -82,26 +87,53 @@ class SelfShadow:
             part: of the p pixels.
             directions: unit, camera axes.
         """
-        x, y = self.ray[part, :1], self.ray[part, 1:2]
-        view = -self.ray[part] / np.linalg.norm(self.ray[part], axis=1, keepdims=True)
-        # where the projection of a point goes that moves along the direction
-        azimuth = np.arctan2(directions[1] + y * directions[2], directions[0] + x * directions[2])
-        plane = np.round(azimuth * (HALF_PLANES / (2 * math.pi))).astype(np.int64) % HALF_PLANES
-        theta = np.arccos(np.clip(view @ directions, -1, 1))
-        sector = np.minimum(theta * (SECTORS / math.pi), SECTORS - 1).astype(np.uint64)
-        masks = (np.take_along_axis(of[part], plane, axis=1) for of in (self.hidden, self.behind))
-        hidden, behind = ((mask >> sector) & np.uint64(1) == 1 for mask in masks)
-        return hidden, behind
+        classes = self.classes(part, directions)
+        return classes == 0, classes <= 1
 
     def classes(self, part: slice, directions: Float[np.ndarray, "3 m"]) -> UInt8[np.ndarray, "q m"]:
         """For each direction its number in `unirender.models.visibility.CLASSES`; arguments: `look`."""
-        hidden, behind = self.look(part, directions)
-        return np.where(hidden, np.uint8(0), np.where(behind, np.uint8(1), np.uint8(2)))
+        ray, (masks, behind) = self.ray[part], (_as_bytes(of[part]) for of in (self.hidden, self.behind))
+        masks = (2 - behind) * (1 - masks)  # class of each half plane's sectors
+        cosine = -ray / np.linalg.norm(ray, axis=1, keepdims=True) @ directions
+        found = np.empty(cosine.shape, np.uint8)
+        step = max(1, _BLOCK // cosine.shape[1])
+        for some in (slice(i, i + step) for i in range(0, len(found), step)):
+            x, y = ray[some, :1], ray[some, 1:2]
+            # where the projection of a point goes that moves along the direction
+            azimuth = _angle(
+                torch.atan2,
+                np.arctan2,
+                HALF_PLANES / (2 * math.pi),
+                0.5,
+                directions[1] + y * directions[2],
+                directions[0] + x * directions[2],
+            )
+            plane = np.rint(azimuth, out=azimuth).astype(np.int32) & (HALF_PLANES - 1)  # `%` is slow
+            theta = _angle(torch.acos, np.arccos, SECTORS / math.pi, 0, np.clip(cosine[some], -1, 1))
+            sector = np.minimum(theta, SECTORS - 1, out=theta).astype(np.int32)
+            found[some] = of_rows(masks[some], plane * SECTORS + sector)
+        return found
 
     def parts(self, directions: int) -> Iterator[slice]:
         """Pixels that fit into memory together with so many directions."""
         step = max(1, _CHUNK // directions)
         yield from (slice(i, i + step) for i in range(0, len(self.hidden), step))
+
+
+def of_rows(table: Shaped[np.ndarray, "q t"], index: Integer[np.ndarray, "q m"]) -> Shaped[np.ndarray, "q m"]:
+    """What stands in each row of a table in the columns that the same row of the index names."""
+    found = np.empty(index.shape, table.dtype)
+    step = max(1, _BLOCK // index.shape[1])
+    first = np.arange(min(step, len(table)), dtype=np.int32)[:, None] * np.int32(table.shape[1])  # of a row
+    for some in (slice(i, i + step) for i in range(0, len(table), step)):
+        rows = table[some]
+        found[some] = rows.reshape(-1).take(first[: len(rows)] + index[some])
+    return found
+
+
+def _as_bytes(masks: UInt64[np.ndarray, "q a"]) -> UInt8[np.ndarray, "q t"]:
+    """The bits of a pixel's masks, one after another."""
+    return np.unpackbits(masks.astype("<u8").view(np.uint8), axis=1, bitorder="little")
 
 
 def _hidden(
@@ -113,35 +145,83 @@ def _hidden(
 ) -> UInt64[np.ndarray, "2 p a"]:
     """The masks of the pixels of a surface: hidden, and behind."""
     height, width = depth.shape
-    row, column = (index.astype(np.float32) for index in np.nonzero(surface))
     width_of_pixel = 2 * math.tan(math.radians(camera.fov_deg) / 2) / height  # at distance 1
-    pixel = width_of_pixel * depth
-    thick = (ROUNDNESS * _distance_to_ends(depth, surface, CUT * width_of_pixel) * pixel).astype(np.float32)
-    points = (rays * np.where(surface, depth, 0)[..., None]).astype(np.float32)
-    at = points[surface]
-    view = -at / np.linalg.norm(at, axis=1, keepdims=True)
-    masks = np.zeros((2, len(at), HALF_PLANES), np.uint64)
-    for plane in range(HALF_PLANES):
-        right, up = math.cos(2 * math.pi * plane / HALF_PLANES), math.sin(2 * math.pi * plane / HALF_PLANES)
-        for distance in np.geomspace(NEAREST, max(FARTHEST * max(height, width), 2 * NEAREST), STEPS):
-            i = np.round(row - up * distance).astype(np.int64)
-            j = np.round(column + right * distance).astype(np.int64)
-            in_frame = (i >= 0) & (i < height) & (j >= 0) & (j < width)
-            i, j = np.where(in_frame, i, 0), np.where(in_frame, j, 0)
-            there = np.flatnonzero(in_frame & surface[i, j])
-            front = points[i[there], j[there]]
-            towards = front - at[there]
-            length = np.linalg.norm(towards, axis=1)
-            above = (towards * normal[there]).sum(axis=1) > LEAST_RISE * length
-            there, front, towards, length = there[above], front[above], towards[above], length[above]
-            deep = thick[i[there], j[there]] + THICKENING * length
-            away = front / np.linalg.norm(front, axis=1, keepdims=True)
-            behind = towards + away * deep[:, None]
-            first = _sector((towards * view[there]).sum(axis=1) / length)
-            last = _sector((behind * view[there]).sum(axis=1) / np.linalg.norm(behind, axis=1))
-            masks[0, there, plane] |= _bits(first, last)
-            masks[1, there, plane] |= _bits(first, np.full_like(first, SECTORS))
+    thick = ROUNDNESS * _distance_to_ends(depth, surface, CUT * width_of_pixel) * (width_of_pixel * depth)
+    points = (rays * np.where(surface, depth, 0)[..., None]).astype(np.float32)[surface]
+    walls = _Walls(
+        np.ascontiguousarray(points.T),
+        np.ascontiguousarray((points / np.linalg.norm(points, axis=1, keepdims=True)).T),
+        np.ascontiguousarray(normal.T),
+        thick[surface].astype(np.float32),
+    )
+    number = np.full((height + 2, width + 2), -1)
+    number[1:-1, 1:-1][surface] = np.arange(len(points))
+    rows, columns = _targets(height, width)
+    row, column = np.nonzero(surface)
+    masks = np.empty((2, len(points), HALF_PLANES), np.uint64)
+    step = _BLOCK // STEPS
+    for part in (slice(i, i + step) for i in range(0, len(points), step)):
+        for plane in range(HALF_PLANES):
+            met = rows[plane].take(row[part], axis=1) * number.shape[1] + columns[plane].take(column[part], axis=1)
+            masks[:, part, plane] = walls.hide(part.start, number.take(met))
     return masks
+
+
+def _targets(height: int, width: int) -> tuple[Int[np.ndarray, "a s h"], Int[np.ndarray, "a s w"]]:
+    """Rows and columns to which the steps of each half plane lead from each row and column; in a frame padded by one,
+    where whatever lies outside is on its border.
+    """
+    distances = np.geomspace(NEAREST, max(FARTHEST * max(height, width), 2 * NEAREST), STEPS)
+    angles = [2 * math.pi * plane / HALF_PLANES for plane in range(HALF_PLANES)]
+    down = np.array([-math.sin(angle) for angle in angles])[:, None] * distances
+    right = np.array([math.cos(angle) for angle in angles])[:, None] * distances
+    ends = (
+        np.clip(np.round(np.arange(size) + offset[..., None]).astype(np.int64), -1, size) + 1
+        for size, offset in ((height, down), (width, right))
+    )
+    return next(ends), next(ends)
+
+
+@dataclass(frozen=True)
+class _Walls:
+    """The surface's pixels as what hides and what is hidden from.
+
+    Attributes:
+        at: where each is.
+        away: unit direction from the viewer to it.
+        normal: of it.
+        thick: by so much it goes on behind.
+    """
+
+    at: Float[np.ndarray, "3 p"]
+    away: Float[np.ndarray, "3 p"]
+    normal: Float[np.ndarray, "3 p"]
+    thick: Float[np.ndarray, " p"]
+
+    def hide(
+        self, start: int, met: Int[np.ndarray, "s q"]
+    ) -> tuple[UInt64[np.ndarray, " q"], UInt64[np.ndarray, " q"]]:
+        """Masks of a half plane.
+
+        Args:
+            start: number of the first of q pixels in a row.
+            met: numbers of the pixels that each of them meets, step by step; -1: none.
+        """
+        hidden, lowest = np.zeros(met.shape, np.uint64), np.full(met.shape, SECTORS)
+        where = np.flatnonzero(met >= 0)
+        own, other = np.broadcast_to(np.arange(start, start + met.shape[1]), met.shape).take(where), met.take(where)
+        towards = self.at.take(other, axis=1) - self.at.take(own, axis=1)
+        length = np.sqrt(dot(towards, towards))
+        above = np.flatnonzero(dot(towards, self.normal.take(own, axis=1)) > LEAST_RISE * length)
+        where, own, other, length = (each.take(above) for each in (where, own, other, length))
+        towards, view = towards.take(above, axis=1), -self.away.take(own, axis=1)
+        deep = self.thick.take(other) + THICKENING * length
+        behind = towards + self.away.take(other, axis=1) * deep
+        first = _middles(dot(towards, view) / length)
+        last = _middles(dot(behind, view) / np.sqrt(dot(behind, behind)))
+        hidden.reshape(-1)[where] = _bits(first, last)
+        lowest.reshape(-1)[where] = first
+        return np.bitwise_or.reduce(hidden, axis=0), _bits(lowest.min(axis=0), np.full(met.shape[1], SECTORS))
 
 
 def _distance_to_ends(
@@ -157,19 +237,45 @@ def _distance_to_ends(
     return np.asarray(distance_transform_edt(np.pad(whole, 1)))[1:-1, 1:-1]
 
 
-def _sector(cosine: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-    """The angle, in sectors."""
-    return np.arccos(np.clip(cosine, -1, 1)) * (SECTORS / math.pi)
+def _middles(cosine: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """How many sectors have their middle below an angle of that cosine."""
+    angle = _angle(torch.acos, np.arccos, SECTORS / math.pi, 0.5, np.clip(cosine, -1, 1))
+    return np.clip(np.ceil(angle - 0.5), 0, SECTORS).astype(np.int64)
 
 
-def _bits(first: Float[np.ndarray, " p"], last: Float[np.ndarray, " p"]) -> UInt64[np.ndarray, " p"]:
-    """Masks of the sectors whose middle lies between two angles."""
-    low = np.clip(np.ceil(first - 0.5), 0, SECTORS).astype(np.uint64)
-    high = np.clip(np.ceil(last - 0.5), 0, SECTORS).astype(np.uint64)
-    return np.where(high > low, _ones(high) ^ _ones(low), np.uint64(0))
+def _bits(first: Int[np.ndarray, " n"], last: Int[np.ndarray, " n"]) -> UInt64[np.ndarray, " n"]:
+    """Masks of the sectors from `first` to before `last`."""
+    ones = _ones()
+    return ones.take(np.maximum(first, last)) ^ ones.take(first)
 
 
-def _ones(count: UInt64[np.ndarray, " p"]) -> UInt64[np.ndarray, " p"]:
-    """Masks of so many lowest bits; 64 of them at most."""
-    full = np.uint64(0xFFFFFFFFFFFFFFFF)
-    return np.where(count >= SECTORS, full, (np.uint64(1) << np.minimum(count, SECTORS - 1)) - np.uint64(1))
+@functools.cache
+def _ones() -> UInt64[np.ndarray, " n"]:
+    """Masks of 0, 1, ... SECTORS lowest bits."""
+    return np.array([(1 << count) - 1 for count in range(SECTORS + 1)], np.uint64)
+
+
+def _angle(
+    fast: Callable[..., torch.Tensor],
+    exact: Callable[..., np.ndarray],
+    scale: float,
+    border: float,
+    *arguments: Float[np.ndarray, "*n"],
+) -> Float[np.ndarray, "*n"]:
+    """`scale * exact(*arguments)`, to be rounded: torch is several times as fast as numpy, but for last bits.
+
+    Args:
+        fast: of torch.
+        exact: the same of numpy, which is taken where last bits may decide.
+        scale: parts by radian.
+        border: of the parts, modulo 1.
+        arguments: of both.
+    """
+    angle = fast(*map(torch.from_numpy, arguments)).numpy()
+    angle *= scale
+    apart = angle + border
+    apart -= np.rint(apart)
+    near = np.flatnonzero(np.abs(apart, out=apart) < _BORDER)
+    if len(near):
+        angle.reshape(-1)[near] = scale * exact(*(argument.take(near) for argument in arguments))
+    return angle
