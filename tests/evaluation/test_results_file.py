@@ -69,7 +69,9 @@ def test_a_file_that_names_no_lights_is_read_and_a_reader_told() -> None:
     del older["lights"]
     found = from_document(older, "a.json")
     assert found.lights == {}
-    assert remarks(found) == ["the lights of its samples are not named: what holds under other lights, it cannot tell"]
+    assert remarks(found) == [
+        "the lights of its samples are not named: those of the suite count, where the very suite is installed"
+    ]
 
 
 def test_nothing_invalid_is_written(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from small_results import small_results
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, difference_over_lights, over_lights
 from unirender_evaluation.results.file import read_results, write_results
-from unirender_evaluation.results.lights import main, sample_lights, with_lights
+from unirender_evaluation.results.lights import lights_of, main, sample_lights, with_lights
 from unirender_evaluation.results.merge import merged_lights
 from unirender_evaluation.suites.suite import load_suite, material_key
 
@@ -36,6 +36,9 @@ def test_a_file_without_lights_gets_those_of_its_suite_and_stays_as_it_is_otherw
     write_results(path, of_tiny.run, [record])
     before = read_results(path)
     assert before.lights == {}
+    assert lights_of([before]) == sample_lights(suite), "the commands take them from the suite"
+    elsewhere = replace(before, run=replace(before.run, suite_hash="0" * 64))
+    assert lights_of([elsewhere]) == {}, "of another truth nothing is known"
     assert main(["tiny", str(path)]) == 0
     assert read_results(path) == replace(before, lights={record.sample: (scene.light,)})
     assert capsys.readouterr().out == f"{path}: the lights of 1 samples\n"

@@ -48,7 +48,7 @@ def remarks(results: Results) -> list[str]:
     else:
         found += _untold_part(results)
     if not results.lights:
-        found.append("the lights of its samples are not named: what holds under other lights, it cannot tell")
+        found.append("the lights of its samples are not named: those of the suite count, where the very suite is installed")
     used = {record.method for record in results.records}
     idle = [info.key for info in run.methods if info.key not in used]
     if idle:
@@ -202,7 +202,7 @@ def _light_problems(results: Results) -> Iterator[Problem]:
             yield Problem("lights", what)
 
 
-def _suite_of(run: RunInfo) -> "Suite | None":
+def suite_of(run: RunInfo) -> "Suite | None":
     """The very suite of a run with its truth; None where this installation does not have it."""
     from unirender_evaluation.suites.suite import load_suite
 
@@ -226,7 +226,7 @@ def _untold_part(results: Results) -> Iterator[str]:
     A method answers as much as it can, but the trivial rows and the bounds answer for all scenes of a run. Without a
     record of any scene, as of the multi-view table alone, nothing is known.
     """
-    suite = _suite_of(results.run)
+    suite = suite_of(results.run)
     if suite is None:
         return
     keys = {scene.key for scene in suite.scenes}
@@ -240,7 +240,7 @@ def _untold_part(results: Results) -> Iterator[str]:
 
 def _strangers_to_the_suite(results: Results) -> list[Problem]:
     """Pictures of another size and samples that the suite does not have, where it is the one installed here."""
-    suite, run = _suite_of(results.run), results.run
+    suite, run = suite_of(results.run), results.run
     if suite is None:
         return []
     from unirender_evaluation.results.lights import sample_lights

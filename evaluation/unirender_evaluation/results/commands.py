@@ -74,7 +74,8 @@ class BenchTables:
         """Prints the tables; returns 1 where there is none."""
         some(self.files, "tables")
         from unirender_evaluation.results.file import read_results
-        from unirender_evaluation.results.merge import merge, merged_lights
+        from unirender_evaluation.results.lights import lights_of
+        from unirender_evaluation.results.merge import merge
         from unirender_evaluation.results.schema_check import did_you_mean
         from unirender_evaluation.table_list import ALL_TABLES
         from unirender_evaluation.tables.build import build_tables
@@ -86,7 +87,7 @@ class BenchTables:
         found = [read_results(path) for path in self.files]
         run, records = merge(found)
         specs = {name: ALL_TABLES[name] for name in self.table or ALL_TABLES}
-        lights = merged_lights(found) if self.interval == "objects-and-lights" else None
+        lights = lights_of(found) if self.interval == "objects-and-lights" else None
         tables = build_tables(records, run, specs, variants, lights)
         if not tables:
             raise UnirenderError(
@@ -112,11 +113,12 @@ class BenchVerdict:
         """Prints the verdict."""
         some(self.files, "verdict")
         from unirender_evaluation.results.file import read_results
-        from unirender_evaluation.results.merge import merge, merged_lights
+        from unirender_evaluation.results.lights import lights_of
+        from unirender_evaluation.results.merge import merge
         from unirender_evaluation.results.verdict import VERDICTS
 
         found = [read_results(path) for path in self.files]
-        print(VERDICTS[self.format](*merge(found), merged_lights(found)), end="")
+        print(VERDICTS[self.format](*merge(found), lights_of(found)), end="")
         return 0
 
 

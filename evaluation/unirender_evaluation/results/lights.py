@@ -1,6 +1,7 @@
 """Under which lights each sample of a suite is: what an interval over objects and lights is made from.
 
-Files that `bench run` wrote before it named them get theirs from the suite, and stay as they are otherwise:
+Of files that `bench run` wrote before it named them the commands take those of the suite, if it is installed. This
+writes them into the files, which stay as they are otherwise:
 
     python -m unirender_evaluation.results.lights SUITE results.json ...
 """
@@ -12,8 +13,10 @@ from pathlib import Path
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Lights
+from unirender_evaluation.results.check import suite_of
 from unirender_evaluation.results.data import Results
 from unirender_evaluation.results.file import read_results, write_results
+from unirender_evaluation.results.merge import merged_lights
 from unirender_evaluation.suites.suite import Suite, load_suite
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
@@ -46,6 +49,15 @@ def with_lights(results: Results, suite: Suite) -> Results:
             f"{suite.spec.name} {suite.sha256[:12]}"
         )
     return replace(results, lights=sample_lights(suite))
+
+
+def lights_of(files: Sequence[Results]) -> Lights:
+    """The lights of the samples of all files, which are of one suite; of those that name none the suite's, if it is
+    installed here."""
+    named = merged_lights(files)
+    older = [file for file in files if not file.lights]
+    suite = suite_of(older[0].run) if older else None
+    return named if suite is None else sample_lights(suite) | named
 
 
 def main(arguments: Sequence[str]) -> int:
