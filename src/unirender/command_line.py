@@ -14,6 +14,7 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
+BORDER = "\N{BOX DRAWINGS LIGHT VERTICAL}"  # of the boxes of a help, where a stream can print it
 LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
 
 
@@ -121,13 +122,15 @@ def _asked(commands: Any, words: Sequence[str], prog: str) -> tuple[str, list[st
     """The command that a line begins with, from the program's name on, and the options that its help lists."""
     names = list(itertools.takewhile(lambda word: not word.startswith("-"), words))[:2]  # or values of a command
     while True:
-        printed, path = io.StringIO(), " ".join([prog, *names])
+        printed, path = io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), " ".join([prog, *names])
         streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
         with streams[0], streams[1], contextlib.suppress(SystemExit):
             tyro.cli(commands, args=[*names, "--help"], prog=prog)
-        lines = printed.getvalue().splitlines()
+        printed.seek(0)
+        lines = printed.read().splitlines()
         if not names or any(line.startswith(f"usage: {path} ") for line in lines):
-            heads = [line[2:].split("  ")[0] for line in lines if line[2:3] == "-"]  # not the prose
+            cells = (cell for line in lines for cell in line.split(BORDER))  # several a line, where a terminal is wide
+            heads = [cell[1:].split("  ")[0] for cell in cells if cell[1:2] == "-"]  # not the prose
             return path, sorted({"--help", *OPTION.findall(" ".join(heads))})
         names.pop()
 

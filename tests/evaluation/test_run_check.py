@@ -28,6 +28,7 @@ from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.tables.protocol import protocol_line
 from unirender_evaluation.tables.specs import PROTOCOLS
 from unirender_evaluation.truth.check import chosen_scenes
+from unirender_evaluation.truth.renders import TruthRenders
 from unirender_evaluation.verdict import verdict_text
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_reference.passes import Estimate
@@ -177,6 +178,17 @@ def test_a_check_that_is_killed_goes_on(suite: Suite, tmp_path: Path, drawing: t
     assert drawing.made == made
     assert {**other, "date": ""} == {**check, "date": ""}
     assert [r.values for r in whole.records] == [r.values for r in folder.records]
+
+
+@pytest.mark.parametrize("left", [0, 50, 200])
+def test_a_damaged_render_is_made_again(tmp_path: Path, left: int) -> None:
+    """A disk that lost a part of it ended this run and every one after it."""
+    renders = TruthRenders(tmp_path)
+    renders.of("image", lambda: {"mean": np.ones(100)})
+    (path,) = tmp_path.glob("*.npz")
+    path.write_bytes(path.read_bytes()[:left])
+    assert renders.of("image", lambda: {"mean": np.zeros(100)})["mean"].max() == 0
+    assert renders.of("image", dict)["mean"].max() == 0, "it is kept"
 
 
 def test_another_check_begins_anew(suite: Suite, tmp_path: Path, drawing: type[Drawing]) -> None:

@@ -86,9 +86,17 @@ def test_a_packed_picture_says_which_channel_counts(tmp_path):
     assert obj.roughness is not None
     assert obj.roughness[0, 0] == pytest.approx((0.2126 * 250 + 0.7152 * 100 + 0.0722 * 30) / 255, abs=1e-6)
     assert obj.provenance["ignored"] == "clearcoat"
-    for options, said in (("", "is in colour .* expected one value a texel"), ("-imfchan z ", "got -imfchan z")):
-        with pytest.raises(UnirenderError, match=f"texture 'orm.png' of metallic: {said}"):
-            write(tmp_path, f"map_Pm {options}orm.png")
+    with pytest.raises(UnirenderError, match=r"texture 'orm\.png' of metallic: got -imfchan z"):
+        write(tmp_path, "map_Pm -imfchan z orm.png")
+
+
+def test_a_map_in_colour_that_names_no_channel_counts_by_its_luminance(tmp_path):
+    """As the format has it; that the file is in colour is told, since it may be a packed one."""
+    (tmp_path / "orm.png").write_bytes(png(np.full((4, 4, 3), (250, 100, 30), np.uint8)))
+    obj = write(tmp_path, "map_Pm orm.png")
+    assert obj.metallic is not None
+    assert obj.metallic[0, 0] == pytest.approx((0.2126 * 250 + 0.7152 * 100 + 0.0722 * 30) / 255, abs=1e-6)
+    assert obj.provenance["ignored"] == "colour of a map of metallic"
 
 
 def test_normals_of_a_map_that_point_into_the_surface_count_as_flat(tmp_path):

@@ -75,6 +75,17 @@ def test_what_a_command_does_not_take(arguments: list[str], line: str, capsys: p
     assert said(capsys, *arguments) == (2, f"unirender: error: {line}\n")
 
 
+@pytest.mark.parametrize("columns", [40, 80, 250])
+def test_an_option_is_known_however_wide_the_terminal_is(
+    columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wide one gets several columns of options, of which those of the first were known."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    told = said(capsys, "optimize", "x", "--out", "y", "--refine.no-common-random-numbers", "--single.steps", "no")[1]
+    assert "no option of" not in told
+    assert "--single.steps" in told
+
+
 def test_what_the_machine_does_not_have(capsys: pytest.CaptureFixture[str]) -> None:
     """Not the command line is wrong then: a larger machine could do it."""
     status, line = said(capsys, "optimize", "x", "--out", "y", "--shape.cells", "100000")

@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -22,6 +23,15 @@ from unirender.intrinsics import Intrinsics
 from unirender.whole_files import replace_file, whole_file
 
 Arrays = Mapping[str, np.ndarray]
+
+
+def _stored(path: Path) -> Arrays | None:
+    """The arrays of a file; None of a damaged one."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes())) as stored:
+            return dict(stored)
+    except (EOFError, ValueError, BadZipFile):
+        return None
 
 
 @dataclass(frozen=True)
@@ -40,9 +50,8 @@ class TruthRenders:
         if self.folder is None:
             return make()
         path = self.folder / f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.npz"
-        if path.is_file():
-            with np.load(io.BytesIO(path.read_bytes())) as stored:
-                return dict(stored)
+        if path.is_file() and (stored := _stored(path)) is not None:
+            return stored
         made = make()
         with whole_file(path) as file:
             np.savez(file, **made)  # pyright: ignore[reportArgumentType] - no array has the name of an option

@@ -18,7 +18,9 @@ from unirender_reference.meshes.polygons import strip
 from unirender_reference.meshes.surface import Model, Piece
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
-UNIT_TOLERANCE = 0.01  # of a quaternion's squared length: what few digits leave; beyond, it would shear
+UNIT_TOLERANCE = (
+    0.0077  # of a quaternion's length: what signed bytes leave, as Khronos' validator allows; more would shear
+)
 VISIBILITY = "KHR_node_visibility"
 INSTANCING = "EXT_mesh_gpu_instancing"  # where no reader must have it, its mesh stands once, where its node is
 
@@ -101,10 +103,10 @@ def _local(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
     if "matrix" in node:
         return vector(node, "matrix", [0.0] * 16).reshape(4, 4).T
     x, y, z, w = quaternion = vector(node, "rotation", [0, 0, 0, 1])
-    if abs(quaternion @ quaternion - 1) > UNIT_TOLERANCE:
+    length = np.linalg.norm(quaternion)
+    if abs(length - 1) > UNIT_TOLERANCE:
         raise UnirenderError(
-            f"a node's rotation has the length {np.linalg.norm(quaternion):.3g}, expected a unit quaternion; export it "
-            "again"
+            f"a node's rotation has the length {length:.3g}, expected a unit quaternion; export it again"
         )
     rotation = np.array(
         [

@@ -194,6 +194,9 @@ class MtlMaterials:
             self.ignored |= buried
         elif channel != "albedo":
             which = (options.get("-imfchan") or [""])[0].lower()
+            if not which and float(np.ptp(texels, axis=-1).mean()) > COLOURED:
+                which = "l"  # as the format has it where nothing is said
+                self.ignored.add(f"colour of a map of {channel}")
             texels = _one_channel(texels, which, f"texture {file!r} of {channel}")
         self.ignored |= {f"{name} of a map" for name in UNHEEDED if _is_unheeded(name, options.get(name, []))}
         # OBJ counts v from below: v_down = 1 - (s v_up + o), in terms of the 1 - v_up that the reader stores
@@ -214,7 +217,7 @@ def _one_channel(texels: Float[np.ndarray, "h w 3"], which: str, what: str) -> F
     """The values of a texture of numbers, from the channel that `-imfchan` names; "" where all are alike.
 
     Raises:
-        UnirenderError: nothing says which channel of a picture in colour, or another one than r, g and b is named.
+        UnirenderError: another one than r, g, b and l (luminance) is named.
     """
     if which in ("r", "g", "b"):
         return texels[..., ["r", "g", "b"].index(which)][..., None]
@@ -222,11 +225,6 @@ def _one_channel(texels: Float[np.ndarray, "h w 3"], which: str, what: str) -> F
         return luminance(texels)[..., None]
     if which:
         raise UnirenderError(f"{what}: got -imfchan {which}, expected r, g, b or l; correct the MTL")
-    if (difference := float(np.ptp(texels, axis=-1).mean())) > COLOURED:
-        raise UnirenderError(
-            f"{what}: is in colour (its channels differ by {difference:.2g} in the mean), expected one value a texel; "
-            "name the channel in front of the file, as -imfchan g, or save it as grey"
-        )
     return texels[..., :1]
 
 
