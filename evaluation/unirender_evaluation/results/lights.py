@@ -57,7 +57,7 @@ def lights_of(files: Sequence[Results]) -> Lights:
     named = merged_lights(files)
     older = [file for file in files if not file.lights]
     suite = suite_of(older[0].run) if older else None
-    return named if suite is None else sample_lights(suite) | named
+    return named if suite is None else {**sample_lights(suite), **named}
 
 
 def main(arguments: Sequence[str]) -> int:
