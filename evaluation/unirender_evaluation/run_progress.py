@@ -40,7 +40,8 @@ class LineProgress(Progress):
         self._say(task_id)
 
     def _say(self, task_id: TaskID) -> None:
-        task, now = self._tasks[task_id], self.get_time()
+        task = next(task for task in self.tasks if task.id == task_id)
+        now = self.get_time()
         with self._turn:
             before = self._said.get(task_id)
             if not (task.total and task.visible) or task.finished or (before is not None and now - before < EVERY):

@@ -93,8 +93,11 @@ class Store:
     def close(self) -> list[Record]:
         """Sorts this run's records, writes and returns them, and lays the others by."""
         records = sorted(self.used.values(), key=lambda r: (r.table, r.protocol, r.method, r.sample))
-        write_records(self.unused_path, self._waiting())
+        if waiting := self._waiting():
+            write_records(self.unused_path, waiting)
         write_records(self.path, records)
+        if not waiting:
+            self.unused_path.unlink(missing_ok=True)
         return records
 
     def _code(self) -> set[str]:

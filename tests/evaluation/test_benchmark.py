@@ -382,6 +382,18 @@ def test_of_other_code_the_last_few_records_of_a_measurement_wait(suite: Suite, 
     assert len(waiting_after(["code"] * count, list(range(count)))) == 2 * (count - 1)
 
 
+def test_no_file_of_unused_records_where_every_record_is_used(tmp_path: Path) -> None:
+    """Neither in a new folder nor after a run has asked again for all that waited."""
+    record = Record("inverse", "single-image", "m", "s", "o", {}, "key")
+    path = tmp_path / "records.jsonl"
+    for laid_by in (True, False):
+        store = Store.open(path)
+        store.lay_by(record) if laid_by else store.has(record.key)
+        store.close()
+        assert (tmp_path / "unused.jsonl").exists() == laid_by
+    assert path.read_text().count("\n") == 1
+
+
 class Killer:
     """Ends its process."""
 
