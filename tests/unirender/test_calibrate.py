@@ -21,16 +21,16 @@ from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.augment import Draw
-from unirender.training.calibrate import Calibrate, readings, write_calibrated
-from unirender.training.calibration_line import Line, fit
+from unirender.training.after.calibrate import Calibrate, readings, write_calibrated
+from unirender.training.after.calibration_line import Line, fit
+from unirender.training.augmentations.augment import Draw
 from unirender.training.config import RunConfig
-from unirender.training.data import GroupDataset
-from unirender.training.facts import dataset_facts
-from unirender.training.groups import Pair
-from unirender.training.same_objects import object_of, objects_of
-from unirender.training.start import read_start
-from unirender.training.trainer import Trainer
+from unirender.training.data.dataset import GroupDataset
+from unirender.training.data.groups import Pair
+from unirender.training.data.same_objects import object_of, objects_of
+from unirender.training.loop.facts import dataset_facts
+from unirender.training.loop.trainer import Trainer
+from unirender.training.start.weights import read_start
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,14 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.models.packing import TRIPLETS
-from unirender.training import consistency, losses, passes
 from unirender.training.config import LossConfig, TrainConfig
-from unirender.training.loss_scale import FIRST
-from unirender.training.losses import LossFunction
-from unirender.training.passes import BatchGradient, Split
-from unirender.training.processes import Processes
+from unirender.training.losses import consistency
+from unirender.training.losses import loss_function as losses
+from unirender.training.losses.loss_function import LossFunction
+from unirender.training.optim import passes
+from unirender.training.optim.loss_scale import FIRST
+from unirender.training.optim.passes import BatchGradient, Split
+from unirender.training.optim.processes import Processes
 
 BATCH = 8
 CONFIG = dataclasses.replace(

@@ -19,15 +19,15 @@ from tiny_models import TRAIN, make_pipeline
 
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training import processes
-from unirender.training.checkpoint import load_state
 from unirender.training.command import Train
 from unirender.training.config import RunConfig, TrainConfig
-from unirender.training.processes import ALONE, Processes, join_processes
+from unirender.training.data.source import ShardSource
+from unirender.training.loop.checkpoint import load_state
+from unirender.training.loop.state import OF_ALL, check_alike
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim import processes
+from unirender.training.optim.processes import ALONE, Processes, join_processes
 from unirender.training.run import train
-from unirender.training.source import ShardSource
-from unirender.training.state import OF_ALL, check_alike
-from unirender.training.trainer import Trainer
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")
@@ -37,7 +37,7 @@ LOSSES = ("image", "material", "albedo", "normal", "specular", "diffuse", "envir
 BROKEN_DISK = """
 import os
 from unirender.errors import UnirenderError
-from unirender.training.source import ShardSource
+from unirender.training.data.source import ShardSource
 
 def next(self):
     raise UnirenderError("the disk of process 1 is gone")
@@ -48,8 +48,8 @@ if os.environ["RANK"] == "1":
 
 SLOW_SAVE = """
 import os, signal, time
-from unirender.training import trainer
-from unirender.training.source import ShardSource
+from unirender.training.loop import trainer
+from unirender.training.data.source import ShardSource
 
 own_next, own_save = ShardSource.next, trainer.save_state
 

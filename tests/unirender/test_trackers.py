@@ -16,9 +16,9 @@ from unirender.cli import main
 from unirender.errors import UsageError
 from unirender.training.command import Train
 from unirender.training.config import RunConfig
-from unirender.training.source import ShardSource
-from unirender.training.trackers import check_trackers, known_trackers, make_trackers, numbers, tracking
-from unirender.training.trainer import Trainer
+from unirender.training.data.source import ShardSource
+from unirender.training.logs.trackers import check_trackers, known_trackers, make_trackers, numbers, tracking
+from unirender.training.loop.trainer import Trainer
 
 NAME = "test_lines"
 
@@ -172,7 +172,7 @@ def test_unknown_trackers_are_refused_with_those_that_accelerate_knows(registere
 
 
 def test_a_run_of_wandb_is_found_again_by_its_folder(tmp_path: Path) -> None:
-    from unirender.training.trackers import _run_options
+    from unirender.training.logs.trackers import _run_options
 
     one, same, other = (_run_options("wandb", tmp_path / name) for name in ("a", "a/../a", "b"))
     assert one == same

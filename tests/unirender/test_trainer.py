@@ -28,10 +28,16 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.training import data as data_module
-from unirender.training import reader
-from unirender.training.augment import NO_AUGMENTATION
-from unirender.training.checkpoint import (
+from unirender.training.augmentations.augment import NO_AUGMENTATION
+from unirender.training.command import Train
+from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
+from unirender.training.data import dataset as data_module
+from unirender.training.data import reader
+from unirender.training.data.reader import BatchReader
+from unirender.training.data.source import ShardSource
+from unirender.training.logs.live import live_report, never_at_peak, standing
+from unirender.training.logs.run_log import read_lines
+from unirender.training.loop.checkpoint import (
     STATE_FILE,
     differences,
     load_state,
@@ -39,18 +45,12 @@ from unirender.training.checkpoint import (
     restore_folder,
     save_state,
 )
-from unirender.training.command import Train
-from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
-from unirender.training.export import export_pipeline, read_history
-from unirender.training.live import live_report, never_at_peak, standing
+from unirender.training.loop.export import export_pipeline, read_history
+from unirender.training.loop.trainer import Trainer, learning_rate
+from unirender.training.loop.validation import Validate, Validation
 from unirender.training.presets import PRESETS, get_preset
-from unirender.training.reader import BatchReader
 from unirender.training.run import train
-from unirender.training.run_log import read_lines
-from unirender.training.source import ShardSource
-from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import Trainer, learning_rate
-from unirender.training.validation import Validate, Validation
+from unirender.training.start.weights import begin_with_network, read_start
 
 CPU = torch.device("cpu")
 OVERFIT_STEPS = 150

@@ -16,13 +16,13 @@ from unirender.training.presets import PRESETS
 if TYPE_CHECKING:
     import torch
 
-    from unirender.training.data import GroupDataset
-    from unirender.training.device_data import DeviceSource
-    from unirender.training.memory import TrainingBytes
-    from unirender.training.processes import Processes
-    from unirender.training.source import ShardSource
-    from unirender.training.trainer import Trainer
-    from unirender.training.validation import Validate
+    from unirender.training.data.dataset import GroupDataset
+    from unirender.training.data.device_data import DeviceSource
+    from unirender.training.data.source import ShardSource
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.loop.validation import Validate
+    from unirender.training.optim.memory import TrainingBytes
+    from unirender.training.optim.processes import Processes
 
 
 def train(
@@ -45,9 +45,9 @@ def train(
         UsageError: the options ask for scores and there is no `validate`, or contradict each other.
     """
     from unirender.models.precision import resolve_device
-    from unirender.training.checkpoint import check_leftover
-    from unirender.training.groups import list_shards
-    from unirender.training.processes import join_processes
+    from unirender.training.data.groups import list_shards
+    from unirender.training.loop.checkpoint import check_leftover
+    from unirender.training.optim.processes import join_processes
 
     config = options.resolved(config)
     options.check_start(config)
@@ -79,13 +79,13 @@ def _train(
     from rich.console import Console
 
     from unirender.models.precision import resolve_dtype
-    from unirender.training.checkpoint import STATE_FILE
-    from unirender.training.export import export_pipeline
-    from unirender.training.live import live_report, never_at_peak
-    from unirender.training.memory import training_bytes
-    from unirender.training.start import read_start
-    from unirender.training.trackers import make_trackers, tracking
-    from unirender.training.trainer import Trainer
+    from unirender.training.logs.live import live_report, never_at_peak
+    from unirender.training.logs.trackers import make_trackers, tracking
+    from unirender.training.loop.checkpoint import STATE_FILE
+    from unirender.training.loop.export import export_pipeline
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.optim.memory import training_bytes
+    from unirender.training.start.weights import read_start
 
     dtype = resolve_dtype(options.dtype, device)
     parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
@@ -126,8 +126,8 @@ def _train(
 
 def _tell_data(folder: Path, data: "GroupDataset", say: Callable[[str], None]) -> None:
     """Says what is in a data folder, and what is doubtful about it."""
-    from unirender.training.closed_form_check import doubt
-    from unirender.training.groups import split_of, unread_shards
+    from unirender.training.data.closed_form_check import doubt
+    from unirender.training.data.groups import split_of, unread_shards
 
     say(f"{folder}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
     if unread := unread_shards(folder):
@@ -176,8 +176,8 @@ def make_source(
         trainer: whose rows of each batch they are.
         memory: that the training needs beside the data.
     """
-    from unirender.training.device_data import DeviceSource, fits
-    from unirender.training.source import ShardSource
+    from unirender.training.data.device_data import DeviceSource, fits
+    from unirender.training.data.source import ShardSource
 
     source = ShardSource(
         options.data,
@@ -197,7 +197,7 @@ def make_source(
 
 def described(trainer: "Trainer", source: "ShardSource | DeviceSource") -> str:
     """What trains, and where, in a line."""
-    from unirender.training.device_data import DeviceSource
+    from unirender.training.data.device_data import DeviceSource
 
     processes, at_once = trainer.processes, trainer.split.at_once
     place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""

@@ -18,8 +18,8 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.config import RunConfig, TrainConfig
+from unirender.training.loop.trainer import Trainer
 from unirender.training.presets import get_preset
-from unirender.training.trainer import Trainer
 from unirender_evaluation.studies.speed import network
 from unirender_evaluation.studies.speed.bare import BarePasses, Rows, cut_batch
 from unirender_evaluation.studies.speed.command import BenchSpeed

@@ -41,9 +41,9 @@ def throughput(
         UnirenderError: unusable shards, or pictures of another size than the preset's.
     """
     from unirender.training.config import RunConfig
-    from unirender.training.export import averaged_pipeline
-    from unirender.training.source import ShardSource
-    from unirender.training.trainer import Trainer
+    from unirender.training.data.source import ShardSource
+    from unirender.training.loop.export import averaged_pipeline
+    from unirender.training.loop.trainer import Trainer
     from unirender_evaluation.studies.speed.bare import BarePasses
 
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, cycle_warmup=0.0))
