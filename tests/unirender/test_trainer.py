@@ -46,6 +46,7 @@ from unirender.training.loop.checkpoint import (
     save_state,
 )
 from unirender.training.loop.export import export_pipeline, read_history
+from unirender.training.loop.facts import training_facts
 from unirender.training.loop.trainer import Trainer, learning_rate
 from unirender.training.loop.validation import Validate, Validation
 from unirender.training.presets import PRESETS, get_preset
@@ -330,7 +331,8 @@ def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> Non
 
 def test_the_best_on_other_scenes_is_not_compared(tmp_path: Path) -> None:
     """The best of an easy suite would stay for ever; and a run that goes on may be scored on others (`--validate`)."""
-    facts: dict[str, Any] = {"train": dataclasses.asdict(TRAIN), "scored_on": "4 scenes of the suite tiny"}
+    timed = Trainer(TRAIN, RunConfig(tmp_path, minutes=30.0), CPU, torch.float32)  # its length is no difference
+    facts: dict[str, Any] = training_facts(timed) | {"scored_on": "4 scenes of the suite tiny"}
     (tmp_path / "best").mkdir()
     (tmp_path / "best" / "training.json").write_text(json.dumps(facts))
     (tmp_path / STATE_FILE).touch()  # of a run that goes on; nobody reads it before
@@ -771,11 +773,14 @@ def test_a_process_reads_its_own_rows(tmp_path: Path) -> None:
     assert whole.state_dict() == parts[0].state_dict() == parts[1].state_dict()
 
 
-def test_data_of_another_size_is_refused(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path, size=32)
+def test_data_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    data = write_dataset(tmp_path / "data", size=32)
     ShardSource(data, 2, 0, size=32).open()
+    derived = dataclasses.replace(NO_AUGMENTATION, derived=1.0)
     with pytest.raises(UnirenderError, match="got pictures of 32 x 32, expected 64 x 64"):
-        ShardSource(data, 2, 0, size=64).open()
+        ShardSource(data, 2, 0, size=64, augmentation=derived).open()
+    assert not (tmp_path / "cache/derived").exists()  # which takes seconds a group
 
 
 def test_only_steps_count_as_training(tmp_path: Path) -> None:

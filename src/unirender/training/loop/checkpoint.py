@@ -18,7 +18,7 @@ from unirender.writing import writing
 
 STATE_FILE = "state.pt"
 PICTURES = "pictures"
-PROLONGABLE = "steps"  # a resumed run may be given another length
+LENGTH = {"steps", "minutes"}  # a resumed run may be given another; minutes: in the account beside a pipeline only
 # Entries of earlier versions that are gone, each with the value that means what a run is without it.
 GONE = {f"model.{name}": value for name, value in GONE_FROM_NETWORKS.items()} | {
     "loss.answers": 0.0,
@@ -99,10 +99,13 @@ def with_defaults(stored: dict[str, Any]) -> dict[str, Any]:
 
 
 def differences(stored: dict[str, Any], config: TrainConfig) -> list[str]:
-    """What a state's plain config has instead of `config`, by dotted names; the length of a run is no difference."""
+    """What a plain config, of a state or a `training.json`, has instead of `config`, by dotted names.
+
+    The length of a run is no difference.
+    """
     theirs, own = (dict(_leaves(tree)) for tree in (with_defaults(stored), plain(config)))
     theirs = {name: value for name, value in theirs.items() if name not in GONE or value != GONE[name]}
-    names = sorted((theirs.keys() | own.keys()) - {PROLONGABLE})
+    names = sorted((theirs.keys() | own.keys()) - LENGTH)
     return [f"{n} {theirs.get(n)!r} instead of {own.get(n)!r}" for n in names if theirs.get(n) != own.get(n)]
 
 
