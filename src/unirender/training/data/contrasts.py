@@ -35,15 +35,13 @@ class ContrastDataset(GroupDataset):
         run_length: pictures of a run.
     """
 
-    def __init__(
-        self, folder: str | Path, shards: tuple[str, ...] | None = None, *, run_length: int, derived: bool = False
-    ) -> None:
+    def __init__(self, folder: str | Path, shards: tuple[str, ...] | None = None, *, run_length: int) -> None:
         """Opens a folder as `GroupDataset` does.
 
         Raises:
             UnirenderError: it was rendered with another `--vary`, or has no set as large as a run.
         """
-        super().__init__(folder, shards, derived=derived)
+        super().__init__(folder, shards)
         self.run_length = run_length
         groups = [group for _, group in self._groups]
         others = sorted({group.vary for group in groups} - {"one-at-a-time"})

@@ -83,8 +83,7 @@ class GroupDataset:
             self.shards.append(open_packed(path, sha256, names[path]))
             if progress is not None:
                 progress(len(self.shards), len(available))
-        pairs = list(zip(available, self.shards, strict=True))
-        self._derived: list[DerivedLight] | None = open_derived(pairs, progress) if derived else None
+        self._derived: list[DerivedLight] | None = None
         sizes = {shard.shared.shape[-2:]: shard.name for shard in self.shards}
         if len(sizes) != 1:
             named = ", ".join(f"{width} x {height} ({name})" for (height, width), name in sorted(sizes.items()))
@@ -100,6 +99,16 @@ class GroupDataset:
         for i, (_, group) in enumerate(self._groups):
             self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
         self.fingerprint = hashlib.sha256(" ".join(shard.sha256 for shard in self.shards).encode()).hexdigest()
+        if derived:  # the last, as it may take long: a folder that is refused is refused before
+            self.derive(progress)
+
+    def derive(self, progress: Callable[[int, int], None] | None = None) -> None:
+        """Opens s and d as derived from their light, and derives first what was not derived before.
+
+        Args:
+            progress: called with (shards derived, shards to derive).
+        """
+        self._derived = open_derived(list(zip(self._paths, self.shards, strict=True)), progress)
 
     def _check_keys(self) -> None:
         """Looks for groups that are there twice; meshes of one name in two parts are two objects.

@@ -119,11 +119,10 @@ class ShardSource:
         """The shards as pairs, or as runs of contrasts; refused where their size is not the network's."""
         if shards is None:
             split_of(self.folder)
-        derived = self.augmentation.derived > 0
         if self.group_size == 1:
-            dataset = GroupDataset(self.folder, shards, derived=derived)
+            dataset = GroupDataset(self.folder, shards)
         else:
-            dataset = ContrastDataset(self.folder, shards, run_length=self.group_size, derived=derived)
+            dataset = ContrastDataset(self.folder, shards, run_length=self.group_size)
         height, width = dataset.resolution
         if self.size is not None and (height, width) != (self.size, self.size):
             raise UnirenderError(
@@ -131,6 +130,8 @@ class ShardSource:
                 f"the network is made for; render data with --resolution {self.size}, or train with another "
                 "--resolution or --preset"
             )
+        if self.augmentation.derived > 0:
+            dataset.derive()
         return dataset
 
     def state_dict(self) -> dict[str, Any]:
