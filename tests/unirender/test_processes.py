@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -102,14 +101,6 @@ def losses(out: Path) -> list[dict[str, float]]:
     return [{name: line[name] for name in ("step", *LOSSES) if name in line} for line in lines]
 
 
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """What a training in this process does to torch's threads is undone."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("torchrun")
@@ -130,7 +121,7 @@ def one_process(run: Run, out: Path, seed: int) -> list[dict[str, float]]:
 
 
 @pytest.mark.long
-def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads: None) -> None:
+def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path) -> None:
     assert [f"process {rank} of 2" in run.printed for rank in range(3)] == [True, True, False]
     assert len(json.loads((run.out / "config.json").read_text())["hardware"]) == 2
     assert run.printed.count("use it with --checkpoint") == 1  # the first process alone speaks of it

@@ -49,6 +49,7 @@ from unirender.training.loop.export import export_pipeline, read_history
 from unirender.training.loop.facts import training_facts
 from unirender.training.loop.trainer import Trainer, learning_rate
 from unirender.training.loop.validation import Validate, Validation
+from unirender.training.optim.passes import side_by_side
 from unirender.training.presets import PRESETS, get_preset
 from unirender.training.run import train
 from unirender.training.start.weights import begin_with_network, read_start
@@ -688,12 +689,16 @@ def test_a_resume_with_another_beginning_is_refused(tmp_path: Path) -> None:
 
 
 def test_loading_what_a_run_begins_with_shows_no_bars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And a call of `train` leaves torch's threads as they were: a second one would train in other parts."""
     diffusers.utils.logging.enable_progress_bar()
     data = write_dataset(tmp_path / "data", size=64)
     make_pipeline(0).save_pretrained(tmp_path / "other")
     options = Train(data, out=tmp_path / "run", init=tmp_path / "other", steps=1)
-    with pytest.raises(UnirenderError, match="expected the same network"):
-        train(options, options.check(), tmp_path / "run")
+    with side_by_side(CPU, 1):
+        torch.set_num_threads(3)
+        with pytest.raises(UnirenderError, match="expected the same network"):
+            train(options, options.check(), tmp_path / "run")
+        assert torch.get_num_threads() == 3
     assert "Loading" not in capsys.readouterr().err
 
 

@@ -47,6 +47,7 @@ def train(
     from unirender.models.precision import resolve_device
     from unirender.training.data.groups import list_shards
     from unirender.training.loop.checkpoint import check_leftover
+    from unirender.training.optim.passes import side_by_side
     from unirender.training.optim.processes import join_processes
 
     config = options.resolved(config)
@@ -61,21 +62,24 @@ def train(
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
     check_leftover(out, "pipeline")
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
-    with alone(out) if processes.is_main else contextlib.nullcontext():
-        return _train(options, config, out, validate, processes, device)
+    with (
+        alone(out) if processes.is_main else contextlib.nullcontext(),
+        side_by_side(device, options.parallel) as parallel,
+    ):
+        run = run_config(options, config, out, parallel)
+        return _train(options, config, run, validate, processes, device)
 
 
 def _train(
     options: Train,
     config: TrainConfig,
-    out: Path,
+    run: RunConfig,
     validate: "Validate | None",
     processes: "Processes",
     device: "torch.device",
 ) -> Path | None:
     """In a folder that no other run writes to."""
     import diffusers
-    import torch
     from rich.console import Console
 
     from unirender.models.precision import resolve_dtype
@@ -88,10 +92,7 @@ def _train(
     from unirender.training.start.weights import read_start
 
     dtype = resolve_dtype(options.dtype, device)
-    parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
-    if parallel > 1:
-        torch.set_num_threads(1)
-    run = run_config(options, config, out, parallel)
+    out = run.out
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     tell = notice if processes.is_main else lambda text: None
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files

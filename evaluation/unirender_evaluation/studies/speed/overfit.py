@@ -25,7 +25,7 @@ from unirender.training.config import OptimizerConfig, TrainConfig
 from unirender.training.presets import get_preset
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key, psnr_from_mse
 from unirender_evaluation.scoring import score_image
-from unirender_evaluation.studies.speed.timing import Part, side_by_side
+from unirender_evaluation.studies.speed.timing import Part
 from unirender_evaluation.tables.formats import format_number
 from unirender_evaluation.tables.text import TextTable
 
@@ -145,6 +145,7 @@ def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype:
     """Trains on one pair for so many minutes; a point for every measure, the first before the first step."""
     from unirender.training.config import RunConfig
     from unirender.training.loop.trainer import Trainer
+    from unirender.training.optim.passes import side_by_side
 
     batch = {name: value.expand(config.batch_size, -1, -1, -1) for name, value in pair.items()}
     points: list[Point] = []

@@ -13,9 +13,10 @@ the more others use the cores, the longer that wait: hence parts side by side (`
 `--parallel 1` and without, shows what it is worth). On a GPU parts one after the other save memory.
 """
 
+import contextlib
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -36,6 +37,24 @@ OWN_ROWS = ("image", "environment", "composite", "cycle")  # terms whose means h
 
 Gradients = list[Tensor | None]  # by parameter; None: it took no part
 ByName = dict[str, float]
+
+
+@contextlib.contextmanager
+def side_by_side(device: torch.device, parallel: int | None = None) -> Iterator[int]:
+    """How many parts of a batch run side by side; inside this block each has one thread of its own.
+
+    Args:
+        device: of the passes.
+        parallel: what is asked for. None: on a CPU as many as PyTorch has threads, elsewhere 1.
+    """
+    threads = torch.get_num_threads()
+    parallel = parallel or (threads if device.type == "cpu" else 1)
+    if parallel > 1:
+        torch.set_num_threads(1)
+    try:
+        yield parallel
+    finally:
+        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)
