@@ -13,7 +13,7 @@ from synthetic_shards import write_dataset
 from tiny_models import TRAIN
 
 from unirender.cli import main
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.training.command import Train
 from unirender.training.config import RunConfig
 from unirender.training.data.source import ShardSource
@@ -124,7 +124,8 @@ class UnreachableTracker(LineTracker):
 
 def test_trackers_that_were_started_are_finished_where_another_cannot_start(tmp_path: Path) -> None:
     trackers = (LineTracker("one", tmp_path), UnreachableTracker("two", tmp_path), LineTracker("three", tmp_path))
-    with pytest.raises(ConnectionError, match="no such host"), tracking(trackers, TRAIN):
+    expected = f"--track {NAME}: cannot be started \\(no such host\\); mend that, or leave it out"
+    with pytest.raises(UnirenderError, match=expected), tracking(trackers, TRAIN):
         pytest.fail("the run went on without its tracker")
     told = [json.loads(line)["event"] for line in trackers[0].path.read_text().splitlines()]
     assert told == ["start", "parameters", "finish"]

@@ -17,7 +17,7 @@ from typing import Any
 
 from accelerate.tracking import LOGGER_TYPE_TO_CLASS, GeneralTracker, get_available_trackers
 
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.notices import notice
 from unirender.training.config import TrainConfig
 from unirender.training.logs.live import Report
@@ -90,14 +90,19 @@ def tracking(
         config: stored as the run's parameters.
         resumed: the run's parameters are stored already.
         show: is told every line, too.
+
+    Raises:
+        UnirenderError: one cannot be started, as where nobody is logged in to its service.
     """
     working = list(trackers)  # those that have not failed
     with contextlib.ExitStack() as stack:
         for tracker in trackers:
-            tracker.start()
+            with _starting(tracker):
+                tracker.start()
             stack.callback(_finish, tracker, working)
             if not resumed:
-                tracker.store_init_configuration(parameters(dataclasses.asdict(config)))
+                with _starting(tracker):
+                    tracker.store_init_configuration(parameters(dataclasses.asdict(config)))
 
         def report(line: dict[str, Any]) -> None:
             show(line)
@@ -124,11 +129,23 @@ def _told(tracker: GeneralTracker, tell: Callable[[], object]) -> bool:
     try:
         tell()
     except Exception as error:  # of any library
-        reason = " ".join(str(error).split()) or type(error).__name__
-        name = getattr(tracker, "name", type(tracker).__name__)
-        notice(f"--track {name}: failed ({reason}); the training goes on without it, and log.jsonl has all")
+        notice(f"{_named(tracker, 'failed', error)}; the training goes on without it, and log.jsonl has all")
         return False
     return True
+
+
+@contextlib.contextmanager
+def _starting(tracker: GeneralTracker) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # of any library
+        raise UnirenderError(f"{_named(tracker, 'cannot be started', error)}; mend that, or leave it out") from error
+
+
+def _named(tracker: GeneralTracker, what: str, error: Exception) -> str:
+    """What happened to a tracker, and why."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    return f"--track {getattr(tracker, 'name', type(tracker).__name__)}: {what} ({reason})"
 
 
 def numbers(line: Mapping[str, Any], prefix: str = "") -> dict[str, float]:
