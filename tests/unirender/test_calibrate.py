@@ -123,7 +123,8 @@ def test_every_object_counts_the_same() -> None:
     for name in ("slope", "offset", "before", "after", "chance"):
         assert getattr(often, name) == pytest.approx(getattr(once, name), rel=1e-9), name
     assert fit(5 * objects, found, truth).after == pytest.approx(once.after, rel=1e-9)
-    assert [object_of(key) for key in ("train-5_g0", "a_g1_g12", "plain")] == ["train-5", "a_g1", "plain"]
+    assert [object_of(key) for key in ("train-5_g0", "a_g1_g12", "_g3")] == ["train-5", "a_g1", "_g3"]
+    assert [object_of(key) for key in ("plain", "mug_green")] == ["plain", "mug_green"]  # no number of a group
 
 
 def test_a_prediction_is_moved_as_a_whole() -> None:

@@ -17,12 +17,13 @@ from unirender.training.data.dataset import GroupDataset
 
 CELLS = 8  # along each side of a picture: means over them are compared
 ALIKE = 0.01  # root mean square of the difference below which two look alike; another colour is more
+_NUMBER = re.compile(r"_g\d+$")  # of a group
 _TURNED = re.compile(r"-turned\d+$")
 
 
 def object_of(key: str) -> str:
     """The object of a group, by its key: one object may have several."""
-    return _TURNED.sub("", key.rpartition("_g")[0] or key)
+    return _TURNED.sub("", _NUMBER.sub("", key) or key)
 
 
 def objects_of(data: GroupDataset) -> tuple[Int[np.ndarray, " groups"], list[tuple[str, str]]]:
