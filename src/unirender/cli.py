@@ -28,10 +28,10 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.notices import NoticeHandler, notice
 from unirender.process_ends import READER_LEFT, drop_output, hear_ends, open_streams, quick_start, reader_left
 from unirender.system_errors import out_of_memory, refused_by_system
-from unirender.training.average import Average
-from unirender.training.calibrate import Calibrate
+from unirender.training.after.average import Average
+from unirender.training.after.calibrate import Calibrate
 from unirender.training.command import Train
-from unirender.training.visibility import TrainVisibility
+from unirender.training.shadows.command import TrainVisibility
 from unirender_evaluation.commands import Bench
 from unirender_evaluation.demo.command import Demo
 from unirender_evaluation.figures.command import Figures
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from unirender.camera import Camera
     from unirender.intrinsics import Intrinsics
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-    from unirender.training.validation import Validate
+    from unirender.training.loop.validation import Validate
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from doc_blocks import DOCS, blocks
 from inline_executor import Inline
 from PIL import Image
 
-from unirender.training.groups import read_groups
+from unirender.training.data.groups import read_groups
 from unirender_evaluation.predictions.conventions import read_conventions
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw

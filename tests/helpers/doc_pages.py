@@ -20,7 +20,7 @@ from tiny_suites import make_suite
 from unirender.color import image_srgb, unpremultiply
 from unirender.exr import image_channels, write_exr
 from unirender.models.dual_stream import DualStreamModel
-from unirender.training.groups import read_groups
+from unirender.training.data.groups import read_groups
 from unirender.visualization import write_png
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.predictions.check import folder_problems, questions

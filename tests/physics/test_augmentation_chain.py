@@ -9,8 +9,8 @@ import pytest
 from unirender.exposure import exposure_factor
 from unirender.exr import channels_rgb, read_exr_bytes
 from unirender.symmetries import mirror, permute_channels, quarter_turn, turn_rotation
-from unirender.training.augment import Draw, mix_lights
-from unirender.training.data import GroupDataset
+from unirender.training.augmentations.augment import Draw, mix_lights
+from unirender.training.data.dataset import GroupDataset
 from unirender_reference.dataset import render_group
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.plan import plan_groups

@@ -21,7 +21,7 @@ from inline_executor import Inline
 
 from unirender.errors import UnirenderError
 from unirender.exr import write_exr
-from unirender.training.groups import list_shards
+from unirender.training.data.groups import list_shards
 from unirender_reference import journal, passes, shards
 from unirender_reference.cluster import this_machine
 from unirender_reference.commands import Dataset

@@ -14,7 +14,7 @@ from inline_executor import Inline
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes, write_exr
-from unirender.training.groups import read_groups
+from unirender.training.data.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig

@@ -16,8 +16,8 @@ from trimesh.visual.texture import TextureVisuals
 
 from unirender.errors import UnirenderError
 from unirender.exr import read_exr_bytes
-from unirender.training.data import GroupDataset
-from unirender.training.groups import read_groups
+from unirender.training.data.dataset import GroupDataset
+from unirender.training.data.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import MAX_TILT_DEG, DatasetConfig

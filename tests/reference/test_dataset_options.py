@@ -14,9 +14,9 @@ from unirender.cli import main
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.training.augment import METALLIC_NODES, interpolate_metallic
-from unirender.training.data import GroupDataset
-from unirender.training.groups import read_groups
+from unirender.training.augmentations.augment import METALLIC_NODES, interpolate_metallic
+from unirender.training.data.dataset import GroupDataset
+from unirender.training.data.groups import read_groups
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate, render_group
 from unirender_reference.dataset_config import GRID, DatasetConfig

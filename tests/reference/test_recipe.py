@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.training.data import GroupDataset
+from unirender.training.data.dataset import GroupDataset
 from unirender_reference.commands import Dataset
 from unirender_reference.recipe import read_recipe
 

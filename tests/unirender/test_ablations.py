@@ -19,11 +19,11 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.config import LossConfig, RunConfig
-from unirender.training.export import export_pipeline
-from unirender.training.losses import LossFunction
+from unirender.training.data.source import ShardSource
+from unirender.training.loop.export import export_pipeline
+from unirender.training.loop.trainer import Trainer
+from unirender.training.losses.loss_function import LossFunction
 from unirender.training.presets import PRESETS
-from unirender.training.source import ShardSource
-from unirender.training.trainer import Trainer
 
 T = 999
 CPU = torch.device("cpu")

@@ -5,7 +5,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.symmetries import permute_channels, scale_light
-from unirender.training.augment import from_maps, interpolate_metallic, mix_lights, to_maps
+from unirender.training.augmentations.augment import from_maps, interpolate_metallic, mix_lights, to_maps
 
 
 def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:

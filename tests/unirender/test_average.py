@@ -16,9 +16,9 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_sha256
-from unirender.training.average import Average, averaged_facts
-from unirender.training.card import CARD_FILE
-from unirender.training.export import TRAINING_FILE, read_history
+from unirender.training.after.average import Average, averaged_facts
+from unirender.training.loop.card import CARD_FILE
+from unirender.training.loop.export import TRAINING_FILE, read_history
 
 WEIGHTS = "dual_stream/diffusion_pytorch_model.safetensors"
 

@@ -21,16 +21,16 @@ from unirender.pipelines.calibration import calibrated, check_lines
 from unirender.pipelines.masked_maps import masked_mean
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
-from unirender.training.augment import Draw
-from unirender.training.calibrate import Calibrate, readings, write_calibrated
-from unirender.training.calibration_line import Line, fit
+from unirender.training.after.calibrate import Calibrate, readings, write_calibrated
+from unirender.training.after.calibration_line import Line, fit
+from unirender.training.augmentations.augment import Draw
 from unirender.training.config import RunConfig
-from unirender.training.data import GroupDataset
-from unirender.training.facts import dataset_facts
-from unirender.training.groups import Pair
-from unirender.training.same_objects import object_of, objects_of
-from unirender.training.start import read_start
-from unirender.training.trainer import Trainer
+from unirender.training.data.dataset import GroupDataset
+from unirender.training.data.groups import Pair
+from unirender.training.data.same_objects import object_of, objects_of
+from unirender.training.loop.facts import dataset_facts
+from unirender.training.loop.trainer import Trainer
+from unirender.training.start.weights import read_start
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,8 @@ def test_every_object_counts_the_same() -> None:
     for name in ("slope", "offset", "before", "after", "chance"):
         assert getattr(often, name) == pytest.approx(getattr(once, name), rel=1e-9), name
     assert fit(5 * objects, found, truth).after == pytest.approx(once.after, rel=1e-9)
-    assert [object_of(key) for key in ("train-5_g0", "a_g1_g12", "plain")] == ["train-5", "a_g1", "plain"]
+    assert [object_of(key) for key in ("train-5_g0", "a_g1_g12", "_g3")] == ["train-5", "a_g1", "_g3"]
+    assert [object_of(key) for key in ("plain", "mug_green")] == ["plain", "mug_green"]  # no number of a group
 
 
 def test_a_prediction_is_moved_as_a_whole() -> None:

@@ -14,11 +14,11 @@ from tiny_models import TRAIN
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_names
-from unirender.training.card import CARD_FILE, card_text
 from unirender.training.config import RunConfig
-from unirender.training.export import export_pipeline
-from unirender.training.source import ShardSource
-from unirender.training.trainer import Trainer
+from unirender.training.data.source import ShardSource
+from unirender.training.loop.card import CARD_FILE, card_text
+from unirender.training.loop.export import export_pipeline
+from unirender.training.loop.trainer import Trainer
 
 FACTS: dict[str, Any] = {
     "preset": "tiny",

@@ -326,7 +326,7 @@ def test_a_forked_process_ends_as_any_other() -> None:
 FEWER_SIGNALS = """
 import signal
 del signal.SIGHUP, signal.pthread_kill
-import unirender.training.stopping
+import unirender.training.loop.stopping
 from unirender import cli, process_ends
 
 cli.run = lambda command: process_ends._Ends().again(signal.SIGINT)

@@ -11,8 +11,8 @@ from tiny_models import TRAIN
 from unirender.errors import UnirenderError
 from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.config_check import RANGES, check_config
+from unirender.training.loop.trainer import Trainer
 from unirender.training.presets import PRESETS
-from unirender.training.trainer import Trainer
 
 
 def changed(config: Any, name: str, value: float) -> Any:

@@ -8,13 +8,13 @@ import torch
 from synthetic_shards import group_members, write_dataset, write_shard
 
 from unirender.errors import UnirenderError
-from unirender.training.augment import DEFAULT_AUGMENTATION, NO_AUGMENTATION
+from unirender.training.augmentations.augment import DEFAULT_AUGMENTATION, NO_AUGMENTATION
 from unirender.training.command import Train
 from unirender.training.config import Augmentation
-from unirender.training.contrasts import ContrastDataset, sets_of
-from unirender.training.data import GroupDataset
-from unirender.training.groups import Group, Pair
-from unirender.training.source import ShardSource
+from unirender.training.data.contrasts import ContrastDataset, sets_of
+from unirender.training.data.dataset import GroupDataset
+from unirender.training.data.groups import Group, Pair
+from unirender.training.data.source import ShardSource
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.plan import OBJECT_BLOCK, plan_groups
 

@@ -21,18 +21,18 @@ from unirender.lighting import mean_radiance, resample_environment, rotate_envir
 from unirender.paths import cache_dir
 from unirender.surface_light import diffuse_light, specular_light
 from unirender.symmetries import turn_rotation
-from unirender.training.augment import (
+from unirender.training.augmentations.augment import (
     DEFAULT_AUGMENTATION,
     NO_AUGMENTATION,
     Draw,
     draw,
 )
+from unirender.training.augmentations.environments import turned_environments
 from unirender.training.config import Augmentation
-from unirender.training.data import BATCH_MAPS, GroupDataset
-from unirender.training.environments import turned_environments
-from unirender.training.groups import Pair, list_shards, read_groups, split_of, unread_shards
-from unirender.training.reader import BatchReader
-from unirender.training.source import ShardSource
+from unirender.training.data.dataset import BATCH_MAPS, GroupDataset
+from unirender.training.data.groups import Pair, list_shards, read_groups, split_of, unread_shards
+from unirender.training.data.reader import BatchReader
+from unirender.training.data.source import ShardSource
 
 
 @pytest.fixture(scope="module")

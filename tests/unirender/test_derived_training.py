@@ -26,14 +26,14 @@ from unirender.pipelines.inputs import ready_to_render, told_derived
 from unirender.pipelines.results import EditResult
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.surface_light import diffuse_light, specular_light
-from unirender.training import derived
-from unirender.training.augment import NO_AUGMENTATION
+from unirender.training.augmentations.augment import NO_AUGMENTATION
 from unirender.training.config import Augmentation, LossConfig
-from unirender.training.data import BATCH_MAPS, DERIVED_FLAGS, DERIVED_MAPS, GroupDataset
-from unirender.training.derived import DerivedLight
-from unirender.training.groups import list_shards, read_groups
-from unirender.training.losses import LossFunction
-from unirender.training.reader import BatchReader
+from unirender.training.data import derived
+from unirender.training.data.dataset import BATCH_MAPS, DERIVED_FLAGS, DERIVED_MAPS, GroupDataset
+from unirender.training.data.derived import DerivedLight
+from unirender.training.data.groups import list_shards, read_groups
+from unirender.training.data.reader import BatchReader
+from unirender.training.losses.loss_function import LossFunction
 
 ALWAYS = Augmentation(mix=0.7, tint=0.3, permute=0.6, turn=0.6, derived=1.0)
 LIGHT = ("specular", "diffuse")

@@ -11,17 +11,17 @@ from synthetic_shards import group_members, maps_members, write_dataset, write_s
 from tiny_models import TRAIN
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.training.augment import NO_AUGMENTATION
+from unirender.training.augmentations.augment import NO_AUGMENTATION
 from unirender.training.command import Train
 from unirender.training.config import Augmentation, RunConfig
-from unirender.training.data import ALL_ROWS, Batch, GroupDataset, make_batch
-from unirender.training.device_data import DeviceSource, fits, packed_bytes, room
-from unirender.training.device_groups import DeviceGroups
-from unirender.training.facts import training_facts
-from unirender.training.memory import TrainingBytes
+from unirender.training.data.dataset import ALL_ROWS, Batch, GroupDataset, make_batch
+from unirender.training.data.device_data import DeviceSource, fits, packed_bytes, room
+from unirender.training.data.device_groups import DeviceGroups
+from unirender.training.data.source import ShardSource
+from unirender.training.loop.facts import training_facts
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim.memory import TrainingBytes
 from unirender.training.run import train
-from unirender.training.source import ShardSource
-from unirender.training.trainer import Trainer
 
 EVERYTHING = Augmentation(mix=0.7, permute=0.5, turn=0.5, repaint=0.5, derived=0.6, shadowed=0.5, move=0.5)
 ONE_BY_ONE = {

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from unirender.training.ema import Ema
+from unirender.training.optim.ema import Ema
 
 
 def left_of_the_start(decay: float, updates: int) -> float:

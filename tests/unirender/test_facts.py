@@ -8,11 +8,11 @@ import pytest
 import torch
 from tiny_models import TRAIN
 
-from unirender.training import facts
 from unirender.training.config import RunConfig
-from unirender.training.facts import data_facts, processor_name, training_facts
-from unirender.training.source import ShardSource
-from unirender.training.trainer import Trainer
+from unirender.training.data.source import ShardSource
+from unirender.training.loop import facts
+from unirender.training.loop.facts import data_facts, processor_name, training_facts
+from unirender.training.loop.trainer import Trainer
 
 LOG: tuple[dict[str, Any], ...] = (
     {"step": 10, "samples_per_s": 5.0, "image": 0.4},

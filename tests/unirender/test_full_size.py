@@ -15,9 +15,9 @@ from torch import Tensor
 
 from unirender.models.build import build_model
 from unirender.models.dual_stream import DualStreamModel
-from unirender.training.memory import readable, training_bytes
+from unirender.training.optim.memory import readable, training_bytes
 from unirender.training.presets import PRESETS
-from unirender.training.stable_diffusion import StableDiffusion
+from unirender.training.start.stable_diffusion import StableDiffusion
 
 pytestmark = pytest.mark.large
 

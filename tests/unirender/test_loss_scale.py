@@ -10,11 +10,11 @@ from tiny_models import TRAIN, make_batch
 from torch import Tensor
 
 from unirender.errors import UnirenderError
-from unirender.training import loss_scale
-from unirender.training.checkpoint import load_state
 from unirender.training.config import RunConfig
-from unirender.training.loss_scale import FIRST, LEAST, LossScale
-from unirender.training.trainer import Trainer
+from unirender.training.loop.checkpoint import load_state
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim import loss_scale
+from unirender.training.optim.loss_scale import FIRST, LEAST, LossScale
 
 CPU = torch.device("cpu")
 

@@ -19,12 +19,12 @@ from unirender.models.codec import KLCodec
 from unirender.models.dual_stream import DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import PRIORS
-from unirender.training import consistency as consistency_module
-from unirender.training import loss_terms
 from unirender.training.config import LossConfig
-from unirender.training.consistency import Consistency
-from unirender.training.loss_terms import Errors, compressed
-from unirender.training.losses import DROPPABLE, LossFunction
+from unirender.training.losses import consistency as consistency_module
+from unirender.training.losses import terms as loss_terms
+from unirender.training.losses.consistency import Consistency
+from unirender.training.losses.loss_function import DROPPABLE, LossFunction
+from unirender.training.losses.terms import Errors, compressed
 
 T = 999
 MAPS = {"material", "albedo", "normal", "specular", "diffuse", "environment"}

@@ -18,7 +18,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.packing import TRIPLETS
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training.losses import DROPPABLE
+from unirender.training.losses.loss_function import DROPPABLE
 
 GROWN = ("albedo", "normal", "roughness", "metallic", "mask")
 SUBSETS = [

@@ -12,8 +12,8 @@ from unirender.errors import UnirenderError
 from unirender.lighting import mean_radiance, resample_environment, rotate_environment
 from unirender.surface_light import diffuse_light
 from unirender.symmetries import quarter_turn
-from unirender.training.augment import to_maps
-from unirender.training.moving import Move, moved, rolled_environment
+from unirender.training.augmentations.augment import to_maps
+from unirender.training.augmentations.moving import Move, moved, rolled_environment
 
 STILL = Move(0.0, 1.0, (0.0, 0.0))
 SIZE = 32

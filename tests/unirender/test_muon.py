@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from unirender.models.build import build_model
 from unirender.training.config import OptimizerConfig
-from unirender.training.memory import training_bytes
-from unirender.training.muon import (
+from unirender.training.optim.memory import training_bytes
+from unirender.training.optim.muon import (
     STEP_RMS,
     STEPS,
     A,

@@ -18,11 +18,11 @@ from synthetic_shards import group_members, maps_members, write_shard
 
 from unirender.errors import UnirenderError
 from unirender.exr import read_exr_bytes
-from unirender.training.augment import DEFAULT_AUGMENTATION
-from unirender.training.data import GroupDataset, make_batch
-from unirender.training.derived import _derive
-from unirender.training.groups import read_groups
-from unirender.training.packing import Packer
+from unirender.training.augmentations.augment import DEFAULT_AUGMENTATION
+from unirender.training.data.dataset import GroupDataset, make_batch
+from unirender.training.data.derived import _derive
+from unirender.training.data.groups import read_groups
+from unirender.training.data.packing import Packer
 
 Members = dict[str, bytes]
 IMAGE = "l0.m050_r040.exr"
@@ -278,7 +278,7 @@ def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.
 def test_a_full_disk_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
     write_shard(tmp_path / "shard-000000.tar", {"a": members()})
-    script = "import sys; from unirender.training.data import GroupDataset; GroupDataset(sys.argv[1])"
+    script = "import sys; from unirender.training.data.dataset import GroupDataset; GroupDataset(sys.argv[1])"
     # Kilobytes of a file; without -B Python cuts its bytecode off as well, and nothing imports the modules again.
     limited = f"ulimit -f 1; exec {sys.executable} -B -c '{script}' {tmp_path}"
     ended = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)

@@ -12,12 +12,14 @@ from unirender.diffusion.schedule import make_scheduler
 from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.models.packing import TRIPLETS
-from unirender.training import consistency, losses, passes
 from unirender.training.config import LossConfig, TrainConfig
-from unirender.training.loss_scale import FIRST
-from unirender.training.losses import LossFunction
-from unirender.training.passes import BatchGradient, Split
-from unirender.training.processes import Processes
+from unirender.training.losses import consistency
+from unirender.training.losses import loss_function as losses
+from unirender.training.losses.loss_function import LossFunction
+from unirender.training.optim import passes
+from unirender.training.optim.loss_scale import FIRST
+from unirender.training.optim.passes import BatchGradient, Split, side_by_side
+from unirender.training.optim.processes import Processes
 
 BATCH = 8
 CONFIG = dataclasses.replace(
@@ -188,3 +190,16 @@ def test_a_batch_too_small_for_the_processes_is_refused(batch: dict[str, Tensor]
         Split(2, Processes(0, 3))
     with pytest.raises(UnirenderError, match="got 7 rows, expected 8"):
         gradient_of()({name: value[:7] for name, value in batch.items()})
+
+
+def test_threads_are_given_back() -> None:
+    cpu = torch.device("cpu")
+    with side_by_side(cpu, 1):  # which gives back those of before
+        torch.set_num_threads(3)
+        for asked in (None, 2):
+            with side_by_side(cpu, asked) as parallel:
+                assert (parallel, torch.get_num_threads()) == (asked or 3, 1)
+            assert torch.get_num_threads() == 3
+        with pytest.raises(RuntimeError, match="stop"), side_by_side(cpu):
+            raise RuntimeError("stop")
+        assert torch.get_num_threads() == 3

@@ -6,7 +6,6 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,15 +18,15 @@ from tiny_models import TRAIN, make_pipeline
 
 from unirender.errors import UnirenderError
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.training import processes
-from unirender.training.checkpoint import load_state
 from unirender.training.command import Train
 from unirender.training.config import RunConfig, TrainConfig
-from unirender.training.processes import ALONE, Processes, join_processes
+from unirender.training.data.source import ShardSource
+from unirender.training.loop.checkpoint import load_state
+from unirender.training.loop.state import OF_ALL, check_alike
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim import processes
+from unirender.training.optim.processes import ALONE, Processes, join_processes
 from unirender.training.run import train
-from unirender.training.source import ShardSource
-from unirender.training.state import OF_ALL, check_alike
-from unirender.training.trainer import Trainer
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"
 CPU = torch.device("cpu")
@@ -37,7 +36,7 @@ LOSSES = ("image", "material", "albedo", "normal", "specular", "diffuse", "envir
 BROKEN_DISK = """
 import os
 from unirender.errors import UnirenderError
-from unirender.training.source import ShardSource
+from unirender.training.data.source import ShardSource
 
 def next(self):
     raise UnirenderError("the disk of process 1 is gone")
@@ -48,8 +47,8 @@ if os.environ["RANK"] == "1":
 
 SLOW_SAVE = """
 import os, signal, time
-from unirender.training import trainer
-from unirender.training.source import ShardSource
+from unirender.training.loop import trainer
+from unirender.training.data.source import ShardSource
 
 own_next, own_save = ShardSource.next, trainer.save_state
 
@@ -102,14 +101,6 @@ def losses(out: Path) -> list[dict[str, float]]:
     return [{name: line[name] for name in ("step", *LOSSES) if name in line} for line in lines]
 
 
-@pytest.fixture
-def threads() -> Iterator[None]:
-    """What a training in this process does to torch's threads is undone."""
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("torchrun")
@@ -130,7 +121,7 @@ def one_process(run: Run, out: Path, seed: int) -> list[dict[str, float]]:
 
 
 @pytest.mark.long
-def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path, threads: None) -> None:
+def test_two_processes_give_the_losses_of_one(run: Run, tmp_path: Path) -> None:
     assert [f"process {rank} of 2" in run.printed for rank in range(3)] == [True, True, False]
     assert len(json.loads((run.out / "config.json").read_text())["hardware"]) == 2
     assert run.printed.count("use it with --checkpoint") == 1  # the first process alone speaks of it

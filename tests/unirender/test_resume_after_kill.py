@@ -14,8 +14,8 @@ import torch
 from synthetic_shards import write_dataset
 from tiny_models import TRAIN
 
-from unirender.training.checkpoint import STATE_FILE, load_state, save_state
 from unirender.training.command import Train
+from unirender.training.loop.checkpoint import STATE_FILE, load_state, save_state
 from unirender.training.run import train
 
 SCRIPT = Path(__file__).resolve().parents[1] / "helpers" / "train_tiny.py"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from unirender.training.processes import ALONE, Processes
-from unirender.training.run_log import RunLog, read_lines
+from unirender.training.logs.run_log import RunLog, read_lines
+from unirender.training.optim.processes import ALONE, Processes
 
 LINES = '{"step": 1, "image": 2.0}\n', '{"step": 2, "image": 1.5}\n', '{"step": 3, "image": 1.0}\n'
 

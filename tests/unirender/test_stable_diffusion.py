@@ -29,11 +29,11 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.training.command import Train
 from unirender.training.config import LossConfig, RunConfig, TrainConfig
-from unirender.training.memory import readable, training_bytes
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim.memory import readable, training_bytes
 from unirender.training.presets import PRESETS
-from unirender.training.stable_diffusion import StableDiffusion, load_stable_diffusion
-from unirender.training.start import begin_with_diffusion
-from unirender.training.trainer import Trainer
+from unirender.training.start.stable_diffusion import StableDiffusion, load_stable_diffusion
+from unirender.training.start.weights import begin_with_diffusion
 
 UNET, VAE, TEXT = ("unet", "vae", "text_encoder")
 WEIGHTS = {

@@ -15,11 +15,11 @@ from torch import Tensor
 from unirender import cli
 from unirender.command_line import Ended
 from unirender.process_ends import SIGNALS
-from unirender.training import stopping
-from unirender.training.checkpoint import load_state
 from unirender.training.config import RunConfig
-from unirender.training.stopping import stopping_gently
-from unirender.training.trainer import Trainer
+from unirender.training.loop import stopping
+from unirender.training.loop.checkpoint import load_state
+from unirender.training.loop.stopping import stopping_gently
+from unirender.training.loop.trainer import Trainer
 
 STEPS = 4
 pytestmark = pytest.mark.usefixtures("a_hangup_counts")

@@ -13,12 +13,12 @@ from synthetic_shards import write_dataset
 from tiny_models import TRAIN
 
 from unirender.cli import main
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.training.command import Train
 from unirender.training.config import RunConfig
-from unirender.training.source import ShardSource
-from unirender.training.trackers import check_trackers, known_trackers, make_trackers, numbers, tracking
-from unirender.training.trainer import Trainer
+from unirender.training.data.source import ShardSource
+from unirender.training.logs.trackers import check_trackers, known_trackers, make_trackers, numbers, tracking
+from unirender.training.loop.trainer import Trainer
 
 NAME = "test_lines"
 
@@ -124,7 +124,8 @@ class UnreachableTracker(LineTracker):
 
 def test_trackers_that_were_started_are_finished_where_another_cannot_start(tmp_path: Path) -> None:
     trackers = (LineTracker("one", tmp_path), UnreachableTracker("two", tmp_path), LineTracker("three", tmp_path))
-    with pytest.raises(ConnectionError, match="no such host"), tracking(trackers, TRAIN):
+    expected = f"--track {NAME}: cannot be started \\(no such host\\); mend that, or leave it out"
+    with pytest.raises(UnirenderError, match=expected), tracking(trackers, TRAIN):
         pytest.fail("the run went on without its tracker")
     told = [json.loads(line)["event"] for line in trackers[0].path.read_text().splitlines()]
     assert told == ["start", "parameters", "finish"]
@@ -172,7 +173,7 @@ def test_unknown_trackers_are_refused_with_those_that_accelerate_knows(registere
 
 
 def test_a_run_of_wandb_is_found_again_by_its_folder(tmp_path: Path) -> None:
-    from unirender.training.trackers import _run_options
+    from unirender.training.logs.trackers import _run_options
 
     one, same, other = (_run_options("wandb", tmp_path / name) for name in ("a", "a/../a", "b"))
     assert one == same

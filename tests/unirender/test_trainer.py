@@ -28,10 +28,16 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
-from unirender.training import data as data_module
-from unirender.training import reader
-from unirender.training.augment import NO_AUGMENTATION
-from unirender.training.checkpoint import (
+from unirender.training.augmentations.augment import NO_AUGMENTATION
+from unirender.training.command import Train
+from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
+from unirender.training.data import dataset as data_module
+from unirender.training.data import reader
+from unirender.training.data.reader import BatchReader
+from unirender.training.data.source import ShardSource
+from unirender.training.logs.live import live_report, never_at_peak, standing
+from unirender.training.logs.run_log import read_lines
+from unirender.training.loop.checkpoint import (
     STATE_FILE,
     differences,
     load_state,
@@ -39,18 +45,14 @@ from unirender.training.checkpoint import (
     restore_folder,
     save_state,
 )
-from unirender.training.command import Train
-from unirender.training.config import LossConfig, OptimizerConfig, RunConfig, TrainConfig
-from unirender.training.export import export_pipeline, read_history
-from unirender.training.live import live_report, never_at_peak, standing
+from unirender.training.loop.export import export_pipeline, read_history
+from unirender.training.loop.facts import training_facts
+from unirender.training.loop.trainer import Trainer, learning_rate
+from unirender.training.loop.validation import Validate, Validation
+from unirender.training.optim.passes import side_by_side
 from unirender.training.presets import PRESETS, get_preset
-from unirender.training.reader import BatchReader
 from unirender.training.run import train
-from unirender.training.run_log import read_lines
-from unirender.training.source import ShardSource
-from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import Trainer, learning_rate
-from unirender.training.validation import Validate, Validation
+from unirender.training.start.weights import begin_with_network, read_start
 
 CPU = torch.device("cpu")
 OVERFIT_STEPS = 150
@@ -330,7 +332,8 @@ def test_the_best_of_another_run_is_not_taken_for_its_own(tmp_path: Path) -> Non
 
 def test_the_best_on_other_scenes_is_not_compared(tmp_path: Path) -> None:
     """The best of an easy suite would stay for ever; and a run that goes on may be scored on others (`--validate`)."""
-    facts: dict[str, Any] = {"train": dataclasses.asdict(TRAIN), "scored_on": "4 scenes of the suite tiny"}
+    timed = Trainer(TRAIN, RunConfig(tmp_path, minutes=30.0), CPU, torch.float32)  # its length is no difference
+    facts: dict[str, Any] = training_facts(timed) | {"scored_on": "4 scenes of the suite tiny"}
     (tmp_path / "best").mkdir()
     (tmp_path / "best" / "training.json").write_text(json.dumps(facts))
     (tmp_path / STATE_FILE).touch()  # of a run that goes on; nobody reads it before
@@ -686,12 +689,16 @@ def test_a_resume_with_another_beginning_is_refused(tmp_path: Path) -> None:
 
 
 def test_loading_what_a_run_begins_with_shows_no_bars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And a call of `train` leaves torch's threads as they were: a second one would train in other parts."""
     diffusers.utils.logging.enable_progress_bar()
     data = write_dataset(tmp_path / "data", size=64)
     make_pipeline(0).save_pretrained(tmp_path / "other")
     options = Train(data, out=tmp_path / "run", init=tmp_path / "other", steps=1)
-    with pytest.raises(UnirenderError, match="expected the same network"):
-        train(options, options.check(), tmp_path / "run")
+    with side_by_side(CPU, 1):
+        torch.set_num_threads(3)
+        with pytest.raises(UnirenderError, match="expected the same network"):
+            train(options, options.check(), tmp_path / "run")
+        assert torch.get_num_threads() == 3
     assert "Loading" not in capsys.readouterr().err
 
 
@@ -771,11 +778,14 @@ def test_a_process_reads_its_own_rows(tmp_path: Path) -> None:
     assert whole.state_dict() == parts[0].state_dict() == parts[1].state_dict()
 
 
-def test_data_of_another_size_is_refused(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path, size=32)
+def test_data_of_another_size_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    data = write_dataset(tmp_path / "data", size=32)
     ShardSource(data, 2, 0, size=32).open()
+    derived = dataclasses.replace(NO_AUGMENTATION, derived=1.0)
     with pytest.raises(UnirenderError, match="got pictures of 32 x 32, expected 64 x 64"):
-        ShardSource(data, 2, 0, size=64).open()
+        ShardSource(data, 2, 0, size=64, augmentation=derived).open()
+    assert not (tmp_path / "cache/derived").exists()  # which takes seconds a group
 
 
 def test_only_steps_count_as_training(tmp_path: Path) -> None:

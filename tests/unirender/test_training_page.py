@@ -10,8 +10,8 @@ from synthetic_shards import own_picture
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.training.closed_form_check import doubt
-from unirender.training.data import GroupDataset
+from unirender.training.data.closed_form_check import doubt
+from unirender.training.data.dataset import GroupDataset
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 

@@ -23,11 +23,11 @@ from unirender.intrinsics import Intrinsics
 from unirender.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
 from unirender.process_ends import SIGNALS
-from unirender.training import checkpoint
-from unirender.training.checkpoint import load_state
-from unirender.training.visibility import TrainVisibility, rate, split, train_visibility
-from unirender.training.visibility_data import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
-from unirender.training.visibility_loss import terms
+from unirender.training.loop import checkpoint
+from unirender.training.loop.checkpoint import load_state
+from unirender.training.shadows.command import TrainVisibility, rate, split, train_visibility
+from unirender.training.shadows.loss import terms
+from unirender.training.shadows.rays import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
 
 SIZE = 32
 
@@ -163,7 +163,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
 ) -> None:
     options = {"steps": 4, "batch_size": 2}
     whole = train_visibility(TrainVisibility(folder, tmp_path / "whole", **options))
-    from unirender.training import visibility
+    from unirender.training.shadows import command as visibility
 
     calls, write = [], checkpoint.save_state
 
@@ -203,7 +203,7 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
 def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
     number: int, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from unirender.training import visibility
+    from unirender.training.shadows import command as visibility
 
     def asked(*arguments: object) -> float:
         os.kill(os.getpid(), number)

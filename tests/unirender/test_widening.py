@@ -10,10 +10,10 @@ from tiny_models import MODEL, TRAIN, make_batch, make_model
 
 from unirender.errors import UnirenderError
 from unirender.training.config import RunConfig
+from unirender.training.loop.trainer import Trainer
 from unirender.training.presets import PRESETS
-from unirender.training.start import begin_with_network, read_start
-from unirender.training.trainer import Trainer
-from unirender.training.widening import Channels, can_widen, repeated, widen, widened
+from unirender.training.start.weights import begin_with_network, read_start
+from unirender.training.start.widening import Channels, can_widen, repeated, widen, widened
 
 NARROW = {"block_out_channels": (16, 32, 32), "attention_levels": (2,), "norm_num_groups": 8}
 WIDE = {"block_out_channels": (16, 48, 64), "attention_levels": (1, 2)}

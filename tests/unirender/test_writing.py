@@ -16,14 +16,14 @@ from torch import nn
 
 from unirender import cli
 from unirender.errors import UnirenderError
-from unirender.training.average import Average
-from unirender.training.checkpoint import load_state, save_state
+from unirender.training.after.average import Average
 from unirender.training.config import RunConfig
-from unirender.training.export import export_pipeline
-from unirender.training.pictures import save_sheet
-from unirender.training.processes import ALONE
-from unirender.training.run_log import RunLog
-from unirender.training.trainer import Trainer
+from unirender.training.logs.run_log import RunLog
+from unirender.training.loop.checkpoint import load_state, save_state
+from unirender.training.loop.export import export_pipeline
+from unirender.training.loop.pictures import save_sheet
+from unirender.training.loop.trainer import Trainer
+from unirender.training.optim.processes import ALONE
 from unirender.writing import unusable, writing
 
 NO_SPACE = "No space left on device"

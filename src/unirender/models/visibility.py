@@ -6,7 +6,7 @@ no mask knows. The network gives for each pixel, each class c and each bin k of 
 
     P(hidden | c, k) = sigmoid(f(n, log z, share of each class in the bins)_ck)
 
-It is a U-Net of a million weights, trained on traced rays (`unirender.training.visibility`) and on no light: whatever
+It is a U-Net of a million weights, trained on traced rays (`unirender.training.shadows`) and on no light: whatever
 the light, the integrals of d and s are taken over 1 - P.
 
 Notation: n normals in camera axes, z depth along the view axis, k of `BINS` bins, c of `CLASSES`.

@@ -1,4 +1,4 @@
-"""Reading predicted roughness and metallic by a line that was fitted on new objects (`unirender.training.calibrate`).
+"""Reading predicted roughness and metallic by a line fitted on new objects (`unirender.training.after.calibrate`).
 
 The line is one between means over objects. So a prediction is moved as a whole, all samples and all pixels by the
 same amount: what one sample says beside another, and one pixel beside another, stays, but for the clip.

@@ -19,7 +19,7 @@ from unirender.training.presets import get_preset
 from unirender.writing import check_out
 
 if TYPE_CHECKING:
-    from unirender.training.validation import Validate
+    from unirender.training.loop.validation import Validate
 
 Batches = Literal["auto", "cpu", "device"]
 MakeValidation = Callable[[str, int], "Validate"]  # (suite, number of scenes) -> the function that scores a pipeline
@@ -114,7 +114,7 @@ class Train:
         if self.keep_best is not None and not self.validate:
             raise UsageError(f"--keep-best {self.keep_best}: nothing is scored, expected --validate beside it")
         if self.track:
-            from unirender.training.trackers import check_trackers
+            from unirender.training.logs.trackers import check_trackers
 
             check_trackers(self.track)
         with usage():

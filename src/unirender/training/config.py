@@ -12,7 +12,7 @@ from unirender.models.config import ModelConfig
 
 @dataclass(frozen=True)
 class LossConfig:
-    """The loss; see `unirender.training.losses`."""
+    """The loss; see `unirender.training.losses.loss_function`."""
 
     # squared error of [-1, 1] pictures, per triplet
     material: float = 1.0
@@ -36,7 +36,7 @@ class LossConfig:
 class OptimizerConfig:
     """AdamW or Muon, linear warm-up, cosine decay."""
 
-    kind: Literal["adamw", "muon"] = "adamw"  # muon: of hidden matrices; see `unirender.training.muon`
+    kind: Literal["adamw", "muon"] = "adamw"  # muon: of hidden matrices; see `unirender.training.optim.muon`
     learning_rate: float = 1e-3
     beta1: float = 0.9
     beta2: float = 0.99
@@ -49,7 +49,7 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """How often each augmentation is drawn, and how strongly; see `unirender.training.augment` and `.repaint`."""
+    """How often each augmentation is drawn, and how strongly; see `unirender.training.augmentations`."""
 
     mix: float = 0.5  # probability that more than one light of a basis group is on
     max_lights: int = 3  # most lights in a mixture
@@ -62,7 +62,7 @@ class Augmentation:
     derived: float = 0.0  # probability that a renderer sees s and d derived from the light
     shadowed: float = 0.0  # share of these that has the shadows that the picture shows, and not none
     repaint: float = 0.0  # probability that an object takes on another's mean colour; close, not exact
-    move: float = 0.0  # probability of a roll, a zoom and a shift; close; see `unirender.training.moving`
+    move: float = 0.0  # probability of a roll, a zoom and a shift; close; see `unirender.training.augmentations.moving`
 
 
 @dataclass(frozen=True)

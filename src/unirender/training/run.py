@@ -16,13 +16,13 @@ from unirender.training.presets import PRESETS
 if TYPE_CHECKING:
     import torch
 
-    from unirender.training.data import GroupDataset
-    from unirender.training.device_data import DeviceSource
-    from unirender.training.memory import TrainingBytes
-    from unirender.training.processes import Processes
-    from unirender.training.source import ShardSource
-    from unirender.training.trainer import Trainer
-    from unirender.training.validation import Validate
+    from unirender.training.data.dataset import GroupDataset
+    from unirender.training.data.device_data import DeviceSource
+    from unirender.training.data.source import ShardSource
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.loop.validation import Validate
+    from unirender.training.optim.memory import TrainingBytes
+    from unirender.training.optim.processes import Processes
 
 
 def train(
@@ -45,9 +45,10 @@ def train(
         UsageError: the options ask for scores and there is no `validate`, or contradict each other.
     """
     from unirender.models.precision import resolve_device
-    from unirender.training.checkpoint import check_leftover
-    from unirender.training.groups import list_shards
-    from unirender.training.processes import join_processes
+    from unirender.training.data.groups import list_shards
+    from unirender.training.loop.checkpoint import check_leftover
+    from unirender.training.optim.passes import side_by_side
+    from unirender.training.optim.processes import join_processes
 
     config = options.resolved(config)
     options.check_start(config)
@@ -61,37 +62,37 @@ def train(
         raise UsageError(f"--batches device: the training is on {device}, expected a CUDA device; leave it out")
     check_leftover(out, "pipeline")
     list_shards(options.data)  # says what is wrong with the data before anything is built or written
-    with alone(out) if processes.is_main else contextlib.nullcontext():
-        return _train(options, config, out, validate, processes, device)
+    with (
+        alone(out) if processes.is_main else contextlib.nullcontext(),
+        side_by_side(device, options.parallel) as parallel,
+    ):
+        run = run_config(options, config, out, parallel)
+        return _train(options, config, run, validate, processes, device)
 
 
 def _train(
     options: Train,
     config: TrainConfig,
-    out: Path,
+    run: RunConfig,
     validate: "Validate | None",
     processes: "Processes",
     device: "torch.device",
 ) -> Path | None:
     """In a folder that no other run writes to."""
     import diffusers
-    import torch
     from rich.console import Console
 
     from unirender.models.precision import resolve_dtype
-    from unirender.training.checkpoint import STATE_FILE
-    from unirender.training.export import export_pipeline
-    from unirender.training.live import live_report, never_at_peak
-    from unirender.training.memory import training_bytes
-    from unirender.training.start import read_start
-    from unirender.training.trackers import make_trackers, tracking
-    from unirender.training.trainer import Trainer
+    from unirender.training.logs.live import live_report, never_at_peak
+    from unirender.training.logs.trackers import make_trackers, tracking
+    from unirender.training.loop.checkpoint import STATE_FILE
+    from unirender.training.loop.export import export_pipeline
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.optim.memory import training_bytes
+    from unirender.training.start.weights import read_start
 
     dtype = resolve_dtype(options.dtype, device)
-    parallel = options.parallel or (torch.get_num_threads() if device.type == "cpu" else 1)
-    if parallel > 1:
-        torch.set_num_threads(1)
-    run = run_config(options, config, out, parallel)
+    out = run.out
     trackers = make_trackers(options.track, out) if processes.is_main else ()
     tell = notice if processes.is_main else lambda text: None
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
@@ -126,8 +127,8 @@ def _train(
 
 def _tell_data(folder: Path, data: "GroupDataset", say: Callable[[str], None]) -> None:
     """Says what is in a data folder, and what is doubtful about it."""
-    from unirender.training.closed_form_check import doubt
-    from unirender.training.groups import split_of, unread_shards
+    from unirender.training.data.closed_form_check import doubt
+    from unirender.training.data.groups import split_of, unread_shards
 
     say(f"{folder}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
     if unread := unread_shards(folder):
@@ -176,8 +177,8 @@ def make_source(
         trainer: whose rows of each batch they are.
         memory: that the training needs beside the data.
     """
-    from unirender.training.device_data import DeviceSource, fits
-    from unirender.training.source import ShardSource
+    from unirender.training.data.device_data import DeviceSource, fits
+    from unirender.training.data.source import ShardSource
 
     source = ShardSource(
         options.data,
@@ -197,7 +198,7 @@ def make_source(
 
 def described(trainer: "Trainer", source: "ShardSource | DeviceSource") -> str:
     """What trains, and where, in a line."""
-    from unirender.training.device_data import DeviceSource
+    from unirender.training.data.device_data import DeviceSource
 
     processes, at_once = trainer.processes, trainer.split.at_once
     place = f"process {processes.rank} of {processes.size}, " if processes.size > 1 else ""

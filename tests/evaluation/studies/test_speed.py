@@ -18,8 +18,8 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.training.config import RunConfig, TrainConfig
+from unirender.training.loop.trainer import Trainer
 from unirender.training.presets import get_preset
-from unirender.training.trainer import Trainer
 from unirender_evaluation.studies.speed import network
 from unirender_evaluation.studies.speed.bare import BarePasses, Rows, cut_batch
 from unirender_evaluation.studies.speed.command import BenchSpeed
@@ -43,7 +43,7 @@ from unirender_evaluation.studies.speed.overfit import (
 )
 from unirender_evaluation.studies.speed.run import run
 from unirender_evaluation.studies.speed.start import SPLIT, cold_starts, run_process, start_table
-from unirender_evaluation.studies.speed.timing import Part, Timing, medians, side_by_side, timed
+from unirender_evaluation.studies.speed.timing import Part, Timing, medians, timed
 from unirender_evaluation.studies.speed.training import throughput, training_table
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.tables.text import TextTable
@@ -72,17 +72,6 @@ def test_timing_leaves_the_warm_up_out() -> None:
     assert 0.01 <= found.median < 0.15
     assert Timing((3.0, 1.0, 2.0)).median == 2
     assert medians([{"a": 1.0, "b": 5.0}, {"a": 3.0, "b": 1.0}, {"a": 2.0, "b": 2.0}]) == {"a": 2.0, "b": 2.0}
-
-
-def test_threads_are_given_back() -> None:
-    before = torch.get_num_threads()
-    with side_by_side(CPU) as parallel:
-        assert parallel == before
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == before
-    with pytest.raises(RuntimeError, match="stop"), side_by_side(CPU):
-        raise RuntimeError("stop")
-    assert torch.get_num_threads() == before
 
 
 def test_the_network_is_timed_per_picture(suite: Suite, monkeypatch: pytest.MonkeyPatch) -> None:

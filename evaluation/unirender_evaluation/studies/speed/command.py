@@ -83,7 +83,7 @@ class BenchSpeed:
         parts = self.check()
         from rich.console import Console
 
-        from unirender.training.groups import list_shards
+        from unirender.training.data.groups import list_shards
         from unirender_evaluation.studies.speed.run import run
 
         if self.data is not None:

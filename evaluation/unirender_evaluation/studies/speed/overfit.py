@@ -25,7 +25,7 @@ from unirender.training.config import OptimizerConfig, TrainConfig
 from unirender.training.presets import get_preset
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key, psnr_from_mse
 from unirender_evaluation.scoring import score_image
-from unirender_evaluation.studies.speed.timing import Part, side_by_side
+from unirender_evaluation.studies.speed.timing import Part
 from unirender_evaluation.tables.formats import format_number
 from unirender_evaluation.tables.text import TextTable
 
@@ -86,9 +86,9 @@ def one_pair(data: Path, size: int) -> Maps:
     Raises:
         UnirenderError: unusable shards, or pictures of another size.
     """
-    from unirender.training.augment import NO_AUGMENTATION
-    from unirender.training.data import make_batch
-    from unirender.training.source import ShardSource
+    from unirender.training.augmentations.augment import NO_AUGMENTATION
+    from unirender.training.data.dataset import make_batch
+    from unirender.training.data.source import ShardSource
 
     source = ShardSource(data, 1, 0, size=size)
     batch = make_batch(source.open(), 0, 1, 0, NO_AUGMENTATION)
@@ -144,7 +144,8 @@ def picture_errors(packing: Any, found: Intrinsics, truth: Intrinsics) -> dict[s
 def overfit(pair: Maps, config: TrainConfig, minutes: float, device: Any, dtype: Any) -> list[Point]:
     """Trains on one pair for so many minutes; a point for every measure, the first before the first step."""
     from unirender.training.config import RunConfig
-    from unirender.training.trainer import Trainer
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.optim.passes import side_by_side
 
     batch = {name: value.expand(config.batch_size, -1, -1, -1) for name, value in pair.items()}
     points: list[Point] = []

@@ -12,8 +12,7 @@ those of this one. Nothing is stored for a later run. Parts:
 
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -71,20 +70,3 @@ def aim_text(what: str, value: float, sign: Literal["<=", ">="], bound: float) -
     """Whether an aim is met, as a sentence."""
     met = value <= bound if sign == "<=" else value >= bound
     return f"Aim: {what} {sign} {bound:g}: {value:.2f}, {'met' if met else 'not met'}."
-
-
-@contextmanager
-def side_by_side(device: Any) -> Iterator[int]:
-    """How many parts of a batch train side by side here, as `unirender train` has it: on a CPU as many as PyTorch has
-    threads, each with one thread of its own inside this block.
-    """
-    import torch
-
-    threads = torch.get_num_threads()
-    parallel = threads if device.type == "cpu" else 1
-    if parallel > 1:
-        torch.set_num_threads(1)
-    try:
-        yield parallel
-    finally:
-        torch.set_num_threads(threads)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.training.config import TrainConfig
-from unirender_evaluation.studies.speed.timing import Part, aim_text, medians, side_by_side
+from unirender_evaluation.studies.speed.timing import Part, aim_text, medians
 from unirender_evaluation.tables.text import TextTable
 
 AIM = 0.85
@@ -41,9 +41,10 @@ def throughput(
         UnirenderError: unusable shards, or pictures of another size than the preset's.
     """
     from unirender.training.config import RunConfig
-    from unirender.training.export import averaged_pipeline
-    from unirender.training.source import ShardSource
-    from unirender.training.trainer import Trainer
+    from unirender.training.data.source import ShardSource
+    from unirender.training.loop.export import averaged_pipeline
+    from unirender.training.loop.trainer import Trainer
+    from unirender.training.optim.passes import side_by_side
     from unirender_evaluation.studies.speed.bare import BarePasses
 
     config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, cycle_warmup=0.0))

@@ -82,7 +82,7 @@ class BenchTraining:
         Raises:
             UnirenderError: one of those asked for by name cannot.
         """
-        from unirender.training.contrasts import ContrastDataset
+        from unirender.training.data.contrasts import ContrastDataset
 
         possible = []
         for row in rows:

@@ -68,7 +68,7 @@ class TrainingStudy:
     @cached_property
     def trained_on(self) -> dict[str, Any]:
         """Data and length of every training."""
-        from unirender.training.data import GroupDataset
+        from unirender.training.data.dataset import GroupDataset
 
         dataset = GroupDataset(self.data)
         return {"data": dataset.fingerprint, "groups": len(dataset.keys), "steps": self.steps}
@@ -76,7 +76,7 @@ class TrainingStudy:
     @cached_property
     def code(self) -> str:
         """Versions of what the figures depend on."""
-        training = Part({"unirender": ("training/*.py",)}, ("torch", "diffusers"))
+        training = Part({"unirender": ("training/**/*.py",)}, ("torch", "diffusers"))
         trainer = part_version(training, {"unirender": package_folder("unirender")})
         own = modules_version("studies/training/run", "validation")
         return SEPARATOR.join((versions().of(frozenset({MODEL, REFERENCE})), trainer, own))

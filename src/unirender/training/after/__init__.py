@@ -1,0 +1,1 @@
+"""After training: checkpoints averaged, and calibrated on new objects."""

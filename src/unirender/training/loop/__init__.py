@@ -1,0 +1,1 @@
+"""The loop: a run that trains, saves, goes on, validates, and leaves a pipeline with its card."""

@@ -1,0 +1,1 @@
+"""Losses: what is compared, and by which weights (paper Sec. 3.2)."""

@@ -1,0 +1,1 @@
+"""The network of shadows, which learns from traced rays: `unirender train-visibility`."""

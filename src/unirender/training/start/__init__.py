@@ -1,0 +1,1 @@
+"""Starts: what the weights of a run begin with."""
