@@ -31,6 +31,7 @@ UNEDITED, SAMPLED = "unedited-input", "ours-sample"
 LOOKED, FLAT, NOT_CLOSED = (f"{OURS}-{name}" for name in ("6-looks", "flat-albedo", "not-closed"))
 TARGETS = {"to 0.1": "_r010", "to 0.9": "_r090"}  # of edits of roughness, and how their samples end
 MAPS = (("albedo", "psnr"), ("normal", "cosine"), ("roughness", "mse"), ("metallic", "mse"))
+PHYSICS = ("physics", "physics")
 DECOMPOSED, EDITED = ("inverse", "single-image"), ("rendering", "from-image")
 RELIT_BY_HDRI, RELIT_BY_BUFFERS = ("relighting", "from-image-hdri"), ("relighting", "from-image-sd")
 
@@ -129,6 +130,13 @@ def _light() -> list[Question]:
     return [*(question for other in rivals for question in lit(OURS, other)), *lit(REFINED, OURS, ("aligned",))]
 
 
+def _physics() -> list[Question]:
+    loops = (("shade_input", "the picture's light"), ("shade_heldout", "another light"))
+    asked = [Question(f"closed loop, {text}", *PHYSICS, q, "psnr", OURS, "true-maps") for q, text in loops]
+    response = "roughness response", *PHYSICS, "roughness_response", "correlation", OURS
+    return [*asked, *(Question(*response, b) for b in (COMPOSITE, "shade-true-maps"))]
+
+
 def _sizes() -> list[Question]:
     def pair(asked: Sequence[Question]) -> list[Question]:
         return [replace(question, a=f"{question.a}@small", b=f"{question.b}@tiny") for question in asked]
@@ -178,6 +186,7 @@ SECTIONS: Mapping[str, Section] = {
     "many views": Section(tuple(_many_views())),
     "closed form": Section(tuple(_closed_form())),
     "light": Section(tuple(_light())),
+    "physics": Section(tuple(_physics())),
     "samples": Section(
         (
             *maps(SAMPLED, OURS, (*MAPS, ("albedo", "lpips_vgg"))),
