@@ -88,6 +88,23 @@ def test_tables_in_every_format(bench, files: tuple[Path, Path]) -> None:
     assert "Inverse rendering" in bench("tables", files[0])[1]
 
 
+def test_a_table_may_have_some_rows_and_columns_alone(bench, files: tuple[Path, Path]) -> None:
+    """What is left is ranked among itself; ours is no longer before."""
+    asked = ("tables", files[0], "--variant", "masked-srgb-raw", "--format", "json")
+    status, out, _ = bench(*asked, "--method", "input-as-albedo", "--metric", "mse")
+    (made,) = json.loads(out)
+    assert status == 0
+    assert [row["label"] for row in made["rows"]] == ["input as albedo"]
+    assert {column["metric"]["name"] for column in made["columns"]} == {"mse"}
+    for given, said in (("--method", "ours-meen"), "did you mean 'ours-mean'"), (("--metric", "psnrr"), "'psnr'"):
+        status, _, err = bench(*asked, *given)
+        assert status == 2
+        assert said in err
+    status, _, err = bench(*asked, "--table", "relighting", "--metric", "cosine")
+    assert status == 1
+    assert "no values of relighting, cosine" in err
+
+
 def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Path]) -> None:
     asked = ("tables", files[0], "--table", "relighting", "--format", "markdown")
     assert "interval: 95% over objects, under these lights: bootstrap" in bench(*asked)[1]

@@ -25,6 +25,7 @@ Contract = Literal["maps", "camera"]  # of the documentation of the data contrac
 Kind = Literal[Asked, Contract]  # and no union of the two, whose choices would be listed in no order
 ASKED: tuple[Asked, ...] = get_args(Asked)
 KINDS = ASKED[:-1]  # where none is named: few methods find the light
+STRIPS: tuple[Asked, ...] = ("metallic", "roughness")  # which pictures of one's own have, too
 CONTRACT: tuple[Contract, ...] = get_args(Contract)
 SCENES = 2  # that are shown where none is named
 
@@ -50,12 +51,13 @@ class Figures:
     scenes: tuple[str, ...] = ()
     """Keys of scenes of the suite. None: two, from its first and second half."""
     pictures: tuple[Path, ...] = ()
-    """Pictures of your own instead of the suite's, with an alpha channel that cuts the object out: `pictures.png`."""
+    """Pictures of your own instead of the suite's, with an alpha channel that cuts the object out: `pictures.png`, or,
+    with --kinds metallic roughness, strips of them."""
     kinds: tuple[Kind, ...] = KINDS
     """metallic, roughness: the input edited over `--values`. relighting: under other lights of the suite. comparison: a
     column for each checkpoint and method. overview: maps, edits and relighting of one picture. light: balls under the
     light that is found. maps, camera: what the data contract says, without a method. These three only where they are
-    named. Not with --pictures."""
+    named. With --pictures metallic and roughness alone."""
     values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Of metallic and roughness in the strips, in [0, 1]."""
     lights: int = 4
@@ -80,13 +82,36 @@ class Figures:
         if outside or not self.values:
             shown = " ".join(f"{value:g}" for value in self.values)
             raise UsageError(f"--values {shown}: expected at least one number, all in [0, 1]")
-        beside = [name for name, default in (("scenes", ()), ("kinds", KINDS)) if getattr(self, name) != default]
-        if self.pictures and beside:
-            raise UsageError(
-                f"--{beside[0]}: got it beside --pictures, expected one of the two: scenes are the suite's"
-            )
         if not self.kinds:
             raise UsageError(f"--kinds: expected at least one of {', '.join([*ASKED, *CONTRACT])}")
+        if self.pictures:
+            self.check_pictures()
+
+    def check_pictures(self) -> None:
+        """Looks at what stands beside --pictures.
+
+        Raises:
+            UsageError: it is not about pictures of one's own.
+        """
+        strips, fields = self.strips(), type(self).__dataclass_fields__
+        if self.kinds != KINDS and set(strips) != set(self.kinds):
+            raise UsageError(
+                f"--kinds {' '.join(self.kinds)}: got it beside --pictures, expected metallic, roughness or both; "
+                "pictures.png, without --kinds, has maps, edits and relightings"
+            )
+        beside = {
+            "scenes": "scenes are the suite's",
+            "spp": "no truth is rendered",
+            "lights": "a strip has none" if strips else "",
+            "values": "" if strips else "name --kinds metallic or roughness, too, whose values they are",
+        }
+        for name, reason in beside.items():
+            if reason and getattr(self, name) != fields[name].default:
+                raise UsageError(f"--{name}: got it beside --pictures, expected it without: {reason}")
+
+    def strips(self) -> tuple[Asked, ...]:
+        """The strips that were asked for by name."""
+        return tuple(kind for kind in STRIPS if kind in self.kinds and self.kinds != KINDS)
 
     def run(self) -> int:
         """Draws, and prints a line for each figure; returns the exit status."""
@@ -107,7 +132,7 @@ class Figures:
             if kind in self.kinds
         }
         if self.pictures:
-            grids = {"pictures": partial(self.sheet, suite=suite, pictures=self.read())}
+            grids = self.of_pictures(suite)
         console = Console()
 
         def say(path: Path) -> None:
@@ -120,6 +145,18 @@ class Figures:
         for name, grid in grids.items():
             say(save(grid(subjects), self.out / f"{name}.png"))
         return 0
+
+    def of_pictures(self, suite: "Suite") -> "dict[str, Callable[[list[Subject]], Grid]]":
+        """Name of a figure of the user's pictures -> what draws it."""
+        from unirender_evaluation.figures.pictures import pictures_strip
+
+        pictures, camera = self.read(), suite.spec.camera
+        if not self.strips():
+            return {"pictures": partial(self.sheet, suite=suite, pictures=pictures)}
+        return {
+            what: partial(pictures_strip, pictures=pictures, what=what, values=self.values, camera=camera)
+            for what in self.strips()
+        }
 
     def explain(self, kind: Contract, suite: "Suite", scene: "Scene") -> Path:
         """A figure of the data contract."""

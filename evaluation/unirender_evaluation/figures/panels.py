@@ -16,8 +16,10 @@ from jaxtyping import Float
 from unirender.color import image_srgb, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.lighting import resample_environment
+from unirender.visualization import map_picture
 from unirender_evaluation.engine import answer, answered, ask
 from unirender_evaluation.figures.grid import Grid, Line, Tile
+from unirender_evaluation.figures.grid import over_white as map_over_white
 from unirender_evaluation.methods.method import Image, Mask, capabilities
 from unirender_evaluation.methods.mitsuba import MitsubaScene
 from unirender_evaluation.metrics import metric_key
@@ -30,6 +32,7 @@ from unirender_evaluation.truth.render import good_spp, item_seed
 
 Truth = Callable[[Scene, MetallicRoughness, Float[np.ndarray, "eh ew 3"]], Image]
 LIGHT_ROWS = 32  # of a light's picture
+COMPARED_MAPS = ("albedo", "normal")  # as the paper compares them
 
 
 @dataclass(frozen=True)
@@ -159,11 +162,12 @@ def comparison_sheet(subjects: Sequence[Subject], suite: Suite, scenes: Sequence
                 true = Tile(_shown(_true(task, name), mask, name))
                 lines.append(Line(label, (_over(seen, mask), *cells, true), starts=number == 0))
     columns = ("input", *(subject.label for subject in subjects), "Mitsuba")
-    return Grid(columns, tuple(lines), "PSNR inside the mask, sRGB, against the suite's truth by Mitsuba.")
+    caption = "PSNR (of normals the mean cosine) inside the mask, sRGB, against the suite's truth by Mitsuba."
+    return Grid(columns, tuple(lines), caption)
 
 
 def _questions(suite: Suite, scene: Scene) -> list[tuple[str, Task, str]]:
-    """(label, task, "image" or map): the suite's edits, the relighting, and the albedo of the first picture."""
+    """(label, task, "image" or map): the suite's edits, the relighting, albedo and normals of the first picture."""
     found = []
     for task in tasks(suite, "rendering", "from-image", [scene]):
         change = {name: task.inputs["edit"].get(name) for name in ("metallic", "roughness")}
@@ -171,22 +175,24 @@ def _questions(suite: Suite, scene: Scene) -> list[tuple[str, Task, str]]:
         found.append((label, task, "image"))
     found += [("relit", task, "image") for task in tasks(suite, "relighting", "from-image-hdri", [scene])]
     first = next(tasks(suite, "inverse", "single-image", [scene]))
-    return [*found, ("albedo", first, "albedo")]
+    return [*found, *((name, first, name) for name in COMPARED_MAPS)]
 
 
 def _answered(subject: Subject, task: Task, name: str) -> Tile | None:
-    """A subject's answer with its PSNR; None where it has none."""
-    prediction, key = answer(subject.row, task), metric_key(task.quantity if name == "image" else name, "psnr")
+    """A subject's answer with its PSNR, of normals the cosine; None where it has none."""
+    prediction = answer(subject.row, task)
     if name == "image":
         if prediction.image is None:
             return None
-        psnr = score_image(prediction.image, _true(task, name), task.mask, quantity=task.quantity)[key]
-        return Tile(_shown(prediction.image, task.mask, name), f"{psnr:.1f} dB")
+        values = score_image(prediction.image, _true(task, name), task.mask, quantity=task.quantity)
+        return Tile(_shown(prediction.image, task.mask, name), f"{values[metric_key(task.quantity, 'psnr')]:.1f} dB")
     made = None if prediction.maps is None else getattr(prediction.maps, name)
     if made is None or prediction.maps is None or task.truth_maps is None:
         return None
-    psnr = score_maps(prediction.maps.replace(mask=None), task.truth_maps)[key]
-    return Tile(_shown(made, task.mask, name), f"{psnr:.1f} dB")
+    values = score_maps(prediction.maps.replace(mask=None), task.truth_maps)
+    psnr, cosine = (values.get(metric_key(name, metric)) for metric in ("psnr", "cosine"))
+    score = f"cos {cosine:.2f}" if name == "normal" else f"{psnr:.1f} dB"
+    return Tile(_shown(made, task.mask, name), score)
 
 
 def _true(task: Task, name: str) -> Image:
@@ -196,6 +202,8 @@ def _true(task: Task, name: str) -> Image:
 
 
 def _shown(values: Image, mask: Mask, name: str) -> Image:
+    if name == "normal":
+        return map_over_white(map_picture(name, values), mask)
     return picture_over_white(values, mask) if name == "image" else _display(over_white(values, mask))
 
 

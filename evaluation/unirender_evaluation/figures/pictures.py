@@ -1,6 +1,7 @@
-"""The figure of somebody's own pictures: what methods find in photographs, where nobody knows the truth.
+"""Figures of somebody's own pictures: what methods find in photographs, where nobody knows the truth.
 
-A row is a picture and a subject: the input, the maps found in it, the rendering of these maps, edits, relightings.
+A row is a picture and a subject: the input, the maps found in it, the rendering of these maps, edits, relightings; or,
+in a strip, the input edited over values of one material parameter.
 """
 
 import math
@@ -138,3 +139,29 @@ def pictures_sheet(
         "known. The object is cut out by the picture's alpha channel; the camera is taken to be the benchmark's."
     )
     return Grid(columns, tuple(lines), caption)
+
+
+def pictures_strip(
+    subjects: Sequence[Subject], pictures: Sequence[Picture], what: str, values: Sequence[float], camera: Camera
+) -> Grid:
+    """Pictures edited over values of "metallic" or "roughness"; the other parameter stays as it is found.
+
+    Args:
+        subjects: those that edit take part.
+        pictures: squares, as `framed` gives them.
+        what: the parameter.
+        values: that it gets.
+        camera: that the pictures are taken to be seen through.
+    """
+    taking_part, lines = able(subjects, "edit", f"{what} strip"), []
+    for picture in pictures:
+        assert picture.mask is not None, "framed gives one"
+        seen, mask = {"image_srgb": picture.image_srgb, "mask": picture.mask, "camera": camera}, picture.mask
+        for number, subject in enumerate(taking_part):
+            made = [subject.ask("edit", **seen, **{what: value}) for value in values]
+            tiles = [None if image is None else Tile(picture_over_white(image, mask)) for image in made]
+            label = picture.name if len(taking_part) == 1 else f"{picture.name}, {subject.label}"
+            lines.append(Line(label, (input_tile(seen, number), *tiles), starts=number == 0))
+    other = "roughness" if what == "metallic" else "metallic"
+    caption = f"Edits of {what}; {other} stays as it is found in the picture. The truth is not known."
+    return Grid(("input", *(f"{what} {value:g}" for value in values)), tuple(lines), caption)

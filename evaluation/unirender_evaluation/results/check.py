@@ -48,7 +48,8 @@ def remarks(results: Results) -> list[str]:
     else:
         found += _untold_part(results)
     if not results.lights:
-        found.append("the lights of its samples are not named: those of the suite count, where the very suite is installed")
+        lights = "the lights of its samples are not named: those of the suite count, where the very suite is installed"
+        found.append(lights)
     used = {record.method for record in results.records}
     idle = [info.key for info in run.methods if info.key not in used]
     if idle:

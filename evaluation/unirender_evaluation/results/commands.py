@@ -3,7 +3,8 @@
 Light to import; each command loads what it needs when it runs. None of them measures anything.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -13,7 +14,9 @@ from unirender.errors import UnirenderError, UsageError
 
 if TYPE_CHECKING:
     from unirender_evaluation.metrics import Variant
+    from unirender_evaluation.records import Record, RunInfo
     from unirender_evaluation.tables.build import Table
+    from unirender_evaluation.tables.specs import TableSpec
 
 Format = Literal["text", "markdown", "latex", "json"]
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -62,6 +65,10 @@ class BenchTables:
     """`results.json`, packed by gzip or not, or folders of runs, of one suite."""
     table: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Print only this table (rendering, inverse, relighting, light, multi-view, physics); repeatable. None: all."""
+    method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Key of a row; only these are printed, and ranked among themselves. Repeatable."""
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Only columns of this metric (psnr, lpips_vgg, mse ...), for a table that fits a page; repeatable."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """How numbers are taken: masked or whole, srgb or linear, raw, aligned or aligned_rgb, with - between
     (masked-linear), or all; repeatable. None: whole beside the published values, and masked."""
@@ -86,15 +93,49 @@ class BenchTables:
         variants = asked_variants(self.variant)
         found = [read_results(path) for path in self.files]
         run, records = merge(found)
-        specs = {name: ALL_TABLES[name] for name in self.table or ALL_TABLES}
+        run, records = rows_of(run, records, self.method)
+        specs = {name: spec for name in self.table or ALL_TABLES if (spec := columns_of(ALL_TABLES[name], self.metric))}
         lights = lights_of(found) if self.interval == "objects-and-lights" else None
         tables = build_tables(records, run, specs, variants, lights)
         if not tables:
-            raise UnirenderError(
-                f"tables: the files have no values of {', '.join(specs)}; choose another --table, or none"
-            )
+            asked = ", ".join([*(self.table or ALL_TABLES), *self.method, *self.metric])
+            raise UnirenderError(f"tables: the files have no values of {asked}; name fewer --table, --method, --metric")
         _print_tables(tables, self.format)
         return 0
+
+
+def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str]) -> "tuple[RunInfo, Sequence[Record]]":
+    """Run and records of these rows; without names, of all.
+
+    Raises:
+        UsageError: there is no such row.
+    """
+    from unirender_evaluation.results.schema_check import did_you_mean
+
+    keys = [info.key for info in run.methods]
+    for name in methods:
+        if name not in keys:
+            raise UsageError(f"--method {name}: no such row{did_you_mean(name, keys)}")
+    if not methods:
+        return run, records
+    kept = tuple(info for info in run.methods if info.key in methods)
+    return replace(run, methods=kept), [record for record in records if record.method in methods]
+
+
+def columns_of(spec: "TableSpec", metrics: Sequence[str]) -> "TableSpec | None":
+    """The table with the columns of these metrics; without names, as it is; None where it has none of them.
+
+    Raises:
+        UsageError: there is no such metric.
+    """
+    from unirender_evaluation.results.schema_check import did_you_mean
+    from unirender_evaluation.table_list import ALL_METRICS
+
+    for name in metrics:
+        if name not in ALL_METRICS:
+            raise UsageError(f"--metric {name}: no such metric{did_you_mean(name, ALL_METRICS)}")
+    kept = tuple(column for column in spec.columns if not metrics or column.metric.name in metrics)
+    return replace(spec, columns=kept) if kept else None
 
 
 @dataclass(frozen=True)

@@ -6,27 +6,21 @@ both answered, with the interval over objects.
 """
 
 import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.claims import MASKED, MaskedNumber
-from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of
-from unirender_evaluation.metrics import METRICS, SCALES, Metric, Scale, Variant, metric_key
-from unirender_evaluation.records import Record
+from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of, without_rounding
+from unirender_evaluation.metrics import METRICS, Metric, Scale, metric_key
 from unirender_evaluation.results.data import Results
-from unirender_evaluation.statistics import mean_estimate
-from unirender_evaluation.tables.formats import estimate_text
+from unirender_evaluation.statistics import Estimate, holm, paired_p_value
 from unirender_evaluation.tables.published import published_tables
 from unirender_evaluation.tables.text import markdown_row
 
 NOT_RUN = "not run"
-_MATERIAL = re.compile(r"_m(\d{3})_r(\d{3})$")  # of a sample with one number each; others have maps of their own
-# Metallic and roughness in thirds: the outer ones are where a material shows what it is.
-_THIRDS = (("0 to 0.3", 0.0, 0.35), ("0.4 to 0.6", 0.35, 0.65), ("0.7 to 1", 0.65, 1.01))
 
 
 @dataclass(frozen=True)
@@ -57,14 +51,21 @@ def run_line(results: Results) -> str:
     )
 
 
-def answers(results: Results, questions: Sequence[Question]) -> str:
-    """A table with a line for each question: both means, their difference with its interval, and the verdict."""
-    lines = [_answer(results, question) for question in questions]
-    head = ["", "A", "B", "A", "B", "A - B", "", "pairs (objects)"]
+def answers(results: Results, questions: Sequence[Question], sure: Collection[Question]) -> str:
+    """A table with a line for each question: both means, their difference with its interval, the verdict, and on how
+    many objects row A is better.
+
+    Args:
+        results: a run's.
+        questions: the lines.
+        sure: those whose verdict is printed **bold**, e.g. what is left of all by `sure_of`.
+    """
+    lines = [_answer(results, question, question in sure) for question in questions]
+    head = ["", "A", "B", "A", "B", "A - B", "", "A is better on objects (pairs)"]
     return markdown_table(head, lines, left=3)
 
 
-def _answer(results: Results, question: Question) -> list[str]:
+def _answer(results: Results, question: Question, sure: bool) -> list[str]:
     labels = [label_of(results, key) for key in (question.a, question.b)]
     records = Selection(question.table, question.protocol).of(results.records)
     a, b = (values_of(records, key, question.key) for key in (question.a, question.b))
@@ -74,19 +75,42 @@ def _answer(results: Results, question: Question) -> list[str]:
     metric = question.kind
     found = compare(records, metric, question.key, question.a, question.b)
     means = [f"{np.mean([values[sample] for sample in shared]):.{metric.decimals}f}" for values in (a, b)]
-    counts = f"{found.difference.n} ({found.difference.clusters})"
-    return [question.text, *labels, *means, _difference(found, metric), _word(found), counts]
+    settled = without_rounding(a, b)
+    objects = {record.sample: record.object for record in records}
+    gains: dict[str, list[float]] = {}
+    for sample in shared:
+        gains.setdefault(objects[sample], []).append(a[sample] - settled[sample])
+    better = sum(np.mean(own) > 0 if metric.higher_is_better else np.mean(own) < 0 for own in gains.values())
+    counts = f"{better} of {len(gains)} ({len(shared)})"
+    return [question.text, *labels, *means, interval_text(found.difference, metric), _word(found, sure), counts]
 
 
-def _difference(found: Comparison, metric: Metric) -> str:
-    difference, decimals = found.difference, metric.decimals
-    return f"{difference.mean:+.{decimals}f} [{difference.low:+.{decimals}f}, {difference.high:+.{decimals}f}]"
+def interval_text(difference: Estimate, metric: Metric) -> str:
+    """A difference with its interval, in the digits of its metric."""
+    low, high, decimals = difference.low, difference.high, metric.decimals
+    return f"{difference.mean:+.{decimals}f} [{low:+.{decimals}f}, {high:+.{decimals}f}]"
 
 
-def _word(found: Comparison) -> str:
+def _word(found: Comparison, sure: bool) -> str:
     if not found.decided:
         return "one object: no interval"
-    return "**A is better**" if found.a_beats_b else "**B is better**" if found.b_beats_a else "no difference shown"
+    if not found.a_beats_b and not found.b_beats_a:
+        return "no difference shown"
+    text = f"{'A' if found.a_beats_b else 'B'} is better"
+    return f"**{text}**" if sure else text
+
+
+def sure_of(asked: Sequence[tuple[Results, Question]]) -> set[Question]:
+    """The questions whose two rows differ by Holm's correction for all of them, whose rows have run; p is that of
+    Student's t over objects."""
+    ran, p_values = [], []
+    for results, question in asked:
+        records = Selection(question.table, question.protocol).of(results.records)
+        a, b = (values_of(records, key, question.key) for key in (question.a, question.b))
+        if a.keys() & b.keys():
+            ran.append(question)
+            p_values.append(paired_p_value(a, without_rounding(a, b), {r.sample: r.object for r in records}))
+    return {question for question, refused in zip(ran, holm(p_values), strict=True) if refused}
 
 
 def against_trivial(results: Results, questions: Sequence[Question]) -> str:
@@ -127,7 +151,7 @@ def _against_trivial(results: Results, question: Question) -> list[str] | None:
         f"{question.text}, {metric.label}{unit} {metric.arrow}",
         f"{ours:.{metric.decimals}f}",
         f"{trivial[best]:.{metric.decimals}f} ({label_of(results, best)})",
-        _difference(found, metric),
+        interval_text(found.difference, metric),
         "∞" if math.isinf(perfect) else f"{perfect:.{metric.decimals}f}",
     ]
 
@@ -152,62 +176,6 @@ def together(runs: Mapping[str, Results]) -> Results:
     records = [replace(r, method=f"{r.method}@{name}") for name, results in runs.items() for r in results.records]
     first = next(iter(runs.values()))
     return replace(first, run=replace(first.run, methods=tuple(methods)), records=tuple(records))
-
-
-def by_material(results: Results, method: str, numbers: Sequence[tuple[str, str]]) -> str:
-    """Means of a row of the inverse table by the true material, ± half of their intervals over objects.
-
-    Args:
-        results: a run's.
-        method: the row.
-        numbers: (quantity, metric) of the columns.
-    """
-    records = [r for r in Selection("inverse", "single-image").of(results.records) if r.method == method]
-    groups: list[tuple[str, Callable[[float, float], bool]]] = [("all with one number each", lambda m, r: True)]
-    groups += [(f"metallic {name}", _between(low, high, 0)) for name, low, high in _THIRDS]
-    groups += [(f"roughness {name}", _between(low, high, 1)) for name, low, high in _THIRDS]
-    lines = []
-    for name, belongs in groups:
-        lines.append([name, *_means([r for r in records if (m := material_of(r)) and belongs(*m)], numbers)])
-    own = [record for record in records if material_of(record) is None]
-    if own:
-        lines.append(["with maps of their own", *_means(own, numbers)])
-    return markdown_table(["true material", "pictures", *map(_column, numbers)], lines)
-
-
-def material_of(record: Record) -> tuple[float, float] | None:
-    """(metallic, roughness) of a sample's material by its name; None where it has maps."""
-    found = _MATERIAL.search(record.sample)
-    return (int(found[1]) / 100, int(found[2]) / 100) if found else None
-
-
-def by_object(results: Results, method: str, numbers: Sequence[tuple[str, str]], count: int) -> str:
-    """Means of the objects on which a row is worst, by the first number: the worst `count`."""
-    records = [r for r in Selection("inverse", "single-image").of(results.records) if r.method == method]
-    objects = dict.fromkeys(record.object for record in records)
-    quantity, name = numbers[0]
-    key, metric = metric_key(quantity, METRICS[name], MASKED), METRICS[name]
-    means = {o: float(np.mean([r.values[key] for r in records if r.object == o and key in r.values])) for o in objects}
-    worst = sorted(objects, key=lambda o: means[o] if metric.higher_is_better else -means[o])[:count]
-    lines = [[o, *_means([r for r in records if r.object == o], numbers)] for o in worst]
-    return markdown_table(["object", "pictures", *map(_column, numbers)], lines)
-
-
-def by_scale(results: Results, methods: Sequence[str]) -> str:
-    """The albedo's PSNR of rows: as it is, and after a least-squares factor for the picture or for each channel.
-
-    Means are over the pictures that all of these rows have, those that have none left aside.
-    """
-    records = Selection("inverse", "single-image").of(results.records)
-    keys = [metric_key("albedo", METRICS["psnr"], Variant("masked", "srgb", scale)) for scale in SCALES]
-    rows = {m: {r.sample: r for r in records if r.method == m and keys[0] in r.values} for m in methods}
-    shared = set.intersection(*(set(found) for found in rows.values() if found)) if any(rows.values()) else set()
-    lines = []
-    for method, found in rows.items():
-        values = [[found[sample].values[key] for sample in shared] if found else [] for key in keys]
-        means = [f"{np.mean(own):.2f}" if own else NOT_RUN for own in values]
-        lines.append([label_of(results, method), *means, str(len(values[0]))])
-    return markdown_table(["", "as it is", "one factor", "one a channel", "pictures"], lines)
 
 
 def published_against_constant(results: Results) -> str:
@@ -237,28 +205,9 @@ def seconds(results: Results, rows: Sequence[tuple[str, str, str]]) -> str:
     return markdown_table(["", "question", "seconds", "answers"], lines, left=2)
 
 
-def _means(records: Sequence[Record], numbers: Sequence[tuple[str, str]]) -> list[str]:
-    cells = [str(len(records))]
-    for quantity, name in numbers:
-        key = metric_key(quantity, METRICS[name], MASKED)
-        own = [record for record in records if key in record.values]
-        found = mean_estimate([r.values[key] for r in own], [r.object for r in own]) if own else None
-        cells.append(estimate_text(found, METRICS[name].decimals))
-    return cells
-
-
-def _between(low: float, high: float, which: int) -> Callable[[float, float], bool]:
-    return lambda *material: low <= material[which] < high
-
-
 def label_of(results: Results, key: str) -> str:
     found = [info.label for info in results.run.methods if info.key == key]
     return found[0] if found else key
-
-
-def _column(number: tuple[str, str]) -> str:
-    quantity, metric = number[0], METRICS[number[1]]
-    return f"{quantity}, {metric.label} ({metric.unit})" if metric.unit else f"{quantity}, {metric.label}"
 
 
 def markdown_table(head: Sequence[str], lines: Sequence[Sequence[str]], left: int = 1) -> str:

@@ -49,7 +49,7 @@ from unirender_evaluation.figures.panels import (
 )
 from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.methods.light import MeanLight
-from unirender_evaluation.methods.trivial import InputAsAlbedo, UneditedInput
+from unirender_evaluation.methods.trivial import InputAsAlbedo, SphereNormal, UneditedInput
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, load_suite
 
@@ -221,6 +221,17 @@ def test_the_comparison_asks_the_benchmarks_questions_and_leaves_holes(suite: Su
     assert [line.label for line in grid.lines] == ["metallic 1", "roughness 0.1", "roughness 0.9", "relit", "albedo"]
     answered = [[tile is not None for tile in line.tiles] for line in grid.lines]
     assert answered == [[True, True, False, True]] * 4 + [[True, False, True, True]]
+
+
+def test_normals_are_compared_as_colours_by_their_cosine(suite: Suite) -> None:
+    facing = Subject("sphere", make_row(SphereNormal(), "trivial"))
+    last = comparison_sheet([facing], suite, suite.scenes[:1]).lines[-1]
+    assert last.label == "normal"
+    tile = last.tiles[1]
+    assert tile is not None
+    assert 0.9 < float(tile.corner.removeprefix("cos ")) <= 1, "the suite's object is a ball"
+    centre = tile.picture.shape[0] // 2
+    np.testing.assert_allclose(tile.picture[centre, centre], (0.5, 0.5, 1), atol=0.05)
 
 
 def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite) -> None:

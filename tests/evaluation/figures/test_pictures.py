@@ -1,6 +1,7 @@
 """The figure of one's own pictures: how they are framed, what is asked of whom, what is refused."""
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from unirender.pictures import Picture
 from unirender_evaluation.figures.command import Figures
 from unirender_evaluation.figures.overview import MAPS
 from unirender_evaluation.figures.panels import Subject
-from unirender_evaluation.figures.pictures import EDITS, MARGIN, framed, pictures_sheet, read_cut_out
+from unirender_evaluation.figures.pictures import EDITS, MARGIN, framed, pictures_sheet, pictures_strip, read_cut_out
 from unirender_evaluation.methods.trivial import InputAsAlbedo
 from unirender_evaluation.rows import make_row
 from unirender_evaluation.suites.suite import load_suite
@@ -91,6 +92,17 @@ def test_every_subject_is_asked_for_maps_edits_and_relightings() -> None:
     assert set(MAPS) < set(grid.columns)
 
 
+def test_a_strip_edits_one_parameter_of_every_picture_and_leaves_out_who_cannot() -> None:
+    told = Told()
+    pictures = [framed(disc(40, 40, (20, 20), radius), 32) for radius in (8, 15)]
+    subjects = [Subject("as albedo", make_row(InputAsAlbedo(), "trivial")), Subject("told", make_row(told, "trivial"))]
+    grid = pictures_strip(subjects, pictures, "roughness", (0.0, 0.25), Camera())
+    assert grid.columns == ("input", "roughness 0", "roughness 0.25")
+    assert [line.label for line in grid.lines] == ["disc.png"] * 2
+    assert told.asked == [{"roughness": 0.0}, {"roughness": 0.25}] * 2
+    assert all(tile is not None for line in grid.lines for tile in line.tiles)
+
+
 def test_the_command_draws_pictures_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make_suite(tmp_path / "suite")
     suite = next((tmp_path / "suite").glob("*.toml"))
@@ -103,6 +115,12 @@ def test_the_command_draws_pictures_of_ones_own(tmp_path: Path, capsys: pytest.C
     assert Figures(out=tmp_path / "out", suite=str(suite), method=(method,), pictures=paths, lights=1).run() == 0
     assert "pictures.png" in capsys.readouterr().out.replace("\n", "")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["pictures.png"]
+    method = "unirender_evaluation.methods.trivial:UneditedInput"
+    strips = Figures(
+        out=tmp_path / "strips", suite=str(suite), method=(method,), pictures=paths, kinds=("roughness", "metallic")
+    )
+    assert strips.run() == 0
+    assert sorted(path.name for path in (tmp_path / "strips").iterdir()) == ["metallic.png", "roughness.png"]
     assert len(load_suite(str(suite)).scenes) >= 1
 
 
@@ -113,15 +131,18 @@ def test_what_cannot_be_drawn_is_named_before_a_model_is_loaded(tmp_path: Path) 
     Image.new("RGBA", (20, 20)).save(tmp_path / "empty.png")
     with pytest.raises(UnirenderError, match=r"empty\.png"):
         read_cut_out(tmp_path / "empty.png")
-    given = Figures(
+    both = Figures(
         pictures=(tmp_path / "opaque.png", tmp_path / "absent.png"), checkpoint=(tmp_path / "none",), out=tmp_path / "o"
     )
     with pytest.raises(UnirenderError, match=r"opaque\.png: has no alpha.*; .*absent\.png: no such file"):
-        given.run()
+        both.run()
     assert not (tmp_path / "o").exists()
-    for beside in ({"scenes": ("a",)}, {"kinds": ("metallic",)}):
+    strip: dict[str, Any] = {"kinds": ("roughness",)}
+    beside: list[dict[str, Any]] = [{"scenes": ("a",)}, {"kinds": ("metallic", "overview")}, {"spp": 8}]
+    for given in (*beside, {"values": (0.5,)}, strip | {"lights": 2}):
         with pytest.raises(UsageError, match="beside --pictures"):
-            Figures(pictures=(tmp_path / "opaque.png",), **beside).check()  # pyright: ignore[reportArgumentType] - two shapes
+            replace(Figures(pictures=(tmp_path / "opaque.png",)), **given).check()
+    Figures(pictures=(tmp_path / "a.png",), values=(0.5,), **strip).check()
     with pytest.raises(UsageError, match="expected none of them twice"):
         Figures(pictures=(tmp_path / "a.png", tmp_path / "a.png")).check()
 

@@ -1,0 +1,44 @@
+"""The page *What the tables say*: what it asks, and its tables of results that have the answers or lack them."""
+
+import pytest
+from small_results import small_results
+
+from unirender.errors import UnirenderError
+from unirender_evaluation.results import page as page_module
+from unirender_evaluation.results.findings import Question
+from unirender_evaluation.results.page import Page
+from unirender_evaluation.results.questions import BY_TARGET, SECTIONS, VIEWS, Section
+from unirender_evaluation.suites.suite import load_suite
+
+ALBEDO = Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-mean", "input-as-albedo")
+
+
+@pytest.fixture
+def page() -> Page:
+    one = small_results()
+    return Page(one, one, one, load_suite("tiny"))
+
+
+def test_no_question_is_asked_twice() -> None:
+    """One that is would count twice where all are corrected for."""
+    asked = [(section.view, question) for section in SECTIONS.values() for question in section.questions]
+    assert len({question for _, question in asked}) == len(asked)
+    assert {view for view, _ in asked} == set(VIEWS)
+
+
+def test_a_table_is_markdown_and_the_correction_counts_its_lines(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two objects that differ alike: p is 0."""
+    monkeypatch.setattr(page_module, "SECTIONS", {"one": Section((ALBEDO,))})
+    assert "| **A is better** | 2 of 2 (4) |" in page.table("one").replace("\N{NO-BREAK SPACE}", " ")
+    assert page.table("one")._repr_markdown_() == str(page.table("one"))
+    assert page.correction() == "Of 1 lines 1 say that a row is better; in 1 of them that is **bold**."
+
+
+def test_what_has_no_answers_stops_the_page(page: Page) -> None:
+    """A row by another name would be a line of "not run", which nobody looks for."""
+    with pytest.raises(UnirenderError, match="nvdiffrec-mitsuba"):
+        page.table("optimisation")
+
+
+def test_edits_by_their_target_are_rows_of_their_own(page: Page) -> None:
+    assert {info.key for info in page.view(BY_TARGET).run.methods} >= {"ours-mean@to 0.1", "ours-mean@to 0.9"}
