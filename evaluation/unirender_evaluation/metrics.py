@@ -13,12 +13,13 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
+from unirender.arguments import as_floats
 from unirender.errors import UnirenderError
 
 Mask = Literal["masked", "whole"]
@@ -157,19 +158,30 @@ FACING_AWAY = metric_key("normal", "away")  # recorded of a stranger's normals w
 TURNED = metric_key("normal", "turned")  # and where they gain much with another sign of x or y
 
 
+def pair(p: Any, t: Any) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:
+    """Two pictures to compare, in float64.
+
+    Raises:
+        UnirenderError: one has the whole numbers of a file, there are several pictures, or shapes differ.
+    """
+    p, t = as_floats(p, "metric"), as_floats(t, "metric")
+    if p.ndim != 3:
+        raise UnirenderError(f"metric: got shape {p.shape}, expected one picture [h, w, c]; take the mean of several")
+    if p.shape != t.shape:
+        raise UnirenderError(f"metric: got shapes {p.shape} and {t.shape}, expected equal ones; resample one of them")
+    return p.astype(np.float64), t.astype(np.float64)
+
+
 def mse(
     p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"] | None = None
 ) -> float:
     """Mean squared error; coverage-weighted where `w` is given.
 
     Raises:
-        UnirenderError: if shapes differ, there are several pictures, or the weights sum to 0.
+        UnirenderError: as `pair`, or the weights sum to 0.
     """
-    if p.ndim != 3:
-        raise UnirenderError(f"metric: got shape {p.shape}, expected one picture [h, w, c]; take the mean of several")
-    if p.shape != t.shape:
-        raise UnirenderError(f"metric: got shapes {p.shape} and {t.shape}, expected equal ones; resample one of them")
-    error = np.square(p.astype(np.float64) - t.astype(np.float64))
+    p, t = pair(p, t)
+    error = np.square(p - t)
     return float(error.mean()) if w is None else weighted_mean(error.mean(axis=-1, keepdims=True), w)
 
 
@@ -218,8 +230,12 @@ def ssim_map(p: Float[np.ndarray, "*n h w c"], t: Float[np.ndarray, "*m h w c"])
 def ssim(
     p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], w: Float[np.ndarray, "h w 1"] | None = None
 ) -> float:
-    """Mean SSIM: over the frame without the half-window border (as scikit-image), or weighted by coverage over all."""
-    values = ssim_map(p, t)
+    """Mean SSIM: over the frame without the half-window border (as scikit-image), or weighted by coverage over all.
+
+    Raises:
+        UnirenderError: as `pair`, `crop_border` or `weighted_mean`.
+    """
+    values = ssim_map(*pair(p, t))
     return float(crop_border(values).mean()) if w is None else weighted_mean(values[..., None], w)
 
 
@@ -279,9 +295,17 @@ def rmse_relative(p: Float[np.ndarray, "h w c"], t: Float[np.ndarray, "h w c"], 
 def ciede2000(
     p_linear: Float[np.ndarray, "h w 3"], t_linear: Float[np.ndarray, "h w 3"], w: Float[np.ndarray, "h w 1"]
 ) -> float:
-    """Coverage-weighted mean CIEDE2000 of linear Rec.709 colours in [0, 1] (reference white D65)."""
+    """Coverage-weighted mean CIEDE2000 of linear Rec.709 colours in [0, 1] (reference white D65).
+
+    Raises:
+        UnirenderError: as `pair`, or the mask is empty or of another shape.
+    """
     import colour  # 2 s to import, and only this function needs it
 
+    p_linear, t_linear = pair(p_linear, t_linear)
+    expected = (*p_linear.shape[:2], 1)
+    if w.shape != expected:
+        raise UnirenderError(f"metric: got a mask of shape {w.shape}, expected {expected}; take mask[..., None]")
     inside = w[..., 0] > 0
     space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
     labs = [

@@ -40,6 +40,11 @@ def denoise(
     Raises:
         UnirenderError: the package is missing, or a picture is not finite or of another size.
     """
+    size = image_linear.shape[:2]
+    given = {"albedo": albedo_linear, "normal": normal, "mask": mask}
+    sizes = {name: guide.shape[:2] for name, guide in given.items() if guide is not None}
+    if set(sizes.values()) != {size}:
+        raise UnirenderError(f"denoise: got a picture of {size} pixels and guides of {sizes}, expected one size")
     oidn = _package()
     radiance = image_linear[..., :3] if premultiplied else image_linear[..., :3] * mask
     if image_linear.shape[-1] not in (3, 4) or not np.isfinite(radiance).all() or radiance.min() < 0:

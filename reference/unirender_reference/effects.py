@@ -13,6 +13,7 @@ surface and under the triangle: there it counts as lit and shadowed.
 """
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -66,10 +67,10 @@ def render_effects(
     """The three passes of an image; arguments as `Renderer.image`, `spp` samples per pixel for each pass.
 
     Raises:
-        UnirenderError: `depth` is less than 2, or as `Renderer.image`.
+        UnirenderError: `depth` is no whole number of at least 2, or as `Renderer.image`.
     """
-    if depth < DIRECT_DEPTH:
-        raise UnirenderError(f"depth: got {depth}, expected at least {DIRECT_DEPTH}, one bounce")
+    if not isinstance(depth, Integral) or depth < DIRECT_DEPTH:
+        raise UnirenderError(f"depth: got {depth!r:.40}, expected a whole number from {DIRECT_DEPTH}, one bounce")
     scene = renderer.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
     integrators = {
         "unshadowed": python_integrator(_unshadowed),

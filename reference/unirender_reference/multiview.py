@@ -5,10 +5,12 @@ of the contract (`pose_towards` of azimuth 0, elevation 0) they are the camera's
 """
 
 import math
+from numbers import Integral
 
 import numpy as np
 from jaxtyping import Float
 
+from unirender.arguments import as_instance
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 
@@ -23,8 +25,9 @@ def pose_towards(azimuth_deg: float, elevation_deg: float, camera: Camera) -> Fl
         elevation_deg: above the horizon, within [-90, 90].
 
     Raises:
-        UnirenderError: an angle is not finite, or the elevation is out of its range.
+        UnirenderError: an angle is not finite, the elevation is out of its range, or the camera is none.
     """
+    as_instance(camera, Camera, "pose")
     if not (math.isfinite(azimuth_deg) and -90 <= elevation_deg <= 90):
         raise UnirenderError(
             f"pose: got azimuth {azimuth_deg:g} and elevation {elevation_deg:g} degrees, expected a finite azimuth and "
@@ -42,7 +45,13 @@ def pose_towards(azimuth_deg: float, elevation_deg: float, camera: Camera) -> Fl
 
 
 def orbit(count: int, camera: Camera, start_deg: float = 0.0) -> list[Float[np.ndarray, "4 4"]]:
-    """`count` cameras around the object, evenly in azimuth, with elevations in turn; the first looks from the front."""
+    """`count` cameras around the object, evenly in azimuth, with elevations in turn; the first looks from the front.
+
+    Raises:
+        UnirenderError: the number of cameras is no whole one of at least 1, or as `pose_towards`.
+    """
+    if not isinstance(count, Integral) or count < 1:
+        raise UnirenderError(f"orbit: got {count!r:.40} cameras, expected a whole number of at least 1")
     return [
         pose_towards(start_deg + 360.0 * k / count, ELEVATIONS_DEG[k % len(ELEVATIONS_DEG)], camera)
         for k in range(count)

@@ -27,11 +27,13 @@ from unirender_reference.backend import mitsuba
 from unirender_reference.geometry import geometry_buffers
 from unirender_reference.materials import Surface
 from unirender_reference.passes import (
+    SAMPLES_PER_PASS,
     TRUTH_BATCHES,
     Counters,
     Estimate,
     derive_seed,
     mean_estimate,
+    pass_count,
     ratio_estimate,
     render_passes,
 )
@@ -189,8 +191,13 @@ def render_sample(spec: SceneSpec, spp: int, seed: int = 0, renderer: Renderer |
         spp: samples per pixel of the image, of s and of d, in `TRUTH_BATCHES` passes.
         seed: another seed gives an independent estimate of the same scene, under the same exposure.
         renderer: reuse this one (of the same object, camera and resolution) instead of loading the scene.
+
+    Raises:
+        UnirenderError: an argument is of another type or out of range, the renderer is another scene's, the light does
+            not reach the object, or a pixel stays NaN.
     """
     renderer = renderer_of(spec, renderer)
+    pass_count(spp, TRUTH_BATCHES, SAMPLES_PER_PASS // renderer.resolution**2)  # refuses before anything is rendered
     factor = exposure.scene_exposure(renderer, spec.light.environment, spec.exposure_seed, f"light {spec.light.name}")
     environment = (spec.light.environment * factor).astype(np.float32)
     geometry = renderer.geometry(geometry_spp(spec.resolution, spp), seed, (spec.roughness, spec.metallic))

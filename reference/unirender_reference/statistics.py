@@ -119,8 +119,10 @@ def z_test(
     condition, and so at most 2 `alpha` that they fail (a test file with many comparisons takes a smaller one).
 
     Raises:
-        UnirenderError: shapes differ or the mask is empty.
+        UnirenderError: shapes differ, the mask is empty, or `alpha` is no chance between 0 and 1.
     """
+    if not 0 < alpha < 1:
+        raise UnirenderError(f"z-test: got alpha {alpha:g}, expected a chance between 0 and 1")
     p = p_values(mean_a, var_a, mean_b, var_b, batches_a, batches_b, rounding)
     if mask is not None:
         p = p[np.broadcast_to(np.asarray(mask) > 0.5, p.shape)]

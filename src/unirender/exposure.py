@@ -36,9 +36,11 @@ def exposure_factor(
         target: radiance that a white surface has afterwards at the percentile, as drawn by `draw_target`.
 
     Raises:
-        UnirenderError: the mask is empty, or no more of the object than above the percentile receives light,
-            or more than is finite.
+        UnirenderError: the mask has another size or is empty, or no more of the object than above the percentile
+            receives light, or more than is finite.
     """
+    if mask.size != diffuse[..., 0].size:
+        raise UnirenderError(f"exposure: got a mask of {mask.shape[:2]} pixels, expected {diffuse.shape[:2]}, d's size")
     inside = mask.reshape(diffuse.shape[:2]) > MASK_THRESHOLD
     if not inside.any():
         raise UnirenderError(

@@ -69,10 +69,14 @@ def specular_light(
         where: pixels to light, the others are 0; all if None.
 
     Raises:
-        UnirenderError: roughness or environment are out of range or of another shape.
+        UnirenderError: roughness is out of range, normals are not finite, or an argument has another shape.
     """
     normal = unit_normals(normal)
+    if normal.ndim != 3 or not np.isfinite(normal).all():
+        raise UnirenderError(f"normal: got shape {normal.shape}, expected finite normals of one picture [h, w, 3]")
     height, width = normal.shape[:2]
+    if where is not None and where.shape != (height, width):
+        raise UnirenderError(f"where: got shape {where.shape}, expected {(height, width)}, the normals' size")
     view = (camera or Camera()).view_directions(height, width)
     there = nonzero(normal)
     lit = there if where is None else there & where

@@ -2,6 +2,7 @@
 
 import inspect
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,18 @@ def test_a_mask_or_several_pictures_that_would_broadcast_are_an_error() -> None:
         inspect.unwrap(metrics.weighted_mean)(pictures[0, ..., :1], np.ones((16, 16)))
     with pytest.raises(UnirenderError, match=r"got shape \(2, 16, 16, 3\), expected one picture"):
         inspect.unwrap(metrics.mse)(pictures, pictures)
+
+
+@pytest.mark.parametrize("metric", [metrics.mse, metrics.ssim, metrics.ciede2000])
+def test_whole_numbers_and_other_sizes_are_an_error(metric: Callable[..., float]) -> None:
+    """PSNR of 8-bit pictures was 48 dB too low, their SSIM that of another range, and a grey truth was broadcast."""
+    picture, w = np.full((16, 16, 3), 0.5), np.ones((16, 16, 1))
+    for truth, message in (
+        (np.full((16, 16, 3), 128, np.uint8), "got uint8 values, expected floats whose white is 1; divide by 255"),
+        (picture[..., :1], r"got shapes \(16, 16, 3\) and \(16, 16, 1\), expected equal ones"),
+    ):
+        with pytest.raises(UnirenderError, match=message):
+            inspect.unwrap(metric)(picture, truth, w)
 
 
 @settings(max_examples=25, deadline=None)

@@ -135,6 +135,16 @@ def test_area_resampling_keeps_the_energy_of_a_sun_in_any_row(size):
         assert mean_radiance(area_resampled(sun, (64, 128))) == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.parametrize(
+    "pixels",
+    [np.full((8, 16, 3), np.nan), np.ones((0, 16, 3))],
+    ids=["NaN", "empty"],
+)
+def test_a_picture_that_is_no_radiance_is_not_resampled(pixels):
+    with pytest.raises(UnirenderError, match=r"^light: got .*, expected "):
+        area_resampled(pixels, (8, 16))
+
+
 @pytest.mark.parametrize(("rows", "row"), [(2, 0), (5, 1), (16, 0)])
 def test_a_lamp_of_a_coarse_map_stays_where_it_is(tmp_path, rows, row):
     """On a grid of the map's own rows it had half of its radiance, and those of 5 rows stood 3 degrees off, at the

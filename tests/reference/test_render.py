@@ -14,7 +14,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference import backend, materials, passes, scene
 from unirender_reference.lights import Light
-from unirender_reference.multiview import pose_towards
+from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.render import (
     DIRECT_DEPTH,
     IMAGE_DEPTH,
@@ -26,7 +26,7 @@ from unirender_reference.render import (
     scene_hashes,
 )
 from unirender_reference.scene import MOST_RADIANCE, envmap_data, sensor_at, sensor_dict
-from unirender_reference.shapes import make_object
+from unirender_reference.shapes import bounding_sphere, make_object
 
 SIZE = 32
 
@@ -338,11 +338,14 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, depth=1),  # black: light has to bounce once
         lambda r: pose_towards(0, 100, r.camera),  # the picture would stand on its head
         lambda r: pose_towards(float("nan"), 0, r.camera),
+        lambda r: orbit(0, r.camera),
+        lambda r: bounding_sphere(np.full((3, 3), np.nan)),
+        lambda r: bounding_sphere(np.zeros((0, 3))),
     ],
     ids=[
         *("roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"),
         *("scaled pose", "mirroring pose", "nan pose", "exposure seed"),
-        *("no bounce", "above the zenith", "nan azimuth"),
+        *("no bounce", "above the zenith", "nan azimuth", "no view", "nan vertices", "no vertices"),
     ],
 )
 def test_bad_arguments_are_refused(renderer: Renderer, call: Callable[[Renderer], object]) -> None:

@@ -110,6 +110,11 @@ def test_an_empty_mask_is_refused() -> None:
         z_test(TRUTH, TRUTH, TRUTH, TRUTH, np.zeros((64, 64, 1)))
 
 
+def test_a_family_level_that_is_no_chance_is_refused() -> None:
+    with pytest.raises(UnirenderError, match="alpha 2, expected"):
+        z_test(TRUTH, TRUTH, TRUTH, TRUTH, alpha=2.0)
+
+
 def test_a_stricter_family_level_lowers_the_threshold() -> None:
     arguments = (*estimate(TRUTH, 0.1, 1), *estimate(TRUTH, 0.1, 2))
     assert z_test(*arguments, alpha=1e-3).threshold < z_test(*arguments).threshold / 5

@@ -17,6 +17,7 @@ from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.composite import composite_image
+from unirender.exposure import exposure_factor
 from unirender.exr import read_exr, write_exr
 from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
@@ -29,8 +30,12 @@ from unirender.surface_light import diffuse_light, specular_light
 from unirender_evaluation import read_results, score
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
+from unirender_reference.denoise import denoise
+from unirender_reference.effects import render_effects
 from unirender_reference.lights import Light, load_light, make_light
+from unirender_reference.lights.light import area_resampled
 from unirender_reference.meshes import load_mesh
+from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.optimize.folder import read_views
 from unirender_reference.optimize.views import View
 from unirender_reference.render import Renderer, SceneSpec, render_sample
@@ -117,6 +122,9 @@ CASES = {
     "diffuse_light(maps.normal, np.ones((16, 32, 4)))": "environment: got shape (16, 32, 4), expected a lat-long map",
     "specular_light(maps.normal, 2.0, light)": "roughness: got values in [2, 2], expected [0, 1]",
     "specular_light(maps.normal, maps.roughness[..., 0], light)": "roughness: got shape (16, 24), expected one number",
+    "specular_light(maps.normal[None], 0.5, light)": "normal: got shape (1, 16, 24, 3), expected finite normals of one",
+    "specular_light(np.nan * maps.normal, 0.5, light)": "normal: got shape (16, 24, 3), expected finite normals of one",
+    "specular_light(maps.normal, 0.5, light, None, mask[:4, :, 0] > 0)": "where: got shape (4, 24), expected (16, 24)",
     "rotate_environment(light, 2 * np.eye(3))": "rotation: got [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]],",
     "rotate_environment(light, np.eye(4))": "rotation: got [[1.0, 0.0, 0.0, 0.0], ",
     "sample_environment(light, 2 * maps.normal)": "directions: got lengths from 0 to 2, expected unit vectors",
@@ -147,6 +155,15 @@ CASES = {
     "Intrinsics(camera='x')": "camera: got 'x', expected a unirender.camera.Camera",
     "shade(maps, light, spp=2.5)": "spp: got 2.5, expected a whole number of samples",
     "shade(maps, light, geometry='x')": "geometry: got 'x', expected an object",
+    "render_sample(SceneSpec(renderer.obj, make_light(1, 'train'), 0.5, 0.0, resolution=8), '64')": "spp: got '64'",
+    "render_effects(renderer, light, 0.5, 0.5, 16, depth=2.5)": "depth: got 2.5, expected a whole number from 2",
+    "denoise(image, image[:8], image, mask)": "denoise: got a picture of (16, 24) pixels and guides of {'albedo': (8,",
+    "orbit(2.5, Camera())": "orbit: got 2.5 cameras, expected a whole number of at least 1",
+    "pose_towards(0, 0, 'front')": "pose: got str, expected unirender.camera.Camera",
+    "area_resampled(bytes_8, (8, 16))": "light: got ndarray of uint8 values, expected linear radiance as floats",
+    "area_resampled(light[..., 0], (8, 16))": "light: got a picture of shape (16, 32), expected finite radiance of",
+    "area_resampled(bytes_8.tolist(), (8, 16))": "light: got list of int64 values, expected linear radiance as floats",
+    "exposure_factor(image, mask[:4], 0.7)": "exposure: got a mask of (4, 24) pixels, expected (16, 24), d's size",
     "shade(None, light)": "shade: got NoneType, expected unirender.intrinsics.Intrinsics",
     "shade_gradients(maps, [[1.0]], light)": "shade_gradients: got an image gradient of shape (1, 1), expected finite",
     "shade_gradients(maps, 'x', light)": "image gradient: got str 'x', expected numbers",

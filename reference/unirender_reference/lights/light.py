@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from unirender.color import luminance
 from unirender.errors import UnirenderError
+from unirender.intrinsics import check_radiance
 from unirender.lighting import check_shape, hat_weights, mean_radiance, weighted_means
 
 if TYPE_CHECKING:
@@ -76,9 +77,15 @@ def area_resampled(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -
     Each texel is the mean of the picture under the texel's bilinear weight, so the total over the sphere stays.
 
     Raises:
-        UnirenderError: the shape is none of a map.
+        UnirenderError: the picture is none of finite radiance, or the shape none of a map.
     """
     check_shape(shape)
+    check_radiance("light", pixels)
+    pixels = np.asarray(pixels)
+    if pixels.ndim != 3 or pixels.shape[-1] != 3 or not pixels.size or not np.isfinite(pixels).all():
+        raise UnirenderError(
+            f"light: got a picture of shape {pixels.shape}, expected finite radiance of shape [height, width, 3]"
+        )
     (h, w), (h2, w2) = pixels.shape[:2], shape
     rows = _pixel_means(np.arange(h + 1) * (h2 - 1) / h, h2, lambda row: np.sin(row * np.pi / (h2 - 1)), wrap=False)
     columns = _pixel_means(np.arange(w + 1) * w2 / w - 0.5, w2, np.ones_like, wrap=True)

@@ -204,9 +204,11 @@ def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> Sphere:
     the radius is then exact for that centre.
 
     Raises:
-        UnirenderError: the points have no extent.
+        UnirenderError: there are none, they have no extent, or are not finite.
     """
     points = vertices.astype(np.float64)
+    if not points.size or not np.isfinite(points).all():
+        raise UnirenderError(f"mesh: got {len(points)} vertices, expected some, all of them finite; repair the mesh")
     center = (points.min(0) + points.max(0)) / 2
     for step in range(100):
         offset = points - center

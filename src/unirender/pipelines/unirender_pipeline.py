@@ -243,8 +243,10 @@ class UniRenderPipeline(DualStreamPipeline):
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
-                missing. A missing mask is where the normal is not 0 (the whole frame where it is 0 nowhere); missing s
-                and d are derived from the environment where it is given.
+                missing. Light is expected as bright as in the training data (white near display white): the error of
+                the network does not shrink with it, so scale a dim light up, and the picture down. A missing mask is
+                where the normal is not 0 (the whole frame where it is 0 nowhere); missing s and d are derived from the
+                environment where it is given.
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
