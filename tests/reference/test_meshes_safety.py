@@ -339,7 +339,8 @@ def test_textures_of_the_folder_of_meshes(tmp_path):
     ("content", "message"),
     [
         (TRIANGLE + "f 1 2 9\n", "faces name vertex 9, but it has 3"),
-        (TRIANGLE + "f 1 2 -4\n", "faces name vertex 0|names vertex 0"),
+        (TRIANGLE + "f 1 2 -4\n", "its faces name a vertex before the first, counted back from a face, but it has 3"),
+        (TRIANGLE + "vn 0 0 1\nf 1//1 2//1 3//-2\n", "name a normal before the first"),
         (TRIANGLE + "f 1 2 99999999999999999999\n", "line 4 cannot be read"),
         (TRIANGLE + "f 1/9 2/9 3/9\n", "faces name texture coordinate 9, but it has 0"),
         (TRIANGLE + "f 1 2 x\n", "line 4 cannot be read .*'f 1 2 x"),
@@ -452,6 +453,8 @@ def test_truncated_stl(tmp_path):
     assert "truncated: claims 1,280 triangles in 64,083 bytes, expected 64,084" in reason(tmp_path / "ball.stl")
     (tmp_path / "ball.stl").write_bytes(data[:80] + struct.pack("<I", 4_000_000_000) + data[84:])
     assert "truncated: claims 4,000,000,000 triangles" in reason(tmp_path / "ball.stl")
+    (tmp_path / "ball.stl").write_bytes(data[:80] + bytes(4) + data[84:])
+    assert "claims 0 triangles, but has bytes for 1,280: its count was never written" in reason(tmp_path / "ball.stl")
     (tmp_path / "ball.stl").write_bytes(b"")
     assert reason(tmp_path / "ball.stl") == "is empty; copy it again"
 
@@ -489,10 +492,14 @@ def test_find_meshes(tmp_path):
     assert names(f"{tmp_path}/[xw]/*") == ["w/f[1].stl", "x/c.ply"]
     assert names(f"{tmp_path}/w/f[1].stl") == ["w/f[1].stl"]
     assert names(tmp_path / "b.glb") == ["b.glb"]
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others/chair.FBX").touch()
     for pattern, message in {
         f"{tmp_path}/absent": "no such file or folder",
         f"{tmp_path}/absent/*.glb": "no folder .*absent; expected one before the first wildcard",
         f"{tmp_path}/*.fbx": "no mesh found; expected files ending in",
+        f"{tmp_path}/others": r"; chair\.FBX is there: export it as GLB, from Blender or with assimp$",
+        f"{tmp_path}/others/chair.*": r"; chair\.FBX is there: export it as GLB",
         f"{tmp_path}/notes.txt": "no mesh found",
         f"{tmp_path}/.obj": "no mesh found",
     }.items():
