@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UsageError
-from unirender.input_picture import BYTES_A_PIXEL, read_input
+from unirender.input_picture import BYTES_A_PIXEL, TILED_BYTES_A_PIXEL, read_input
 from unirender.notices import notice
 from unirender.option_checks import at_least, usage
 
@@ -193,6 +193,11 @@ class DecompositionOptions:
                 check_looks(self.looks, mode)
 
     @property
+    def bytes_a_pixel(self) -> int:
+        """Of memory, that a decomposition or an edit takes, as of `read_input`. (`flat` and looks take no more.)"""
+        return TILED_BYTES_A_PIXEL if self.tile else BYTES_A_PIXEL
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of the pipeline's methods, and facts for `meta.json`."""
         return dataclasses.asdict(self)
@@ -224,7 +229,7 @@ class InputOptions:
         """For `meta.json`."""
         return {"input": self.picture, "mask": self.mask}
 
-    def read(self, model: ModelOptions, bytes_a_pixel: int = BYTES_A_PIXEL) -> tuple["Picture", "Camera"]:
+    def read(self, model: ModelOptions, bytes_a_pixel: int) -> tuple["Picture", "Camera"]:
         """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the
         picture cannot show. `bytes_a_pixel` as of `read_input`.
 
