@@ -85,7 +85,7 @@ class Decompose:
             return run_folder(self)
         if self.frames:
             raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
-        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel)
+        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel(self.model.samples))
         with contextlib.ExitStack() as folders:
             folder = folders.enter_context(new_folder(self.out.output, overwrite=self.out.overwrite))
             scene: Path | None = None
@@ -197,7 +197,7 @@ class Edit:
         for name, value in change.items():
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
-        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel)
+        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel(self.model.samples))
         options = {"anchored": self.anchored, **self.decomposition.settings}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
@@ -240,7 +240,8 @@ class Relight:
         self.model.check()
         self.decomposition.check(self.model.mode)
         check_stops(self.exposure)
-        picture, camera = self.input.read(self.model, RELIT_BYTES_A_PIXEL)
+        taken = max(RELIT_BYTES_A_PIXEL, self.decomposition.bytes_a_pixel(self.model.samples))
+        picture, camera = self.input.read(self.model, taken)
         options = {"anchored": self.anchored, **self.decomposition.settings, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light, rule = exposed_light(read_light, self.environment, self.exposure)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UsageError
-from unirender.input_picture import BYTES_A_PIXEL, TILED_BYTES_A_PIXEL, read_input
+from unirender.input_picture import BYTES_A_PIXEL, TILED_BYTES_A_PIXEL, TILED_SAMPLE_BYTES_A_PIXEL, read_input
 from unirender.notices import notice
 from unirender.option_checks import at_least, usage
 
@@ -192,10 +192,11 @@ class DecompositionOptions:
             with usage():
                 check_looks(self.looks, mode)
 
-    @property
-    def bytes_a_pixel(self) -> int:
+    def bytes_a_pixel(self, samples: int) -> int:
         """Of memory, that a decomposition or an edit takes, as of `read_input`. (`flat` and looks take no more.)"""
-        return TILED_BYTES_A_PIXEL if self.tile else BYTES_A_PIXEL
+        if not self.tile:
+            return BYTES_A_PIXEL
+        return TILED_BYTES_A_PIXEL + (TILED_SAMPLE_BYTES_A_PIXEL * samples if samples > 1 else 0)
 
     @property
     def settings(self) -> dict[str, Any]:
