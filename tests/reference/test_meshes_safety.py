@@ -1,6 +1,7 @@
 """What `load_mesh` refuses: one sentence each, in bounded memory, and nothing read from outside the model's folder."""
 
 import ast
+import io
 import json
 import os
 import re
@@ -16,11 +17,13 @@ import pytest
 import trimesh
 from broken_files import BROKEN, GREEDY, huge_scale
 from gltf_files import CORNERS, GOOD, GltfWriter, png, random_pixels
+from PIL import Image
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes import find_meshes, load_mesh
 from unirender_reference.meshes import limits as bounds
+from unirender_reference.meshes.images import ImageBudget
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 PLY = b"ply\nformat ascii 1.0\n"
@@ -223,7 +226,7 @@ def test_damaged_and_large_pictures(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(data)
     assert load_mesh(path).albedo.shape == (66, 66, 3)
     monkeypatch.setattr("unirender_reference.meshes.images.MAX_IMAGE_PIXELS", 4000)
-    assert "texture 'a.png': 0 megapixels, expected at most 64; reduce it" in reason(path)
+    assert "texture 'a.png': 64 x 64 pixels, expected at most 67,108,864 (8,192 x 8,192); reduce it" in reason(path)
     monkeypatch.undo()
     monkeypatch.setattr("unirender_reference.meshes.images.MAX_IMAGE_SIDE", 63)
     assert "texture 'a.png': 64 x 64 pixels, expected sides of at most 63; reduce it" in reason(path)
@@ -429,6 +432,18 @@ def test_names_that_differ_in_case_alone_are_found(tmp_path):
 def test_other_formats(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     assert re.search(message, reason(tmp_path / name))
+
+
+def test_a_texture_of_8k_is_read_and_a_larger_one_is_not():
+    """64 million pixels were the limit, a little less than 8192 x 8192. Nothing is decoded here."""
+    data = []
+    for width in (8192, 8193):
+        stream = io.BytesIO()
+        Image.new("1", (width, 8192)).save(stream, "PNG", compress_level=1)
+        data.append(stream.getvalue())
+    assert ImageBudget().open(data[0], "'a.png'").size == (8192, 8192)
+    with pytest.raises(UnirenderError, match=r"texture 'a\.png': 8,193 x 8,192 pixels, expected at most 67,108,864"):
+        ImageBudget().open(data[1], "'a.png'")
 
 
 @pytest.mark.parametrize("lost", ["100 lines", "half of the last line"])
