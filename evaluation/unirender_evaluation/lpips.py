@@ -28,6 +28,8 @@ BACKBONES: tuple[Backbone, ...] = get_args(Backbone)
 
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # the ScalingLayer of v0.1, on images in [-1, 1]
 KEPT_TRUTHS = 4  # feature lists kept for reuse; 2 MB each for VGG at 64 px
+KEPT_PIXELS = 2**16  # of a truth whose features are kept
+PIXELS_AT_ONCE = 2**20  # of all pictures of a forward pass, where there are several
 EPSILON = 1e-10  # added to the feature norm, as the authors do
 SMALLEST = {"alex": 31, "vgg": 16}  # smallest side (pixels) that leaves at least one value in the last map
 
@@ -102,7 +104,7 @@ class Lpips:
 
     Args:
         backbone: "alex" or "vgg".
-        batch: pairs per forward pass; bounds the memory.
+        batch: pairs per forward pass; fewer of pictures that have more than `PIXELS_AT_ONCE` together.
 
     Raises:
         UnirenderError: if the weights are not on this machine.
@@ -158,7 +160,9 @@ class Lpips:
             return np.concatenate([distances.numpy() for distances in found])
 
     def _features_once(self, image: Float[Tensor, "1 3 h w"]) -> list[Tensor]:
-        """Features of a truth; the last few are kept, because many methods are scored on one truth after another."""
+        """Features of a truth; the last few are kept if small: many methods are scored on one truth after another."""
+        if image.shape[-2] * image.shape[-1] > KEPT_PIXELS:
+            return self.network.features(image)
         key = image.shape, hashlib.sha256(image.contiguous().numpy().tobytes()).digest()
         if key not in self._kept:
             while len(self._kept) >= KEPT_TRUTHS:
@@ -168,7 +172,8 @@ class Lpips:
 
     def _batches(self, images: Float[np.ndarray, "n h w 3"]) -> list[Tensor]:
         tensor = torch.from_numpy(np.ascontiguousarray(images, dtype=np.float32)).permute(0, 3, 1, 2)
-        return list(tensor.split(self.batch))
+        most = max(PIXELS_AT_ONCE // (images.shape[1] * images.shape[2]), 1)
+        return list(tensor.split(min(self.batch, most)))
 
 
 @lru_cache(maxsize=2)

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from unirender.arguments import as_floats
+from unirender.blocks import BLOCK
 from unirender.errors import UnirenderError
 
 Mask = Literal["masked", "whole"]
@@ -31,6 +32,7 @@ SCALES: tuple[Scale, ...] = ("raw", "aligned", "aligned_rgb")
 LPIPS_SCALES: tuple[Scale, ...] = ("raw",)  # those that runs compute: with others, scoring takes half as long again
 
 SSIM_SIGMA, SSIM_TRUNCATE = 1.5, 3.5  # Wang et al. 2004: an 11 x 11 Gaussian window
+DENSE_SIDE = 256  # pixels up to which the window is a product with a dense matrix, of all pictures at once
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 HIGHER, LOWER = True, False  # is better: `Metric.higher_is_better`, as tables of metrics say it
 LOG_EPSILON = 0.01  # added before the logarithm, display units: a hundredth of display white
@@ -218,13 +220,25 @@ def ssim_map(p: Float[np.ndarray, "*n h w c"], t: Float[np.ndarray, "*m h w c"])
     use_sample_covariance=False, data_range=1, full=True)`, and many images at once: the variants of a sample share a
     call (a test holds the two together). Leading axes of the truth broadcast against the prediction's.
     """
+    if max(p.shape[-3:-1]) <= DENSE_SIDE:
+        return _similarity(p, t).mean(axis=-1)
+    p, t = np.broadcast_arrays(p, t)
+    found = np.empty(p.shape[:-1])
+    for at in np.ndindex(p.shape[:-3]):  # of large pictures one channel after the other, to the same bytes
+        planes = [_similarity(p[at][..., k : k + 1], t[at][..., k : k + 1]) for k in range(p.shape[-1])]
+        found[at] = np.concatenate(planes, axis=-1).mean(axis=-1)
+    return found
+
+
+def _similarity(p: Float[np.ndarray, "*n h w c"], t: Float[np.ndarray, "*m h w c"]) -> Float[np.ndarray, "*n h w c"]:
+    """`ssim_map` of each channel."""
     p, t = p.astype(np.float64), t.astype(np.float64)
     c1, c2 = SSIM_K1**2, SSIM_K2**2
     mean_p, mean_t = _blur(p), _blur(t)
     var_p, var_t = _blur(p * p) - mean_p**2, _blur(t * t) - mean_t**2
     covariance = _blur(p * t) - mean_p * mean_t
     numerator = (2 * mean_p * mean_t + c1) * (2 * covariance + c2)
-    return (numerator / ((mean_p**2 + mean_t**2 + c1) * (var_p + var_t + c2))).mean(axis=-1)
+    return numerator / ((mean_p**2 + mean_t**2 + c1) * (var_p + var_t + c2))
 
 
 def ssim(
@@ -308,17 +322,21 @@ def ciede2000(
         raise UnirenderError(f"metric: got a mask of shape {w.shape}, expected {expected}; take mask[..., None]")
     inside = w[..., 0] > 0
     space = colour.RGB_COLOURSPACES["ITU-R BT.709"]
-    labs = [
-        colour.XYZ_to_Lab(np.clip(x[inside], 0, 1).astype(np.float64) @ space.matrix_RGB_to_XYZ.T, space.whitepoint)
-        for x in (p_linear, t_linear)
-    ]
-    difference = np.asarray(colour.delta_E(labs[0], labs[1], method="CIE 2000"))
-    return weighted_mean(difference[:, None], w[inside])
+    p, t, weights = p_linear[inside], t_linear[inside], w[inside]
+    difference = np.empty(weights.shape)
+    for start in range(0, len(p), BLOCK):
+        part = slice(start, start + BLOCK)
+        labs = [
+            colour.XYZ_to_Lab(np.clip(x[part], 0, 1).astype(np.float64) @ space.matrix_RGB_to_XYZ.T, space.whitepoint)
+            for x in (p, t)
+        ]
+        difference[part, 0] = colour.delta_E(labs[0], labs[1], method="CIE 2000")
+    return weighted_mean(difference, weights)
 
 
 def _blur(x: Float[np.ndarray, "*n h w c"]) -> Float[np.ndarray, "*n h w c"]:
     height, width = x.shape[-3:-1]
-    if max(height, width) > 256:  # beyond it the separable filter needs fewer operations than a dense product
+    if max(height, width) > DENSE_SIDE:  # beyond it the separable filter needs fewer operations than a dense product
         for axis in (-3, -2):
             x = gaussian_filter1d(x, SSIM_SIGMA, axis=axis, truncate=SSIM_TRUNCATE)
         return x

@@ -18,6 +18,7 @@ from unirender.arguments import as_instance
 from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.machine import memory_excess
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import (
@@ -37,6 +38,9 @@ Rgb = Float[np.ndarray, "h w 3"]
 Weights = Float[np.ndarray, "h w 1"]
 COLOURS = ("albedo", "specular", "diffuse")
 MATERIALS = ("roughness", "metallic")
+IMAGE_BYTES_A_PIXEL, MAPS_BYTES_A_PIXEL, BYTES_OF_NONE = 420, 570, 3e8  # of memory, what is scored included
+LPIPS_BYTES_A_PIXEL = {"alex": 80, "vgg": 1420}  # beside that
+LARGE = 2**20  # pixels from which they are looked at
 SAME_MASK = 1 / 255  # largest difference of a mask that was stored in 8 bits, whether rounded or cut off
 
 
@@ -60,10 +64,11 @@ def score_maps(
         the prediction has one of its own. Lights have metrics of their own (`light_metrics.score_light`).
 
     Raises:
-        UnirenderError: if the truth has no mask or an empty one, or sizes differ.
+        UnirenderError: if the truth has no mask or an empty one, sizes differ, or the machine is too small for them.
     """
     as_instance(prediction, Intrinsics, "prediction")
     w = _truth_mask(as_instance(truth, Intrinsics, "truth").mask)
+    _check_memory("maps", w, MAPS_BYTES_A_PIXEL, lpips)
     own = _own_mask(prediction.mask, w)
     values: dict[str, float] = {}
     if own is not w:
@@ -121,9 +126,10 @@ def score_image(
         Metric key -> value, all variants.
 
     Raises:
-        UnirenderError: if the mask is empty, sizes differ, or the prediction is not finite.
+        UnirenderError: if the mask is empty, sizes differ, the prediction is not finite, or the machine is too small.
     """
     w = _truth_mask(truth_mask)
+    _check_memory(quantity, w, IMAGE_BYTES_A_PIXEL, lpips)
     own = _own_mask(prediction_mask, w)
     _check_shapes(quantity, prediction_linear, truth_linear)
     p, t = (unpremultiply(x, m) for x, m in ((prediction_linear, own), (truth_linear, w)))
@@ -197,6 +203,19 @@ def _truth_mask(mask: Weights | None) -> Weights:
         what = "no mask" if mask is None else "an empty mask"
         raise UnirenderError(f"scoring: the truth has {what}, expected coverage in [0, 1] with an object in it")
     return mask
+
+
+def _check_memory(what: str, mask: Weights, bytes_a_pixel: int, lpips: Sequence[Lpips]) -> None:
+    """Refuses what the machine is too small for: in one sentence instead of an end without a word."""
+    pixels = mask.shape[0] * mask.shape[1]
+    if pixels < LARGE:
+        return
+    taken = bytes_a_pixel + max((LPIPS_BYTES_A_PIXEL[network.backbone] for network in lpips), default=0)
+    if excess := memory_excess(BYTES_OF_NONE + taken * pixels):
+        fewer = ", or leave out LPIPS" if lpips else ""
+        raise UnirenderError(
+            f"scoring {what}: {pixels / 1e6:,.3g} megapixels, which {excess}; scale both sides down{fewer}"
+        )
 
 
 def _own_mask(mask: Weights | None, truth: Weights) -> Weights:

@@ -13,8 +13,8 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.input_picture import (
+    DERIVED_BYTES_A_PIXEL,
     RELIT_BYTES_A_PIXEL,
-    RELIT_MAPS_BYTES_A_PIXEL,
     RENDERED_BYTES_A_PIXEL,
     memory_remarks,
 )
@@ -85,7 +85,7 @@ class Decompose:
             return run_folder(self)
         if self.frames:
             raise UnirenderError(f"{self.input.picture}: is no folder, expected a folder of pictures for --frames")
-        picture, camera = self.input.read(self.model)
+        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel(self.model.samples))
         with contextlib.ExitStack() as folders:
             folder = folders.enter_context(new_folder(self.out.output, overwrite=self.out.overwrite))
             scene: Path | None = None
@@ -159,11 +159,13 @@ class Render:
 
     def _memory_remarks(self) -> dict[str, str]:
         """As `memory_remarks` has them, of the maps' size in their header."""
-        from unirender.exr import pixel_count
-        from unirender.files import INTRINSICS_FILE
+        from unirender.exr import channel_names, pixel_count
+        from unirender.files import ENVIRONMENT_FILE, INTRINSICS_FILE
 
         file = self.maps / INTRINSICS_FILE if self.maps.is_dir() else self.maps
-        taken = RENDERED_BYTES_A_PIXEL if self.environment is None else RELIT_MAPS_BYTES_A_PIXEL
+        lit = self.maps.is_dir() and (self.maps / ENVIRONMENT_FILE).exists()
+        derived = self.environment is not None or (lit and not {"specular.R", "diffuse.R"} <= channel_names(file))
+        taken = DERIVED_BYTES_A_PIXEL if derived else RENDERED_BYTES_A_PIXEL
         return memory_remarks(self.maps, pixel_count(file), taken)
 
 
@@ -195,7 +197,7 @@ class Edit:
         for name, value in change.items():
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a number in [0, 1]")
-        picture, camera = self.input.read(self.model)
+        picture, camera = self.input.read(self.model, self.decomposition.bytes_a_pixel(self.model.samples))
         options = {"anchored": self.anchored, **self.decomposition.settings}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             pipeline, sampling = self.model.load(), self.model.sampling()
@@ -238,7 +240,8 @@ class Relight:
         self.model.check()
         self.decomposition.check(self.model.mode)
         check_stops(self.exposure)
-        picture, camera = self.input.read(self.model, RELIT_BYTES_A_PIXEL)
+        taken = max(RELIT_BYTES_A_PIXEL, self.decomposition.bytes_a_pixel(self.model.samples))
+        picture, camera = self.input.read(self.model, taken)
         options = {"anchored": self.anchored, **self.decomposition.settings, "shadows": self.shadows}
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light, rule = exposed_light(read_light, self.environment, self.exposure)

@@ -77,6 +77,16 @@ def open_picture(path: str | Path, *, upright: bool = True) -> Image.Image:
         ) from error
 
 
+def pixel_count(path: Path) -> int:
+    """By the header of a file of Pillow's; 0 where it has none that can be read, or names more than `MAX_PIXELS`."""
+    try:
+        with opened(path) as file:
+            pixels = file.width * file.height
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # told where it is read
+        return 0
+    return pixels if pixels <= MAX_PIXELS else 0
+
+
 def _unreadable(path: Path, error: Exception) -> str:
     """What a file is that Pillow did not read, where its first bytes tell, else what Pillow says."""
     try:

@@ -152,6 +152,14 @@ def pixel_count(path: Path) -> int:
     return (int(high[0]) - int(low[0]) + 1) * (int(high[1]) - int(low[1]) + 1)
 
 
+def channel_names(path: Path) -> frozenset[str]:
+    """By the header of a file; none where it has none that can be read."""
+    try:
+        return frozenset(channel.name for channel in OpenEXR.File(str(path), header_only=True).header()["channels"])
+    except Exception:  # several types, as in reading
+        return frozenset()
+
+
 def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:
     """As `read_exr`, from memory; `name` stands in error messages."""
     try:

@@ -43,7 +43,9 @@ class Reader:
         Raises:
             UnirenderError: it cannot be read, or the network would refuse it.
         """
-        picture, said = read_input(path, mask, samples=self.command.model.samples)
+        samples = self.command.model.samples
+        taken = self.command.decomposition.bytes_a_pixel(samples)
+        picture, said = read_input(path, mask, bytes_a_pixel=taken, samples=samples)
         try:
             as_picture(picture.image_srgb, picture.mask)
         except UnirenderError as error:

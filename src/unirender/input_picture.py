@@ -15,8 +15,11 @@ FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
 BYTES_A_PIXEL, BYTES_OF_NONE = 145, 5e8  # of memory: what it takes to take a picture apart, or to edit it
+TILED_BYTES_A_PIXEL = 180  # the same with the detail of tiles
+TILED_SAMPLE_BYTES_A_PIXEL = 24  # what each of several samples takes in tiles, beside `SAMPLE_BYTES_A_PIXEL`
 RELIT_BYTES_A_PIXEL = 190  # what it takes to put it under another light
-RENDERED_BYTES_A_PIXEL, RELIT_MAPS_BYTES_A_PIXEL = 115, 150  # what it takes to render maps; under another light
+RENDERED_BYTES_A_PIXEL = 115  # what it takes to render maps
+DERIVED_BYTES_A_PIXEL = 160  # where s and d are derived from a light
 SAMPLE_BYTES_A_PIXEL = 64  # what each takes beside that, where there are several samples
 
 
@@ -37,11 +40,13 @@ def read_input(
     """
     import numpy as np
 
-    from unirender.pictures import OPAQUE, read_mask_file, read_picture
+    from unirender.pictures import OPAQUE, header_pixels, read_mask_file, read_picture
 
+    pixels = header_pixels(path)
+    lack = memory_remarks(path, pixels, bytes_a_pixel, samples) if pixels else {}
     picture = read_picture(path)
     height, width = picture.image_srgb.shape[:2]
-    remarks = dict(picture.remarks) | memory_remarks(path, height * width, bytes_a_pixel, samples)
+    remarks = dict(picture.remarks) | lack
     if mask is not None:
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UsageError
-from unirender.input_picture import BYTES_A_PIXEL, read_input
+from unirender.input_picture import BYTES_A_PIXEL, TILED_BYTES_A_PIXEL, TILED_SAMPLE_BYTES_A_PIXEL, read_input
 from unirender.notices import notice
 from unirender.option_checks import at_least, usage
 
@@ -192,6 +192,12 @@ class DecompositionOptions:
             with usage():
                 check_looks(self.looks, mode)
 
+    def bytes_a_pixel(self, samples: int) -> int:
+        """Of memory, that a decomposition or an edit takes, as of `read_input`. (`flat` and looks take no more.)"""
+        if not self.tile:
+            return BYTES_A_PIXEL
+        return TILED_BYTES_A_PIXEL + (TILED_SAMPLE_BYTES_A_PIXEL * samples if samples > 1 else 0)
+
     @property
     def settings(self) -> dict[str, Any]:
         """Keyword arguments of the pipeline's methods, and facts for `meta.json`."""
@@ -224,7 +230,7 @@ class InputOptions:
         """For `meta.json`."""
         return {"input": self.picture, "mask": self.mask}
 
-    def read(self, model: ModelOptions, bytes_a_pixel: int = BYTES_A_PIXEL) -> tuple["Picture", "Camera"]:
+    def read(self, model: ModelOptions, bytes_a_pixel: int) -> tuple["Picture", "Camera"]:
         """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the
         picture cannot show. `bytes_a_pixel` as of `read_input`.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from unirender import display_files, exr
 from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
@@ -68,6 +69,16 @@ def read_picture(path: str | Path, *, upright: bool = True) -> Picture:
     """
     path = checked_file(path)
     return _read_exr_picture(path) if path.suffix.lower() == ".exr" else _read_display_picture(path, upright)
+
+
+def header_pixels(path: str | Path) -> int:
+    """Width times height by the header of a picture; 0 where it cannot be read, which `read_picture` tells of.
+
+    Raises:
+        UnirenderError: as `checked_file`.
+    """
+    path = checked_file(path)
+    return exr.pixel_count(path) if path.suffix.lower() == ".exr" else display_files.pixel_count(path)
 
 
 def checked_file(path: str | Path) -> Path:

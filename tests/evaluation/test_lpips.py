@@ -67,6 +67,9 @@ def test_kept_features_change_nothing(alex: Lpips) -> None:
         [alex.distance(a, truth)[0] for truth in truths] == first == [Lpips("alex").distance(a, t)[0] for t in truths]
     )
     assert len(set(first)) == len(truths)
+    kept = list(alex._kept)
+    alex.distance(np.zeros((1, 40, 1700, 3), np.float32), np.ones((1, 40, 1700, 3), np.float32))
+    assert list(alex._kept) == kept  # of large truths they were gigabytes
     white = np.ones((1, 64, 40, 3), np.float32)  # and its transpose, another truth of the same bytes
     lying = white.transpose(0, 2, 1, 3)
     assert alex.distance(white / 2, white)[0] > 0

@@ -188,6 +188,16 @@ def test_lpips_by_hand(own: np.ndarray | None) -> None:
     assert (masked == whole) == (own is None)
 
 
+def test_what_the_machine_is_too_small_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 4k pictures a process ended without a word."""
+    picture, mask = np.zeros((1024, 1024, 3), np.float32), np.ones((1024, 1024, 1), np.float32)
+    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: 6e8)
+    with pytest.raises(UnirenderError, match=r"scoring relit: 1\.05 megapixels, which would take about 0\.7 GiB of"):
+        score_image(picture, picture, mask)
+    with pytest.raises(UnirenderError, match=r"scoring maps: .* about 1\.0 GiB .*scale both sides down, or leave out"):
+        score_maps(Intrinsics(mask=mask), Intrinsics(mask=mask), lpips=[load("alex")])
+
+
 def test_materials_and_normals_by_hand() -> None:
     prediction, truth, w, own = intrinsics(1).maps, intrinsics(0).maps, disc(), disc(6)
     values = score_maps(intrinsics(1).replace(mask=own), intrinsics(0))

@@ -103,7 +103,7 @@ BROKEN: dict[Callable[[Path], Path], str] = {
     nan_vertices: "1 of 6 corner points are NaN or infinite",
     zero_area: "zero area: all 2 faces are points or lines",
     missing_texture: "texture 'nowhere.png' is missing from the model's folder",
-    texture_bomb: "texture 'bomb.png': 3,600 megapixels, expected at most 64; reduce it",
+    texture_bomb: "texture 'bomb.png': 3,600,000,000 pixels, expected at most 67,108,864",
     huge_scale: r"extent 2e\+09 units, expected 1e-08 to 1e\+08",
     huge_index: "name vertex 4,000,000,000, but it has 4 vertices",
     outside: r"texture '..%2Fsecret.png' lies outside the model's folder",

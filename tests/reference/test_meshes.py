@@ -247,6 +247,8 @@ def test_stl_that_goes_on_behind_its_facets(tmp_path):
     assert (len(obj.faces), obj.provenance["ignored"]) == (12, "")
     (tmp_path / "a.stl").write_bytes(data[:-2] + b"\x1f\x80")
     assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "attributes of facets"
+    (tmp_path / "a.stl").write_bytes(data + data[-50:])
+    assert load_mesh(tmp_path / "a.stl").provenance["ignored"] == "facets beyond the count"
 
 
 @pytest.mark.parametrize("padding", ["in capitals", "a name", "the end", "ends of lines"])

@@ -1,6 +1,7 @@
 """What `load_mesh` refuses: one sentence each, in bounded memory, and nothing read from outside the model's folder."""
 
 import ast
+import io
 import json
 import os
 import re
@@ -16,11 +17,13 @@ import pytest
 import trimesh
 from broken_files import BROKEN, GREEDY, huge_scale
 from gltf_files import CORNERS, GOOD, GltfWriter, png, random_pixels
+from PIL import Image
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes import find_meshes, load_mesh
 from unirender_reference.meshes import limits as bounds
+from unirender_reference.meshes.images import ImageBudget
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 PLY = b"ply\nformat ascii 1.0\n"
@@ -223,7 +226,7 @@ def test_damaged_and_large_pictures(tmp_path, monkeypatch):
     (tmp_path / "a.png").write_bytes(data)
     assert load_mesh(path).albedo.shape == (66, 66, 3)
     monkeypatch.setattr("unirender_reference.meshes.images.MAX_IMAGE_PIXELS", 4000)
-    assert "texture 'a.png': 0 megapixels, expected at most 64; reduce it" in reason(path)
+    assert "texture 'a.png': 64 x 64 pixels, expected at most 67,108,864 (8,192 x 8,192); reduce it" in reason(path)
     monkeypatch.undo()
     monkeypatch.setattr("unirender_reference.meshes.images.MAX_IMAGE_SIDE", 63)
     assert "texture 'a.png': 64 x 64 pixels, expected sides of at most 63; reduce it" in reason(path)
@@ -339,7 +342,8 @@ def test_textures_of_the_folder_of_meshes(tmp_path):
     ("content", "message"),
     [
         (TRIANGLE + "f 1 2 9\n", "faces name vertex 9, but it has 3"),
-        (TRIANGLE + "f 1 2 -4\n", "faces name vertex 0|names vertex 0"),
+        (TRIANGLE + "f 1 2 -4\n", "its faces name a vertex before the first, counted back from a face, but it has 3"),
+        (TRIANGLE + "vn 0 0 1\nf 1//1 2//1 3//-2\n", "name a normal before the first"),
         (TRIANGLE + "f 1 2 99999999999999999999\n", "line 4 cannot be read"),
         (TRIANGLE + "f 1/9 2/9 3/9\n", "faces name texture coordinate 9, but it has 0"),
         (TRIANGLE + "f 1 2 x\n", "line 4 cannot be read .*'f 1 2 x"),
@@ -430,6 +434,18 @@ def test_other_formats(tmp_path, name, content, message):
     assert re.search(message, reason(tmp_path / name))
 
 
+def test_a_texture_of_8k_is_read_and_a_larger_one_is_not():
+    """64 million pixels were the limit, a little less than 8192 x 8192. Nothing is decoded here."""
+    data = []
+    for width in (8192, 8193):
+        stream = io.BytesIO()
+        Image.new("1", (width, 8192)).save(stream, "PNG", compress_level=1)
+        data.append(stream.getvalue())
+    assert ImageBudget().open(data[0], "'a.png'").size == (8192, 8192)
+    with pytest.raises(UnirenderError, match=r"texture 'a\.png': 8,193 x 8,192 pixels, expected at most 67,108,864"):
+        ImageBudget().open(data[1], "'a.png'")
+
+
 @pytest.mark.parametrize("lost", ["100 lines", "half of the last line"])
 @pytest.mark.parametrize("kind", ["off", "ply", "stl"])
 def test_a_text_that_is_cut_off(tmp_path, kind, lost):
@@ -452,6 +468,8 @@ def test_truncated_stl(tmp_path):
     assert "truncated: claims 1,280 triangles in 64,083 bytes, expected 64,084" in reason(tmp_path / "ball.stl")
     (tmp_path / "ball.stl").write_bytes(data[:80] + struct.pack("<I", 4_000_000_000) + data[84:])
     assert "truncated: claims 4,000,000,000 triangles" in reason(tmp_path / "ball.stl")
+    (tmp_path / "ball.stl").write_bytes(data[:80] + bytes(4) + data[84:])
+    assert "claims 0 triangles, but has bytes for 1,280: its count was never written" in reason(tmp_path / "ball.stl")
     (tmp_path / "ball.stl").write_bytes(b"")
     assert reason(tmp_path / "ball.stl") == "is empty; copy it again"
 
@@ -489,10 +507,14 @@ def test_find_meshes(tmp_path):
     assert names(f"{tmp_path}/[xw]/*") == ["w/f[1].stl", "x/c.ply"]
     assert names(f"{tmp_path}/w/f[1].stl") == ["w/f[1].stl"]
     assert names(tmp_path / "b.glb") == ["b.glb"]
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others/chair.FBX").touch()
     for pattern, message in {
         f"{tmp_path}/absent": "no such file or folder",
         f"{tmp_path}/absent/*.glb": "no folder .*absent; expected one before the first wildcard",
         f"{tmp_path}/*.fbx": "no mesh found; expected files ending in",
+        f"{tmp_path}/others": r"; chair\.FBX is there: export it as GLB, from Blender or with assimp$",
+        f"{tmp_path}/others/chair.*": r"; chair\.FBX is there: export it as GLB",
         f"{tmp_path}/notes.txt": "no mesh found",
         f"{tmp_path}/.obj": "no mesh found",
     }.items():

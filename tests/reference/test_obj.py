@@ -45,6 +45,12 @@ def test_no_pbr_keywords_no_maps(tmp_path):
     assert obj.uv is None
 
 
+def test_lines_points_and_curves_are_listed(tmp_path):
+    """Nothing said that they are left out."""
+    obj = write(tmp_path, "Kd 0.5 0.5 0.5", "f 1/1 2/2 3/3 4/4\nl 1 2 3\np 1\ncurv 0 1 1 2")
+    assert obj.provenance["ignored"] == "curves and their surfaces, points and lines"
+
+
 def test_pbr_keywords(tmp_path):
     pictures = {name: random_pixels(i, 8, 8) for i, name in enumerate(("color", "rough", "metal", "bumps"))}
     pictures["bumps"][..., 2] = 255

@@ -14,12 +14,12 @@ from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
 from unirender.color import srgb_encode
-from unirender.commands import Relight, Render
+from unirender.commands import Decompose, Relight, Render
 from unirender.display_files import MAX_PIXELS, display_values, open_picture, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, RENDERED_BYTES_A_PIXEL, read_input
-from unirender.options import InputOptions, OutputOptions
+from unirender.options import DecompositionOptions, InputOptions, OutputOptions
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
@@ -464,8 +464,11 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     needed = BYTES_OF_NONE + BYTES_A_PIXEL * 400 * 300
     monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
     read_input(tmp_path / "a.png", None)
+    source, out = InputOptions(tmp_path / "a.png"), OutputOptions(tmp_path / "out")
     with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
-        Relight(InputOptions(tmp_path / "a.png"), tmp_path / "a.hdr", OutputOptions(tmp_path / "out")).run(np.asarray)
+        Relight(source, tmp_path / "a.hdr", out).run(np.asarray)
+    with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
+        Decompose(source, out, decomposition=DecompositionOptions(tile=True)).run()
     with pytest.raises(UnirenderError, match=r"for it; scale it down first, or ask for fewer --samples"):
         read_input(tmp_path / "a.png", None, samples=2)
     monkeypatch.setattr("unirender.machine.unswapped_bytes", lambda: needed - 1)
@@ -476,6 +479,9 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
     with pytest.raises(
         UnirenderError, match=r"a picture of 0\.12 megapixels.* about 0\.5 GiB .* has 0\.4 GiB for it; scale"
     ):
+        read_input(tmp_path / "a.png", None)
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:100])  # told before it is decoded
+    with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
         read_input(tmp_path / "a.png", None)
 
 
@@ -490,6 +496,12 @@ def test_maps_that_the_machine_is_too_small_for_are_refused_before_they_are_read
         render.run(np.asarray)
     with pytest.raises(UnirenderError, match=r"a\.exr: a picture of 0\.12 megapixels, which would take about"):
         dataclasses.replace(render, environment=tmp_path / "light.exr").run(np.asarray)
+    lit = tmp_path / "lit"  # from whose light s and d are derived
+    lit.mkdir()
+    (tmp_path / "a.exr").rename(lit / "intrinsics.exr")
+    (lit / "environment.exr").touch()
+    with pytest.raises(UnirenderError, match=r"lit: a picture of 0\.12 megapixels"):
+        dataclasses.replace(render, maps=lit).run(np.asarray)
 
 
 def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:

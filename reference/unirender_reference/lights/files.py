@@ -25,17 +25,16 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from unirender import display_files
 from unirender.arguments import as_path
 from unirender.blocks import by_rows
 from unirender.color import srgb_decode
-from unirender.display_files import srgb_values
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
 from unirender.lighting import check_shape, resample_environment
 from unirender.machine import memory_excess
 from unirender.pictures import check_finite, negative_share
 from unirender.primaries import REC709, in_rec709
-from unirender.sixteen_bits import opened
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
 
@@ -160,12 +159,12 @@ def _box_resize(pixels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     """Display values of a picture, upright; an alpha channel is dropped."""
-    return np.ascontiguousarray(srgb_values(path, f"light {path}")[..., :3])
+    return np.ascontiguousarray(display_files.srgb_values(path, f"light {path}")[..., :3])
 
 
 def _check_memory(path: Path, hdr: bool) -> None:
     """Looks at the size of a map or a photograph in its header, if that can be read."""
-    texels = _texels(path) if hdr else _photograph_pixels(path)
+    texels = _texels(path) if hdr else display_files.pixel_count(path)
     if excess := memory_excess(BYTES_OF_NONE + BYTES_A_TEXEL * texels):
         raise UnirenderError(f"light {path}: {texels / 1e6:,.3g} million texels, which {excess}; scale it down first")
 
@@ -177,15 +176,6 @@ def _texels(path: Path) -> int:
     with path.open("rb") as file:
         found = SIZES.match(file.read(MOST_HEADER_BYTES))
     return math.prod(int(side) for side in found.groups() if side) if found else 0
-
-
-def _photograph_pixels(path: Path) -> int:
-    """The same of a file of Pillow's."""
-    try:
-        with opened(path) as file:
-            return file.width * file.height
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # told where it is read
-        return 0
 
 
 def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:

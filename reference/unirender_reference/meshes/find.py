@@ -13,6 +13,15 @@ from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl", ".off")
+OTHERS = {  # models that others read: what to do
+    **dict.fromkeys(
+        (".3ds", ".abc", ".ac", ".blend", ".dae", ".fbx", ".lwo", ".usd", ".usda", ".usdc", ".usdz", ".x3d"),
+        "export it as GLB, from Blender or with assimp",
+    ),
+    ".3mf": "export it as STL or OBJ",
+    ".vrm": "it is a GLB by another name; name it .glb",
+    ".zip": "unpack it",
+}
 _WILD = re.compile(r"[*?[]")
 
 
@@ -53,7 +62,19 @@ def find_meshes(pattern: str | Path, unreadable: Callable[[Path, str], None] | N
         others = f", nor can {len(missed) - 1} other folders" if len(missed) > 1 else ""
         raise UnirenderError(f"meshes {folder}: cannot be listed ({cause}){others}; check the permissions")
     if empty:
-        raise UnirenderError(f"meshes {pattern}: no mesh found; expected files ending in {', '.join(SUFFIXES)}")
+        other = _other(Path(text))
+        there = "" if other is None else f"; {other.name} is there: {OTHERS[other.suffix.lower()]}"
+        raise UnirenderError(f"meshes {pattern}: no mesh found; expected files ending in {', '.join(SUFFIXES)}{there}")
+
+
+def _other(path: Path) -> Path | None:
+    """A model of another kind at or below a path, or beside a pattern; None where there is none."""
+    if path.is_file():
+        files = iter([path])
+    else:
+        folder = path if path.is_dir() else path.parent
+        files = (Path(at, name) for at, _, names in os.walk(folder) for name in sorted(names))
+    return next((file for file in files if file.suffix.lower() in OTHERS), None)
 
 
 def _glob(pattern: Path, report: Callable[[Path, str], None]) -> Iterator[Path]:

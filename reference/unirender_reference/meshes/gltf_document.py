@@ -20,6 +20,13 @@ READABLE = {
     "EXT_texture_avif",
     "EXT_texture_webp",
 }
+ADVICE = {  # by extension that is not read: what to do; of others the file is to be exported without them
+    "EXT_mesh_gpu_instancing": "export each instance as a node",
+    "EXT_meshopt_compression": "export it without compression, or with Draco",
+    "KHR_meshopt_compression": "export it without compression, or with Draco",
+    "KHR_texture_basisu": "export its textures as PNG or JPEG",
+    "MSFT_texture_dds": "export its textures as PNG or JPEG",
+}
 JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
 
@@ -47,7 +54,8 @@ class Document:
             raise UnirenderError(f"glTF version {version}, expected 2.0; convert it")
         required = sorted(set(self.json.get("extensionsRequired", [])) - READABLE - _harmless(self.json))
         if required:
-            raise UnirenderError(f"requires {', '.join(required)}, which is not read here; export it without")
+            advice = dict.fromkeys(ADVICE.get(name, "export it without") for name in required)
+            raise UnirenderError(f"requires {', '.join(required)}, not read here; {'; '.join(advice)}")
 
     def item(self, kind: str, index: object) -> dict[str, Any]:
         """One object of an array of the JSON.
@@ -100,6 +108,8 @@ class Document:
         """The bytes of a buffer, read once; all buffers of a model together have a limit."""
         buffer = self.item("buffers", index)
         uri = buffer.get("uri")
+        if uri is None and (packed := sorted(set(buffer.get("extensions", {})) & ADVICE.keys())):
+            raise UnirenderError(f"buffers[{index}] stands for {packed[0]}, not read here; {ADVICE[packed[0]]}")
         if uri is None and (index != 0 or self._binary is None):
             raise UnirenderError(f"buffers[{index}] has no data, expected a uri or a binary chunk; export it again")
         if uri not in self._buffers:

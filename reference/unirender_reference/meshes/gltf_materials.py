@@ -157,6 +157,11 @@ class Materials:
             ),
             texture.get("source"),
         )
+        if source is None:
+            only = ", ".join(sorted(texture.get("extensions", {}))) or "no picture at all"
+            raise UnirenderError(
+                f"textures[{info.get('index')}] has {only}, expected a PNG, JPEG, WebP or AVIF; export it as one"
+            )
         transform = info.get("extensions", {}).get(TRANSFORM, {})
         if sampler.get("magFilter") == NEAREST:
             self.ignored.add(SHARP_TEXELS)

@@ -1,6 +1,7 @@
 """The meshes of a glTF scene in world space (glTF 2.0, sections 3.5 and 3.7.2)."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.gltf_accessors import DRACO, accessor_count, read_accessor, read_draco
 from unirender_reference.meshes.gltf_document import Document
 from unirender_reference.meshes.gltf_materials import Materials, vector
+from unirender_reference.meshes.gltf_skins import Skin, cofactors, read_skin
 from unirender_reference.meshes.limits import MAX_NODES, check_faces, check_pieces, float32_step
 from unirender_reference.meshes.normals import flat_normals
 from unirender_reference.meshes.polygons import strip
@@ -21,6 +23,7 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 UNIT_TOLERANCE = (
     0.0077  # of a quaternion's length: what signed bytes leave, as Khronos' validator allows; more would shear
 )
+VARIANTS = "KHR_materials_variants"
 VISIBILITY = "KHR_node_visibility"
 INSTANCING = "EXT_mesh_gpu_instancing"  # where no reader must have it, its mesh stands once, where its node is
 
@@ -28,7 +31,7 @@ INSTANCING = "EXT_mesh_gpu_instancing"  # where no reader must have it, its mesh
 def read_gltf(path: Path, folder: ModelFolder) -> Model:
     """Reads a .glb or .gltf file.
 
-    Skins are not applied (a skinned mesh keeps the pose and the place it is stored in), nor are morph targets.
+    Skinned meshes are in the pose in which their joints' nodes stand; morph targets are not applied.
 
     Args:
         path: the file.
@@ -38,11 +41,11 @@ def read_gltf(path: Path, folder: ModelFolder) -> Model:
         UnirenderError: the file is damaged, over a limit, or uses something that is not read here.
     """
     document = Document(path, folder)
-    places: dict[int, list[Float[np.ndarray, "4 4"]]] = {}
+    places: dict[int, list[_Place]] = {}
     primitives: dict[int, list[dict[str, Any]]] = {}
     pieces_claimed = 0
-    for mesh, matrix in _instances(document):
-        places.setdefault(mesh, []).append(matrix)
+    for mesh, place in _instances(document):
+        places.setdefault(mesh, []).append(place)
         primitives[mesh] = document.item("meshes", mesh).get("primitives", [])
         pieces_claimed += len(primitives[mesh])
         check_pieces(pieces_claimed)
@@ -51,28 +54,68 @@ def read_gltf(path: Path, folder: ModelFolder) -> Model:
         for mesh, group in primitives.items()
     }
     faces = {mesh: sum(_face_count(document, primitive) for primitive in group) for mesh, group in solid.items()}
-    check_faces(sum(len(matrices) * faces[mesh] for mesh, matrices in places.items()))
+    check_faces(sum(len(stands) * faces[mesh] for mesh, stands in places.items()))
     used = [primitive for group in solid.values() for primitive in group]
     materials = Materials(document, {primitive.get("material") for primitive in used})
     pieces: list[Piece] = []
-    for mesh, matrices in places.items():
+    world = _World(document)
+    for mesh, stands in places.items():
+        skins = {place.skin: read_skin(document, place.skin, world.place) for place in stands if place.skin is not None}
         for primitive in solid[mesh]:
-            shape = _Shape(document, primitive, materials)
+            shape = _Shape(document, primitive, materials, skinned=bool(skins))
             if len(shape.faces):
-                pieces += [shape.placed(matrix) for matrix in matrices]
+                pieces += [shape.placed(place.matrix, skins.get(place.skin)) for place in stands]
     ignored = set(materials.ignored)
     if len(used) < sum(map(len, primitives.values())):
         ignored.add("points and lines")
+    ignored |= {"other scenes"} if len(document.json.get("scenes", [])) > 1 else set()
     if any(INSTANCING in node.get("extensions", {}) for node in document.json.get("nodes", [])):
         ignored.add(INSTANCING.removeprefix("EXT_"))
     for primitive in used:
         ignored |= {"morph targets"} if "targets" in primitive else set()
+        ignored |= {"material variants"} if VARIANTS in primitive.get("extensions", {}) else set()
         ignored |= {"tangents"} if "TANGENT" in primitive.get("attributes", {}) else set()
-        ignored |= {"skin"} if "JOINTS_0" in primitive.get("attributes", {}) else set()
     return Model(pieces, frozenset(ignored))
 
 
-def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
+@dataclass(frozen=True)
+class _Place:
+    """Where a mesh stands: the matrix of its node in the world; of a mesh with a skin (its index) the joints say it."""
+
+    matrix: Float[np.ndarray, "4 4"]
+    skin: object
+
+
+class _World:
+    """Where nodes stand, whatever scene they belong to."""
+
+    def __init__(self, document: Document) -> None:
+        self._document = document
+        self._count = len(document.json.get("nodes", []))
+        children = ((i, document.item("nodes", i).get("children", [])) for i in range(self._count))
+        self._parent: dict[object, int] = {child: i for i, below in children for child in below}
+        self._known: dict[object, Float[np.ndarray, "4 4"]] = {}
+
+    def place(self, index: object) -> Float[np.ndarray, "4 4"]:
+        """The matrix of a node.
+
+        Raises:
+            UnirenderError: there is no such node, or it is its own parent.
+        """
+        above: list[object] = []
+        at: object = index
+        while at is not None and at not in self._known:
+            above.append(at)
+            if len(above) > self._count:
+                raise UnirenderError(f"nodes[{index}] is its own parent, expected a tree; export it again")
+            at = self._parent.get(at)
+        matrix = np.eye(4) if at is None else self._known[at]
+        for node in reversed(above):
+            matrix = self._known[node] = matrix @ _local(self._document.item("nodes", node))
+        return matrix
+
+
+def _instances(document: Document) -> Iterator[tuple[int, _Place]]:
     """Each mesh of the scene that is visible, with its place in the world; a tree, as the specification has it."""
     nodes = document.json.get("nodes", [])
     if len(nodes) > MAX_NODES:
@@ -94,7 +137,7 @@ def _instances(document: Document) -> Iterator[tuple[int, Float[np.ndarray, "4 4
             continue  # it and all below it
         matrix = parent @ _local(node)
         if "mesh" in node:
-            yield node["mesh"], matrix
+            yield node["mesh"], _Place(matrix, node.get("skin"))
         waiting += [(child, matrix) for child in reversed(node.get("children", []))]
 
 
@@ -141,7 +184,9 @@ def _face_count(document: Document, primitive: dict[str, Any]) -> int:
 class _Shape:
     """The arrays of a primitive, in its own space, of the vertices that its faces use."""
 
-    def __init__(self, document: Document, primitive: dict[str, Any], materials: Materials) -> None:
+    def __init__(
+        self, document: Document, primitive: dict[str, Any], materials: Materials, skinned: bool = False
+    ) -> None:
         names = primitive.get("attributes", {})
         self.faces: Int[np.ndarray, "m 3"] = np.zeros((0, 3), np.int64)
         if "POSITION" not in names:
@@ -177,6 +222,8 @@ class _Shape:
         self.faces = index.reshape(-1, 3)
         normals = attribute("NORMAL", 3)
         self._normals = None if normals is None else normals.astype(np.float64)[self.faces]
+        self._at_vertices = normals if skinned else None
+        self._bones = self._read_bones(attribute, names) if skinned and "JOINTS_0" in names else None
         material = primitive.get("material")
         uv = {i: attribute(f"TEXCOORD_{i}", 2) for i in materials.sets(material)}
         self._uv = {
@@ -190,27 +237,46 @@ class _Shape:
             self._colors = np.clip(np.nan_to_num(colors[:, :3].astype(np.float64)), 0, 1)[self.faces]
         self._material = materials.of(material, frozenset(self._uv))
 
-    def placed(self, matrix: Float[np.ndarray, "4 4"]) -> Piece:
+    @staticmethod
+    def _read_bones(
+        attribute: "Callable[..., Num[np.ndarray, 'n width'] | None]", names: dict[str, Any]
+    ) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
+        """The joints of each vertex, four for each set that the primitive has, and their weights."""
+        sets = range(sum(name.startswith("JOINTS_") for name in names))
+        joints, weights = ([attribute(f"{kind}_{i}", 4) for i in sets] for kind in ("JOINTS", "WEIGHTS"))
+        found = [(j, w) for j, w in zip(joints, weights, strict=True) if j is not None and w is not None]
+        if len(found) < len(sets):
+            raise UnirenderError("has JOINTS without WEIGHTS of the same number; export it again")
+        return (
+            np.concatenate([j.astype(np.int64) for j, _ in found], axis=1),
+            np.concatenate([w.astype(np.float64) for _, w in found], axis=1),
+        )
+
+    def placed(self, matrix: Float[np.ndarray, "4 4"], skin: Skin | None) -> Piece:
         """The piece in the world; a mirroring matrix turns the faces round, so that they stay outside."""
-        linear = matrix[:3, :3]
-        mirrored = np.linalg.det(linear) < 0
-        turn = [0, 2, 1] if mirrored else [0, 1, 2]
-        vertices = self._points @ linear.T + matrix[:3, 3]
-        faces = self.faces[:, turn]
-        if self._normals is None:
-            normals = flat_normals(vertices, faces)  # glTF 2.0, section 3.7.2.1
+        normals: Float[np.ndarray, "m 3 3"] | None = None
+        if skin is not None and self._bones is not None:
+            at = self._at_vertices
+            vertices, posed, mirrored = skin.pose(self._points, at, *self._bones)
+            normals = None if posed is None else posed[self.faces]
+            stretch = max(float(np.linalg.norm(linear, 2)) for linear in skin.matrices[:, :3, :3])
         else:
-            # The transposed cofactor matrix carries normals also where the matrix has no inverse.
-            cofactor = np.stack([np.cross(linear[(i + 1) % 3], linear[(i + 2) % 3]) for i in range(3)])
-            normals = (self._normals @ (-cofactor if mirrored else cofactor).T)[:, turn]
+            linear = matrix[:3, :3]
+            mirrored = bool(np.linalg.det(linear) < 0)
+            vertices = self._points @ linear.T + matrix[:3, 3]
+            if self._normals is not None:
+                normals = self._normals @ (-cofactors(linear) if mirrored else cofactors(linear)).T
+            stretch = float(np.linalg.norm(linear, 2))
+        turn = [0, 2, 1] if mirrored else [0, 1, 2]
+        faces = self.faces[:, turn]
         return Piece(
             vertices=vertices,
             faces=faces,
-            normals=normals,
+            normals=flat_normals(vertices, faces) if normals is None else normals[:, turn],  # glTF 2.0, 3.7.2.1
             uv={i: values[:, turn] for i, values in self._uv.items()},
             colors=None if self._colors is None else self._colors[:, turn],
             material=self._material,
-            step=self._step * float(np.linalg.norm(linear, 2)),
+            step=self._step * stretch,
         )
 
 

@@ -17,7 +17,7 @@ from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, 
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).
 FORMATS = ("PNG", "JPEG", "WEBP", "AVIF", "BMP", "TGA", "TIFF", "GIF", "DDS")
-_LIMIT = f"expected at most {MAX_IMAGE_PIXELS / 1e6:.0f}; reduce it"
+_LIMIT = f"expected at most {MAX_IMAGE_PIXELS:,} (8,192 x 8,192); reduce it"
 STRIP = 500_000  # stored pixels made float at a time
 SLACK = 1e-3  # by which floats may miss [0, 1]: rounding, resampling
 Decode = Callable[[Float[np.ndarray, "h w c"]], Float[np.ndarray, "h w k"]]
@@ -41,7 +41,7 @@ class ImageBudget:
                 image = Image.open(io.BytesIO(data), formats=FORMATS)
             except Image.DecompressionBombError as error:  # its message holds the number of pixels
                 count = float((re.findall(r"\d+", str(error)) or ["inf"])[0])
-                raise UnirenderError(f"texture {name}: {count / 1e6:,.0f} megapixels, {_LIMIT}") from error
+                raise UnirenderError(f"texture {name}: {count:,.0f} pixels, {_LIMIT}") from error
             except UnidentifiedImageError as error:
                 raise UnirenderError(
                     f"texture {name}: no image that can be read, expected one of {', '.join(FORMATS)}; export it as PNG"
@@ -53,7 +53,7 @@ class ImageBudget:
         pixels = image.width * image.height
         self._pixels += pixels
         if pixels > MAX_IMAGE_PIXELS:
-            raise UnirenderError(f"texture {name}: {pixels / 1e6:,.0f} megapixels, {_LIMIT}")
+            raise UnirenderError(f"texture {name}: {image.width:,} x {image.height:,} pixels, {_LIMIT}")
         if max(image.size) > MAX_IMAGE_SIDE:
             raise UnirenderError(
                 f"texture {name}: {image.width:,} x {image.height:,} pixels, expected sides of at most "

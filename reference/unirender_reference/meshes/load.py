@@ -16,7 +16,7 @@ from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.atlas import build_atlas
 from unirender_reference.meshes.doubles import without_doubles
-from unirender_reference.meshes.find import SUFFIXES
+from unirender_reference.meshes.find import OTHERS, SUFFIXES
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.gltf_scene import read_gltf
 from unirender_reference.meshes.limits import check_geometry
@@ -72,7 +72,8 @@ def _read(path: Path, root: Path | None) -> Model:
     if not path.is_file():
         raise UnirenderError(f"no such file; expected one of {', '.join(SUFFIXES)}")
     if path.suffix.lower() not in SUFFIXES:
-        raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; convert it")
+        advice = OTHERS.get(path.suffix.lower(), "convert it")
+        raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; {advice}")
     if path.stat().st_size == 0:
         raise UnirenderError("is empty; copy it again")
     model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))

@@ -33,6 +33,10 @@ from unirender_reference.meshes.normals import piece_normals
 from unirender_reference.meshes.polygons import fans, triangulate
 from unirender_reference.meshes.surface import BARE, Material, Model, Piece
 
+LEFT_OUT = {  # keywords of elements that are no faces: what of the file is ignored
+    **dict.fromkeys((b"l", b"p"), "points and lines"),
+    **dict.fromkeys((b"curv", b"curv2", b"surf"), "curves and their surfaces"),
+}
 NAMING = (b"usemtl", b"mtllib")  # keywords whose text may hold a #; elsewhere a comment begins there
 
 
@@ -47,6 +51,7 @@ class _Lines:
         self.sizes, self.materials = array("q"), array("q")  # of each polygon
         self.names: dict[str | None, int] = {None: 0}  # of materials, in the order of their first use
         self.libraries: dict[str, None] = {}  # in order, each once
+        self.ignored: set[str] = set()
         self._triangles = 0
         self._current = 0
 
@@ -105,6 +110,8 @@ class _Lines:
         elif keyword == b"mtllib":
             self.libraries[rest.decode("utf-8", "surrogateescape").strip()] = None
             check_materials(len(self.libraries))
+        elif keyword in LEFT_OUT:
+            self.ignored.add(LEFT_OUT[keyword])
 
     def _face(self, tokens: list[bytes]) -> None:
         """Takes one polygon: its corners' indices from 1, 0 where there is none; negative ones count from the end."""
@@ -115,7 +122,10 @@ class _Lines:
             fields = token.split(b"/")
             for k in range(3):
                 index = int(fields[k]) if k < len(fields) and fields[k] else 0
-                self.corners.append(index if index >= 0 else counts[k] + 1 + index)
+                if index < 0:
+                    index += counts[k] + 1
+                    index -= index <= 0  # before the first stays below 0, which stands for none
+                self.corners.append(index)
         self.sizes.append(len(tokens))
         self.materials.append(self._current)
         self._triangles += len(tokens) - 2
@@ -166,7 +176,7 @@ def read_obj(path: Path, folder: ModelFolder) -> Model:
     mapped = np.array([bool(name in entries and entries[name].maps) for name in names])
     materials = MtlMaterials(folder, entries, used)
     made: dict[tuple[str | None, bool, bool], Material] = {}
-    pieces, owners, ignored = [], [], set[str]()
+    pieces, owners, ignored = [], [], set(lines.ignored)
     for group in mesh.alike(mapped):
         owners.append(mesh.owner[group[0]])
         name = names[owners[-1]]
@@ -284,6 +294,7 @@ def _looked_up(index: Int[np.ndarray, "m 3"], count: int, what: str) -> Int[np.n
     if (index == 0).any():
         return None
     if index.max() > count or index.min() < 1:
-        wrong = index.max() if index.max() > count else index.min()
-        raise UnirenderError(f"its faces name {what} {wrong:,}, but it has {count:,}; export it again")
+        before = f"a {what} before the first, counted back from a face"
+        named = f"{what} {index.max():,}" if index.max() > count else before
+        raise UnirenderError(f"its faces name {named}, but it has {count:,}; export it again")
     return index - 1

@@ -10,7 +10,8 @@ from unirender.errors import UnirenderError
 from unirender_reference.meshes.limits import check_faces
 
 HEADER, FACET = 84, 50  # bytes of a binary file: its header with the count, and each facet
-ATTRIBUTES = "attributes of facets"  # among what is ignored
+ATTRIBUTES = "attributes of facets"  # among what is ignored; where some exporters keep a colour
+MORE = "facets beyond the count"  # likewise
 END = 65536  # bytes in which the last solid ends; zeros may follow
 NAMES = re.compile(rb"solid(?!\S)[^\r\n]*")  # of solids: any words
 # The keywords, wherever they stand in a line; what is looked for behind their letters is found fast.
@@ -41,8 +42,15 @@ def whole_stl(path: Path, head: bytes) -> tuple[io.BytesIO | None, set[str]]:
     check_faces(count)
     with path.open("rb") as file:
         data = file.read(expected)  # trimesh takes what follows for a sign that the file is none
+        more = any(file.read(FACET))
+    if not count and length >= HEADER + FACET:
+        raise UnirenderError(
+            f"claims 0 triangles, but has bytes for {(length - HEADER) // FACET:,}: its count was never written; "
+            "export it again"
+        )
     facets = np.frombuffer(data, np.uint8, offset=HEADER).reshape(-1, FACET)
-    return io.BytesIO(data), {ATTRIBUTES} if facets[:, -2:].any() else set()  # where some exporters keep a colour
+    ignored = {MORE} if more and length >= expected + FACET else set[str]()
+    return io.BytesIO(data), ignored | ({ATTRIBUTES} if facets[:, -2:].any() else set())
 
 
 def _is_text(head: bytes) -> bool:
