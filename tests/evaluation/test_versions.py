@@ -64,7 +64,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
-        (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
+        (OPTIMIZER, "unirender_reference", ("optimize/refine/run.py", "optimize/views.py", "multiview.py")),
         (OPTIMIZER, "unirender_evaluation", ("methods/optimized.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
@@ -89,8 +89,8 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
     ("part", "package", "files"),
     [
         ("core", "unirender_evaluation", ("methods/optimized.py",)),
-        (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
-        (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
+        (REFERENCE, "unirender_reference", ("optimize/refine/run.py", "optimize/shape/hull.py", "multiview.py")),
+        (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/files/folder.py")),
     ],
 )
 def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str, files: tuple[str, ...]) -> None:

@@ -31,7 +31,7 @@ from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.lights import Light, load_light, make_light
 from unirender_reference.meshes import load_mesh
-from unirender_reference.optimize.folder import read_views
+from unirender_reference.optimize.files.folder import read_views
 from unirender_reference.optimize.views import View
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.shade import shade, shade_gradients

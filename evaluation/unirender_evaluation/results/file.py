@@ -23,6 +23,7 @@ from typing import Any
 from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender.whole_files import replace_file
+from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.records import (
     SCHEMA_VERSION,
     Record,
@@ -32,7 +33,6 @@ from unirender_evaluation.records import (
     run_from_plain,
 )
 from unirender_evaluation.results.check import content_problems
-from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.results.data import NAME, PACKED, Definitions, Results, definitions
 from unirender_evaluation.results.schema import FORMAT, json_schema
 from unirender_evaluation.results.schema_check import Problem, quoted, schema_problems

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.comparisons import Lights
+from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.tables.formats import MISSING, json_number, json_text
 from unirender_evaluation.tables.latex import tex_needs, tex_row, tex_text
 from unirender_evaluation.tables.text import TextTable
