@@ -17,8 +17,9 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender_reference.optimize.files.folder import read_views, reduced, write_views
+from unirender_reference.optimize.files.folder import read_views, write_views
 from unirender_reference.optimize.files.state import fingerprint
+from unirender_reference.optimize.reduction import reduced
 from unirender_reference.optimize.refine.losses import ImageLoss
 from unirender_reference.optimize.shape.placement import placed
 from unirender_reference.optimize.views import View, Views

@@ -15,8 +15,9 @@ from unirender.display_files import stored_values
 from unirender.errors import UnirenderError
 from unirender.files import read_result
 from unirender.pictures import checked_file, read_mask
-from unirender_reference.optimize.files.folder import read_picture_file, reduced
+from unirender_reference.optimize.files.folder import read_picture_file
 from unirender_reference.optimize.files.state import rounded
+from unirender_reference.optimize.reduction import reduced
 from unirender_reference.optimize.views import Step, View, Views
 
 MOST_SATURATED = 0.99  # share of the object's display values

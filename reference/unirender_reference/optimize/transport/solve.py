@@ -20,8 +20,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from unirender_reference.optimize.files.folder import reduced
 from unirender_reference.optimize.numerics.robust import cauchy
+from unirender_reference.optimize.reduction import reduced
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.surface.points import SurfacePoints, blocker, trace_points
