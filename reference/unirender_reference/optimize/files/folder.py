@@ -26,11 +26,13 @@ from unirender.files import new_folder
 from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender.visualization import write_png
 from unirender_reference.optimize.files.transforms import Y_UP, PosedPicture, Up, read_transforms
+from unirender_reference.optimize.machine import require_memory_for_pictures
 from unirender_reference.optimize.reduction import reduced
 from unirender_reference.optimize.views import View, Views
 
 SEEN_FILES = ("transforms.json", "transforms_train.json")
 HELD_OUT_FILES = ("transforms_val.json", "transforms_test.json")
+PIXEL_BYTES = 19.0  # of memory for a pixel of a view: colour, coverage, what is clipped
 UNTURNED = "EXIF orientations of the pictures are not followed: poses count in the pixels as they are stored"
 
 _log = logging.getLogger("unirender.optimize")
@@ -58,7 +60,8 @@ def read_views(
         longest_side: larger pictures are reduced to this many pixels, by means of area in linear light.
 
     Raises:
-        UnirenderError: one sentence that names the file, or the argument, and what is wrong with it.
+        UnirenderError: one sentence that names the file, or the argument, and what is wrong with it; or the pictures
+            take more memory than the machine has.
     """
     _check_arguments(up, hold_out, most_views, longest_side)
     folder = as_path(folder, "views")
@@ -75,11 +78,13 @@ def read_views(
         )
     linear = hdr.pop()
     notices: set[str] = set()
-    views = Views(
-        seen=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in seen),
-        held_out=tuple(_view(frame, folder, linear, up, longest_side, notices) for frame in held_out),
-        hdr=linear,
-    )
+    pictures: list[View] = []
+    for frame in (*seen, *held_out):
+        pictures.append(_view(frame, folder, linear, up, longest_side, notices))
+        if len(pictures) == 1:  # the others have its size
+            height, width = pictures[0].mask.shape[:2]
+            require_memory_for_pictures(len(seen) + len(held_out), height, width, PIXEL_BYTES)
+    views = Views(tuple(pictures[: len(seen)]), tuple(pictures[len(seen) :]), linear)
     for notice in sorted(notices):
         _log.warning("%s: %s", main, notice)
     try:

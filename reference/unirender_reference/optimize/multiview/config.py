@@ -9,8 +9,10 @@ from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.transport.config import TransportConfig
 
-# Bytes of memory, measured with textures of 512 and 1024 texels and lights of 16 to 48 rows.
+# Bytes of memory, measured with textures of 512 and 1024 texels, lights of 16 to 48 rows, and 3 and 7 pictures of 512 x
+# 512 pixels.
 TEXEL_BYTES = 450.0  # for a texel of the textures or of a light that is refined: maps, their pyramids, Adam's moments
+PIXEL_BYTES = 230.0  # for a pixel of the pictures, held-out ones too: the refinement shows all of them at once
 PAIR_BYTES = 100.0  # for two columns of the light that the transport stage solves for: its normal equations
 
 

@@ -17,7 +17,8 @@ from unirender.whole_files import file_sha256
 from unirender_reference.backend import renderer_threads
 from unirender_reference.optimize.files.solution import read_solution_file, write_solution_file
 from unirender_reference.optimize.files.state import RunFolder, fingerprint, open_run
-from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.machine import require_memory_for_pictures
+from unirender_reference.optimize.multiview.config import PIXEL_BYTES, OptimizeConfig
 from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.multiview.result import write_result
 from unirender_reference.optimize.refine.run import HeldOut, RefineConfig, RefineState, refine
@@ -65,7 +66,7 @@ def optimize(
 
     Raises:
         UnirenderError: the folder holds another run, all pictures are black, the masks do not bound an object that has
-            no mesh, or what a stage says.
+            no mesh, the pictures take more memory than the machine has, or what a stage says.
     """
     out = None if out is None else as_path(out, "out")
     as_instance(views, Views, "optimize: views")
@@ -77,6 +78,8 @@ def optimize(
             "optimize: got a mesh and a start with a mesh of its own, expected one of them; leave obj or init out"
         )
     views.require_light()
+    count = len(views.seen) + len(views.held_out)
+    require_memory_for_pictures(count, views.height, views.width, PIXEL_BYTES)
     if obj is None and init is None:
         from unirender_reference.optimize.shape.bounds import check_masks
 
