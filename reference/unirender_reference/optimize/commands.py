@@ -1,6 +1,8 @@
 """`unirender optimize`. Light to import: what renders is loaded when the command runs."""
 
 import dataclasses
+import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -130,9 +132,6 @@ class Optimize:
 
     def _run_folder(self, predict: Predict | None) -> int:
         """Optimises a folder of posed pictures and prints the figures of the result; the exit status."""
-        import json
-        import time
-
         from rich.console import Console
 
         from unirender_reference.optimize.files.export import SOLUTION_FILE
@@ -186,8 +185,6 @@ class Optimize:
 
     def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "OnReport") -> "Solution":
         """What the model predicts for every view, on the mesh."""
-        import time
-
         from unirender_reference.optimize.multiview.warm import solution_from_predictions
         from unirender_reference.optimize.show.report import Report
         from unirender_reference.optimize.views import Step
@@ -207,8 +204,6 @@ class Optimize:
 
     def _run_picture(self, predict: Predict | None) -> int:
         """Optimises one picture and writes a result folder; the exit status."""
-        import time
-
         from rich.console import Console
 
         from unirender.files import new_folder, write_result

@@ -9,10 +9,11 @@ from unirender.whole_files import file_sha256
 from unirender_reference.optimize.files.export import SOLUTION_FILE, write_record, write_solution
 from unirender_reference.optimize.files.state import RunFolder
 from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
+from unirender_reference.optimize.refine.losses import psnr_db
 from unirender_reference.optimize.refine.watch import FIGURE, Watch
 from unirender_reference.optimize.shape.coverage import coverage_of, mask_iou
 from unirender_reference.optimize.show.plots import loss_curve
-from unirender_reference.optimize.show.strips import psnr_db, turntable, views_strip
+from unirender_reference.optimize.show.strips import turntable, views_strip
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import Views

@@ -15,6 +15,8 @@ the noise-free picture; the others are biased, most where x is noisiest. `slope`
 A display value of 1 says that the radiance was 1 *or more*. `one_sided`: there, an x above t is no error.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -106,6 +108,23 @@ class ImageLoss:
         product = (shown(images) - given) * (shown(images if other is None else other) - given)
         mse = float((product * self.coverage).sum(dtype=np.float64)) / self._count
         return float(-10 * np.log10(max(mse, 1e-12)))
+
+
+def psnr_db(
+    views: Views,
+    chosen: Sequence[View],
+    found: Float[np.ndarray, "n h w 4"],
+    other: Float[np.ndarray, "n h w 4"] | None = None,
+) -> float:
+    """Of display values over covered pixels; of linear views, of what a display would show.
+
+    Args:
+        views: what the pictures belong to.
+        chosen: some of the views.
+        found: a picture for each of them.
+        other: the same with other samples: without the noise of both (`ImageLoss.psnr`).
+    """
+    return ImageLoss(views, chosen=tuple(chosen)).psnr(found[..., :3], None if other is None else other[..., :3])
 
 
 def pixel_loss(x: Images, t: Images, kind: LossKind) -> tuple[Images, Images]:

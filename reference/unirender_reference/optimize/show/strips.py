@@ -13,7 +13,6 @@ from unirender.color import image_srgb, luminance, srgb_decode
 from unirender.lighting import mean_radiance, resample_environment
 from unirender_reference.lights import bundled_light
 from unirender_reference.multiview import pose_towards
-from unirender_reference.optimize.refine.losses import ImageLoss
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import View, Views
@@ -90,20 +89,3 @@ def _over(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w
     """A premultiplied picture over the page: display values."""
     page = srgb_decode(np.full((1, 1, 1), LIGHT.background, np.float32))
     return image_srgb(image_linear + (1 - mask) * page)
-
-
-def psnr_db(
-    views: Views,
-    chosen: Sequence[View],
-    found: Float[np.ndarray, "n h w 4"],
-    other: Float[np.ndarray, "n h w 4"] | None = None,
-) -> float:
-    """Of display values over covered pixels; of linear views, of what a display would show.
-
-    Args:
-        views: what the pictures belong to.
-        chosen: some of the views.
-        found: a picture for each of them.
-        other: the same with other samples: without the noise of both (`ImageLoss.psnr`).
-    """
-    return ImageLoss(views, chosen=tuple(chosen)).psnr(found[..., :3], None if other is None else other[..., :3])

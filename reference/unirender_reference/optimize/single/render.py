@@ -8,7 +8,8 @@ from PIL import Image
 
 from unirender.intrinsics import Intrinsics
 from unirender_reference.optimize.exposure import exposure_of
-from unirender_reference.optimize.show.strips import psnr_db, views_strip
+from unirender_reference.optimize.refine.losses import psnr_db
+from unirender_reference.optimize.show.strips import views_strip
 from unirender_reference.optimize.single.picture import PictureInput
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shade import shade
