@@ -147,7 +147,17 @@ NOT_IN_RECORDS = (
     "workers",
 )
 # Commands and files of the optimiser: what it finds does not depend on them.
-NOT_IN_OPTIMIZED = ("commands", "export", "folder", "glb", "misplaced", "placement", "strips", "transforms")
+NOT_IN_OPTIMIZED = (
+    "*/__init__",
+    "commands",
+    "files/export",
+    "files/folder",
+    "files/glb",
+    "files/transforms",
+    "shape/misplaced",
+    "shape/placement",
+    "show/strips",
+)
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {

@@ -2,8 +2,8 @@
 
 import inspect
 import math
-from collections.abc import Callable
 import tracemalloc
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np

@@ -22,7 +22,7 @@ from unirender_evaluation.suites.objects import GREY
 from unirender_evaluation.suites.spec import read_spec
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.tasks import tasks
-from unirender_reference.optimize.single_config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject
 

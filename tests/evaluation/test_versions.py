@@ -1,5 +1,6 @@
 """Content keys: each part's version follows its files, its libraries and its data, and nothing else."""
 
+import ast
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from unirender_evaluation.versions import (
     LPIPS,
     MODEL,
     MULTIVIEW,
+    NOT_IN_OPTIMIZED,
     OPTIMIZER,
     PARTS,
     REFERENCE,
@@ -64,7 +66,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
-        (OPTIMIZER, "unirender_reference", ("optimize/refine.py", "optimize/views.py", "multiview.py")),
+        (OPTIMIZER, "unirender_reference", ("optimize/refine/run.py", "optimize/reduction.py", "multiview.py")),
         (OPTIMIZER, "unirender_evaluation", ("methods/optimized.py",)),
         (MULTIVIEW, "unirender_reference", ("optimize/views.py", "optimize/solution.py", "multiview.py")),
         (MULTIVIEW, "unirender_evaluation", ("multiview/scoring.py", "multiview/settings.py")),
@@ -89,13 +91,31 @@ def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple
     ("part", "package", "files"),
     [
         ("core", "unirender_evaluation", ("methods/optimized.py",)),
-        (REFERENCE, "unirender_reference", ("optimize/refine.py", "optimize/shape/hull.py", "multiview.py")),
-        (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/folder.py")),
+        (REFERENCE, "unirender_reference", ("optimize/refine/run.py", "optimize/shape/hull.py", "multiview.py")),
+        (OPTIMIZER, "unirender_reference", ("optimize/commands.py", "optimize/files/folder.py")),
     ],
 )
 def test_a_change_of_the_optimiser_concerns_its_own_rows(part: str, package: str, files: tuple[str, ...]) -> None:
     for name in files:
         assert any(fnmatch(f"{package}/{name}", pattern) for pattern in PARTS[part].without), name
+
+
+def test_what_the_optimiser_finds_needs_no_file_that_its_key_leaves_out() -> None:
+    """Of those it takes what reads, refuses and writes; `reduced`, which the start solves with, was among them."""
+    left_out = {f"unirender_reference.optimize.{name.replace('/', '.')}" for name in NOT_IN_OPTIMIZED}
+    taken: set[str] = set()
+    for path in (package_folder("unirender_reference") / "optimize").rglob("*.py"):
+        own = path.relative_to(package_folder("unirender_reference").parent).with_suffix("")
+        if ".".join(own.parts) in left_out:
+            continue
+        for line in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(line, ast.ImportFrom) and line.module in left_out:
+                taken |= {alias.name for alias in line.names}
+    assert taken == {
+        *("check_in_picture", "sphere_of_masks"),
+        *("read_picture_file", "write_record", "write_solution", "SOLUTION_FILE"),
+        *("turntable", "views_strip"),
+    }
 
 
 @pytest.mark.parametrize(

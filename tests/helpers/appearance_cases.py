@@ -8,8 +8,8 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender_reference.lights import make_light
 from unirender_reference.multiview import orbit
-from unirender_reference.optimize.light_grid import LightGrid
-from unirender_reference.optimize.uv import charted
+from unirender_reference.optimize.shape.uv import charted
+from unirender_reference.optimize.transport.light_grid import LightGrid
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import MeshObject, make_object
@@ -27,8 +27,8 @@ def bare(seed: int = 3, texture_size: int = 32) -> MeshObject:
 
 def two_colours(obj: MeshObject, texture_size: int = 32) -> MeshObject:
     """Reddish above, bluish below: an albedo texture by the height of the surface."""
-    from unirender_reference.optimize.surface_points import blocker, trace_points
-    from unirender_reference.optimize.textures import footprint, spread
+    from unirender_reference.optimize.surface.points import blocker, trace_points
+    from unirender_reference.optimize.surface.textures import footprint, spread
 
     camera = Camera()
     blank = np.zeros((64, 64, 3), np.float32)

@@ -21,7 +21,7 @@ from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
-from unirender_reference.optimize.folder import read_views
+from unirender_reference.optimize.files.folder import read_views
 from unirender_reference.shards import Failure
 
 Reader = Callable[[str], object]

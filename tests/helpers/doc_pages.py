@@ -197,8 +197,8 @@ def check_training(names: Names) -> None:
 
 def optimizer() -> Names:
     """The two classes that the smaller configuration names; the page needs nothing else."""
-    from unirender_reference.optimize.refine_config import RefineConfig
-    from unirender_reference.optimize.transport_config import TransportConfig
+    from unirender_reference.optimize.refine.config import RefineConfig
+    from unirender_reference.optimize.transport.config import TransportConfig
 
     return {"RefineConfig": RefineConfig, "TransportConfig": TransportConfig}
 

@@ -12,9 +12,9 @@ from reference_scenes import environment
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender_reference.multiview import orbit
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
-from unirender_reference.optimize.run import optimize
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.run import optimize
+from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import View, Views

@@ -6,8 +6,8 @@ import trimesh
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender_reference.multiview import orbit
+from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import MeshObject
 

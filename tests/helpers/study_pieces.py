@@ -12,9 +12,9 @@ from unirender_evaluation.studies.optimiser.ingredients import FULL, REFINEMENT,
 from unirender_evaluation.studies.optimiser.study import Study
 from unirender_evaluation.versions import LPIPS, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.backend import renderer_threads
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
+from unirender_reference.optimize.transport.config import TransportConfig
 
 FEW = MultiviewSettings(seen=2, held_out=1, spp=16, truth_spp=16, buffer_spp=8)
 SMALL = OptimizeConfig(

@@ -9,8 +9,8 @@ from unirender.color import image_srgb, unpremultiply
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import resample_environment
 from unirender_reference.lights import make_light
-from unirender_reference.optimize.single_config import SingleConfig
-from unirender_reference.optimize.single_view import optimize_image
+from unirender_reference.optimize.single.config import SingleConfig
+from unirender_reference.optimize.single.run import optimize_image
 from unirender_reference.render import Renderer
 from unirender_reference.shapes import make_object
 

@@ -21,8 +21,8 @@ from unirender.command_line import Ended, causes, interrupted
 from unirender.process_ends import open_streams
 from unirender.system_errors import refused_by_system
 from unirender.visualization import write_png
-from unirender_reference.optimize.export import write_solution
-from unirender_reference.optimize.folder import write_views
+from unirender_reference.optimize.files.export import write_solution
+from unirender_reference.optimize.files.folder import write_views
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, str]:

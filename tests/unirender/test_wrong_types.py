@@ -36,7 +36,7 @@ from unirender_reference.lights import Light, load_light, make_light
 from unirender_reference.lights.light import area_resampled
 from unirender_reference.meshes import load_mesh
 from unirender_reference.multiview import orbit, pose_towards
-from unirender_reference.optimize.folder import read_views
+from unirender_reference.optimize.files.folder import read_views
 from unirender_reference.optimize.views import View
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.shade import shade, shade_gradients

@@ -9,7 +9,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.light_statistics import light_statistics
 from unirender_evaluation.methods.method import Image, Mask, seen_linear
-from unirender_reference.optimize.single_config import COLD
+from unirender_reference.optimize.single.config import COLD
 
 
 class UniformLight:

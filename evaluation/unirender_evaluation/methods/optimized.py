@@ -1,6 +1,6 @@
 """Inverse rendering of one picture by optimisation, as a benchmark method: NvDiffRec's kind, and ours refined by it.
 
-The optimiser (`unirender_reference.optimize.single_view`) finds albedo, roughness, metallic and the light; Mitsuba
+The optimiser (`unirender_reference.optimize.single.run`) finds albedo, roughness, metallic and the light; Mitsuba
 renders the edited and the relit surface (`unirender_reference.shade`).
 """
 
@@ -37,7 +37,7 @@ class OptimizedMethod:
     """
 
     def __init__(self, name: str, base: Any = None, config: Any = None) -> None:
-        from unirender_reference.optimize.single_config import SingleConfig
+        from unirender_reference.optimize.single.config import SingleConfig
 
         self.name, self.base = name, base
         self.settings = SingleConfig() if config is None else config
@@ -57,7 +57,7 @@ class OptimizedMethod:
         return self._found.of(image_srgb, mask, camera, make, told=mesh)[0]
 
     def _optimize(self, image_srgb: Image, mask: Mask, camera: Camera, geometry: MeshObject | None) -> Intrinsics:
-        from unirender_reference.optimize.single_view import optimize_image
+        from unirender_reference.optimize.single.run import optimize_image
 
         init = None if self.base is None else self.base.decompose(image_srgb, mask, camera)
         return optimize_image(image_srgb, mask, camera, self.settings, geometry=geometry, init=init)

@@ -6,7 +6,7 @@ from unirender_evaluation.methods.optimized import OPTIMISER, REFINED, Optimized
 from unirender_evaluation.rows import Row, make_row
 from unirender_evaluation.task import LIGHT
 from unirender_evaluation.versions import MODEL, OPTIMIZER, REFERENCE
-from unirender_reference.optimize.single_config import COLD, fitted
+from unirender_reference.optimize.single.config import COLD, fitted
 
 ASKED = frozenset(
     {

@@ -12,8 +12,8 @@ import numpy as np
 
 from unirender.color import srgb_decode
 from unirender_evaluation.training_statistics import training_statistics
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes import MeshObject
@@ -56,7 +56,7 @@ class Optimized:
     """Our optimiser, all stages and ingredients.
 
     Args:
-        config: of `unirender_reference.optimize.run.optimize`; None: its default.
+        config: of `unirender_reference.optimize.multiview.run.optimize`; None: its default.
     """
 
     name = OPTIMISED
@@ -69,7 +69,7 @@ class Optimized:
         return {"optimize": asdict(self.settings)}
 
     def solve(self, views: Views, mesh: MeshObject) -> Solution:
-        from unirender_reference.optimize.run import optimize
+        from unirender_reference.optimize.multiview.run import optimize
 
         return optimize(views, mesh, self.settings)
 
@@ -87,9 +87,9 @@ class PlainLoop:
         return {"refine": asdict(self.settings), "texture": PLAIN_TEXTURE, "light_rows": LIGHT_SHAPE[0]}
 
     def solve(self, views: Views, mesh: MeshObject) -> Solution:
-        from unirender_reference.optimize.refine import refine
-        from unirender_reference.optimize.solve import start_solution
-        from unirender_reference.optimize.uv import charted
+        from unirender_reference.optimize.refine.run import refine
+        from unirender_reference.optimize.shape.uv import charted
+        from unirender_reference.optimize.transport.solve import start_solution
 
         start = start_solution(views, charted(mesh, PLAIN_TEXTURE), PLAIN_TEXTURE, LIGHT_SHAPE[0])
         return refine(views, start, self.settings, lambda step: True)

@@ -74,8 +74,8 @@ def measure(config: ShapeMeasure, seed: int) -> list[tuple[str, ...]]:
     from unirender_reference.optimize.shape.reconstruct import reconstruct
     from unirender_reference.optimize.shape.refine_shape import refine_shape
     from unirender_reference.optimize.solution import Solution
-    from unirender_reference.optimize.solve import solve_appearance
-    from unirender_reference.optimize.transport_config import TransportConfig
+    from unirender_reference.optimize.transport.config import TransportConfig
+    from unirender_reference.optimize.transport.solve import solve_appearance
     from unirender_reference.shapes import make_object
 
     true = make_object(seed, "test")

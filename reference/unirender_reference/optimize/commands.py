@@ -1,6 +1,8 @@
 """`unirender optimize`. Light to import: what renders is loaded when the command runs."""
 
 import dataclasses
+import json
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,17 +13,17 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 from unirender.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, full_disk
-from unirender_reference.optimize.config import OptimizeConfig
 from unirender_reference.optimize.machine import require_cores
+from unirender_reference.optimize.multiview.config import OptimizeConfig
 from unirender_reference.optimize.option_checks import require_least
-from unirender_reference.optimize.single_config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig
 
 if TYPE_CHECKING:
     import numpy as np
 
     from unirender.camera import Camera
     from unirender.intrinsics import Intrinsics
-    from unirender_reference.optimize.report import OnReport
+    from unirender_reference.optimize.show.report import OnReport
     from unirender_reference.optimize.solution import Solution
     from unirender_reference.optimize.views import Step, Views
     from unirender_reference.shapes import MeshObject, Sphere
@@ -130,15 +132,12 @@ class Optimize:
 
     def _run_folder(self, predict: Predict | None) -> int:
         """Optimises a folder of posed pictures and prints the figures of the result; the exit status."""
-        import json
-        import time
-
         from rich.console import Console
 
-        from unirender_reference.optimize.export import SOLUTION_FILE
-        from unirender_reference.optimize.live import live_report
-        from unirender_reference.optimize.report import refinement_note
-        from unirender_reference.optimize.run import optimize
+        from unirender_reference.optimize.files.export import SOLUTION_FILE
+        from unirender_reference.optimize.multiview.run import optimize
+        from unirender_reference.optimize.show.live import live_report
+        from unirender_reference.optimize.show.report import refinement_note
 
         views, obj, place = self.read()
         with live_report(Console(stderr=True, quiet=not self.progress)) as report:
@@ -170,8 +169,8 @@ class Optimize:
     def read(self) -> "tuple[Views, MeshObject | None, Sphere]":
         """The views with their world in the unit sphere, the mesh, and where it stood."""
         from unirender_reference.meshes import load_mesh_placed
-        from unirender_reference.optimize.folder import read_views
-        from unirender_reference.optimize.placement import check_alignment, placed, sphere_of_masks
+        from unirender_reference.optimize.files.folder import read_views
+        from unirender_reference.optimize.shape.placement import check_alignment, placed, sphere_of_masks
 
         views = read_views(
             self.input, up=self.up, hold_out=self.hold_out, most_views=self.most_views, longest_side=self.size
@@ -186,11 +185,9 @@ class Optimize:
 
     def _start(self, views: "Views", obj: "MeshObject | None", predict: Predict, show: "OnReport") -> "Solution":
         """What the model predicts for every view, on the mesh."""
-        import time
-
-        from unirender_reference.optimize.report import Report
+        from unirender_reference.optimize.multiview.warm import solution_from_predictions
+        from unirender_reference.optimize.show.report import Report
         from unirender_reference.optimize.views import Step
-        from unirender_reference.optimize.warm import solution_from_predictions
 
         if obj is None:
             raise UsageError("--init unirender: expected --mesh beside it, to put the predicted maps on")
@@ -207,16 +204,14 @@ class Optimize:
 
     def _run_picture(self, predict: Predict | None) -> int:
         """Optimises one picture and writes a result folder; the exit status."""
-        import time
-
         from rich.console import Console
 
         from unirender.files import new_folder, write_result
-        from unirender_reference.optimize.live import live_report
-        from unirender_reference.optimize.picture import history_text, read_picture_input
-        from unirender_reference.optimize.report import Report
-        from unirender_reference.optimize.single_render import rerendered
-        from unirender_reference.optimize.single_view import optimize_image
+        from unirender_reference.optimize.show.live import live_report
+        from unirender_reference.optimize.show.report import Report
+        from unirender_reference.optimize.single.picture import history_text, read_picture_input
+        from unirender_reference.optimize.single.render import rerendered
+        from unirender_reference.optimize.single.run import optimize_image
 
         given = read_picture_input(self.input, self.mask, self.fov, self.normal, self.size)
         obj = None

@@ -18,15 +18,31 @@ def require_cores(threads: int) -> None:
         raise UnirenderError(f"--threads {threads}: expected at most {cores}, the cores of this machine; 0 takes all")
 
 
-def require_memory(needed: Mapping[str, float]) -> None:
-    """Looks at options with which memory grows.
+def require_memory_for_pictures(count: int, height: int, width: int, bytes_of_pixel: float) -> None:
+    """Looks at a set of pictures of one size.
+
+    Args:
+        count: of the pictures.
+        height, width: of each, in pixels.
+        bytes_of_pixel: about how many bytes a pixel takes.
+
+    Raises:
+        UnirenderError: they take more than the machine has in all.
+    """
+    named = f"{count} pictures of {width} x {height} pixels"
+    require_memory({named: bytes_of_pixel * count * height * width}, "fewer or smaller ones (--most-views, --size)")
+
+
+def require_memory(needed: Mapping[str, float], instead: str = "a smaller number") -> None:
+    """Looks at options, or pictures, with which memory grows.
 
     Args:
         needed: by option, with its value: about how many bytes it takes.
+        instead: what is expected.
 
     Raises:
         UnirenderError: one takes more than the machine has in all.
     """
     for option, wanted in needed.items():
         if excess := memory_excess(wanted):
-            raise UnirenderError(f"{option}: {excess}; expected a smaller number")
+            raise UnirenderError(f"{option}: {excess}; expected {instead}")

@@ -29,9 +29,9 @@ from unirender_evaluation.studies.optimiser.race import (
     run_ours,
 )
 from unirender_evaluation.studies.optimiser.race_report import draw, race_table, ratio_text, to_json
-from unirender_reference.optimize.refine import refine
-from unirender_reference.optimize.run import optimize
-from unirender_reference.optimize.solve import start_solution
+from unirender_reference.optimize.multiview.run import optimize
+from unirender_reference.optimize.refine.run import refine
+from unirender_reference.optimize.transport.solve import start_solution
 
 SETTINGS = RaceSettings(SMALL, iterations=4, plain_every=2, our_every=2)
 

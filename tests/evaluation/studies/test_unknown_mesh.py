@@ -21,10 +21,10 @@ from unirender_evaluation.studies.unknown_mesh.measure import STRIP, UnknownMesh
 from unirender_evaluation.studies.unknown_mesh.run import run
 from unirender_evaluation.studies.unknown_mesh.tables import AIMS, aim_notes
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, Versions
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.transport.config import TransportConfig
 
 SETTINGS = MultiviewSettings(seen=4, held_out=1, spp=16, truth_spp=16, buffer_spp=16)
 CONFIG = OptimizeConfig(

@@ -21,7 +21,7 @@ from unirender_evaluation.studies.warm_start.run import our_method, run
 from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, difference, tables
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
-from unirender_reference.optimize.single_config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig
 
 QUICK = SingleConfig(steps=(2,), noise=(0.05,), fine_steps=1, coarse_pixels=60, pixels=60, light_rows=8)
 VERSIONS = Versions("test", {MODEL: "1", MULTIVIEW: "1", OPTIMIZER: "1", REFERENCE: "1"})

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from unirender_reference.optimize.descent import BETA_1, PyramidAdam, interpolation
+from unirender_reference.optimize.numerics.descent import BETA_1, PyramidAdam, interpolation
 
 
 @pytest.mark.parametrize("beta_2", [0.99, 0.999])

@@ -17,8 +17,8 @@ from unirender.lighting import area_pixels, environment_directions, middle_rows,
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed
-from unirender_reference.optimize.export import FINER, read_environment, write_solution
-from unirender_reference.optimize.glb import glb_bytes, texture_pixels
+from unirender_reference.optimize.files.export import FINER, read_environment, write_solution
+from unirender_reference.optimize.files.glb import glb_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.scene import envmap_data, sensor_dict
 from unirender_reference.shapes import MeshObject, Sphere

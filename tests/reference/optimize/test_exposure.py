@@ -9,10 +9,10 @@ import pytest
 from optimizer_runs import CONFIG, flat_start, rendered_views, truth
 
 from unirender.errors import UnirenderError
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.export import read_environment
-from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
-from unirender_reference.optimize.run import _plan, _Run, optimize
+from unirender_reference.optimize.files.export import read_environment
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
+from unirender_reference.optimize.multiview.run import _plan, _Run, optimize
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View, Views
 

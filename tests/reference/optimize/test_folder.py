@@ -17,10 +17,14 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender_reference.optimize.folder import read_views, reduced, write_views
-from unirender_reference.optimize.losses import ImageLoss
-from unirender_reference.optimize.placement import placed
-from unirender_reference.optimize.state import fingerprint
+from unirender_reference.optimize.files.folder import read_views, write_views
+from unirender_reference.optimize.files.state import fingerprint
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.run import optimize
+from unirender_reference.optimize.reduction import reduced
+from unirender_reference.optimize.refine.losses import ImageLoss
+from unirender_reference.optimize.shape.placement import placed
+from unirender_reference.optimize.transport.config import TransportConfig
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import Sphere
 
@@ -462,3 +466,16 @@ def test_no_fisheye_is_a_pinhole(folder: Path):
 def test_missing_folder(tmp_path: Path):
     with pytest.raises(UnirenderError, match="is no folder"):
         read_views(tmp_path / "nowhere")
+
+
+def test_more_pictures_than_fit_are_refused_before_they_are_read_or_worked_on(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A run of them was killed by the system once the transport stage was over."""
+    views = read_views(folder)
+    count, pixels = len(views.seen) + len(views.held_out), views.height * views.width
+    config = OptimizeConfig(TransportConfig(enabled=False), texture_size=4, light_rows=8)
+    for bytes_of_pixel, does in ((15, lambda: read_views(folder)), (100, lambda: optimize(views, None, config))):
+        monkeypatch.setattr("unirender.machine.memory_bytes", lambda most=bytes_of_pixel * count * pixels: most)
+        with pytest.raises(UnirenderError, match=rf"^{count} pictures of .* pixels: would take .*--most-views, --size"):
+            does()

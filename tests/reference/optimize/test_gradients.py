@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import refine_problems as problems
 
-from unirender_reference.optimize.parameters import NAMES, Name
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.optimize.refine.parameters import NAMES, Name
+from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
 
 TOLERANCE = 0.03  # of the central difference; of the curvature over the step, and of float32
 SHARP = 0.03  # standard error of either estimate, of the central difference

@@ -5,7 +5,7 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference.optimize.inflate import silhouette_normals
+from unirender_reference.optimize.single.inflate import silhouette_normals
 
 FAR = Camera(fov_deg=2.0)  # nearly orthographic
 

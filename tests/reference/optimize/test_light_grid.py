@@ -5,7 +5,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.optimize.light_grid import LightGrid
+from unirender_reference.optimize.transport.light_grid import LightGrid
 
 GRID = LightGrid(8, 12)
 

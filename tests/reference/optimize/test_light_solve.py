@@ -6,13 +6,13 @@ import appearance_cases as cases
 import numpy as np
 import pytest
 
-from unirender_reference.optimize import light_solve, pixel_fit
-from unirender_reference.optimize.light_grid import LightGrid
-from unirender_reference.optimize.light_solve import LightPrior, evaluate, solve_light
-from unirender_reference.optimize.material_search import search_materials
-from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe, patches
-from unirender_reference.optimize.surface_points import SurfacePoints, blocker, trace_points
-from unirender_reference.optimize.transport import light_transport
+from unirender_reference.optimize.surface.points import SurfacePoints, blocker, trace_points
+from unirender_reference.optimize.transport import light_solve, pixel_fit
+from unirender_reference.optimize.transport.light_grid import LightGrid
+from unirender_reference.optimize.transport.light_solve import LightPrior, evaluate, solve_light
+from unirender_reference.optimize.transport.material_search import search_materials
+from unirender_reference.optimize.transport.matrices import light_transport
+from unirender_reference.optimize.transport.pixel_fit import Appearance, PixelFit, observe, patches
 from unirender_reference.optimize.views import View, Views
 
 GRID = LightGrid(8, 16)

@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from unirender_reference.optimize.live import clock, live_report
-from unirender_reference.optimize.plots import loss_curve
-from unirender_reference.optimize.report import Report, refinement_note
+from unirender_reference.optimize.show.live import clock, live_report
+from unirender_reference.optimize.show.plots import loss_curve
+from unirender_reference.optimize.show.report import Report, refinement_note
 from unirender_reference.optimize.views import Step
 
 FIRST = Report(Step("transport", 1, 2.4, {"cost": 12.5}), 1, 2, None, None)

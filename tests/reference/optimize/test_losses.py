@@ -7,8 +7,8 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode, srgb_encode
-from unirender_reference.optimize.losses import ImageLoss, pixel_loss
-from unirender_reference.optimize.refine_config import LossKind
+from unirender_reference.optimize.refine.config import LossKind
+from unirender_reference.optimize.refine.losses import ImageLoss, pixel_loss
 from unirender_reference.optimize.views import View, Views
 
 KINDS: tuple[LossKind, ...] = get_args(LossKind)

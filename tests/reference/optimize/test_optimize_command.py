@@ -27,13 +27,13 @@ from unirender.machine import memory_bytes
 from unirender.visualization import write_png
 from unirender_reference.meshes import load_mesh_placed
 from unirender_reference.optimize.commands import Optimize
-from unirender_reference.optimize.export import write_solution
-from unirender_reference.optimize.folder import write_views
+from unirender_reference.optimize.files.export import write_solution
+from unirender_reference.optimize.files.folder import write_views
 from unirender_reference.optimize.machine import require_cores, require_memory
-from unirender_reference.optimize.picture import PictureInput, read_normals, read_picture_input, unit_normals
-from unirender_reference.optimize.placement import placed
-from unirender_reference.optimize.single_picture import make_picture
-from unirender_reference.optimize.single_render import rerendered
+from unirender_reference.optimize.shape.placement import placed
+from unirender_reference.optimize.single.picture import PictureInput, read_normals, read_picture_input, unit_normals
+from unirender_reference.optimize.single.pixels import make_picture
+from unirender_reference.optimize.single.render import rerendered
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import Sphere
@@ -169,18 +169,18 @@ def test_every_option_reaches_what_it_is_for(
         return calls[0]
 
     folder = ["--up", "z", "--hold-out", "3", "--most-views", "4", "--size", "12"]
-    given, named = taken_by("folder.read_views", data / "views", *folder)
+    given, named = taken_by("files.folder.read_views", data / "views", *folder)
     assert (given, named) == ((data / "views",), {"up": "z", "hold_out": 3, "most_views": 4, "longest_side": 12})
     options = ["--mesh", mesh, "--threads", "1", "--no-pictures", *QUICK]
-    given, named = taken_by("run.optimize", data / "views", *options)
+    given, named = taken_by("multiview.run.optimize", data / "views", *options)
     assert (given[2].refine.iterations, given[3], named["pictures"], named["threads"]) == (2, out, False, 1)
 
     write_one(solution, one, 12)
     known = ["--mask", "m.png", "--fov", "40", "--normal", "n.png", "--size", "10"]
-    given, _ = taken_by("picture.read_picture_input", one, *known)
+    given, _ = taken_by("single.picture.read_picture_input", one, *known)
     assert given == (one, Path("m.png"), 40, Path("n.png"), 10)
     options = ["--mesh", mesh, "--fov", "40", "--single.light-rows", "12"]
-    given, named = taken_by("single_view.optimize_image", one, *options)
+    given, named = taken_by("single.run.optimize_image", one, *options)
     assert (given[2].fov_deg, given[3].light_rows, named["hdr"], named["init"]) == (40, 12, False, None)
     assert len(named["geometry"].faces) == len(solution.obj.faces)
     assert not out.exists()
@@ -473,7 +473,7 @@ def test_a_full_disk_is_one_sentence(
 
     out = tmp_path / "out"
     if kind == "folder":
-        monkeypatch.setattr("unirender_reference.optimize.state.RunFolder.record", full)
+        monkeypatch.setattr("unirender_reference.optimize.files.state.RunFolder.record", full)
         chosen = command(data / "views", "--mesh", data / "mesh.glb", "--out", out, *QUICK)
         to_do = "run the same command again to go on"
     else:

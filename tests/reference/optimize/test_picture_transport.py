@@ -10,11 +10,11 @@ from occluders import torus
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender_reference.optimize.light_grid import LightGrid
-from unirender_reference.optimize.material_mix import lobes_at, mixed
-from unirender_reference.optimize.single_picture import POINTS
-from unirender_reference.optimize.surface_points import SurfacePoints, blocker, mapped_points, picture_points
-from unirender_reference.optimize.transport import Transport, light_transport
+from unirender_reference.optimize.single.pixels import POINTS
+from unirender_reference.optimize.surface.points import SurfacePoints, blocker, mapped_points, picture_points
+from unirender_reference.optimize.transport.light_grid import LightGrid
+from unirender_reference.optimize.transport.material_mix import lobes_at, mixed
+from unirender_reference.optimize.transport.matrices import Transport, light_transport
 from unirender_reference.render import Renderer
 from unirender_reference.shade import shade
 from unirender_reference.shapes import MeshObject

@@ -15,14 +15,14 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender_reference.multiview import orbit, pose_towards
-from unirender_reference.optimize.placement import check_alignment, check_in_picture, placed, sphere_of_masks
+from unirender_reference.optimize.files.transforms import Y_UP, Up
+from unirender_reference.optimize.multiview.warm import solution_from_predictions
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.hull import visual_hull
+from unirender_reference.optimize.shape.placement import check_alignment, check_in_picture, placed, sphere_of_masks
+from unirender_reference.optimize.shape.uv import charted, has_own_texels
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.transforms import Y_UP, Up
-from unirender_reference.optimize.uv import charted, has_own_texels
 from unirender_reference.optimize.views import View, Views
-from unirender_reference.optimize.warm import solution_from_predictions
 from unirender_reference.shapes import MeshObject, Sphere, make_object
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from unirender_reference.optimize.priors import anchor, neutral_light, smoothness, white_light
+from unirender_reference.optimize.refine.priors import anchor, neutral_light, smoothness, white_light
 
 Prior = Callable[[np.ndarray], tuple[float, np.ndarray]]
 FIRST = np.random.default_rng(1).uniform(0.1, 1, (4, 6, 3)).astype(np.float32)

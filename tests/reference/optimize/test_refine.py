@@ -11,14 +11,14 @@ import refine_problems as problems
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference import backend
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.light_grid import interpolated_light
-from unirender_reference.optimize.parameters import Name
-from unirender_reference.optimize.refine import Fit, RefineConfig, RefineState, refine
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.parameters import Name
+from unirender_reference.optimize.refine.run import Fit, RefineConfig, RefineState, refine
+from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.solve import solve_appearance
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.optimize.transport.light_grid import interpolated_light
+from unirender_reference.optimize.transport.solve import solve_appearance
 from unirender_reference.optimize.views import Step, Views
 
 FAST = RefineConfig(iterations=6, spp=4, spp_gradient=4, depth=2)

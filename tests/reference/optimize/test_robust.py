@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from unirender_reference.optimize.robust import HUBER, Cauchy, Loss, cauchy
+from unirender_reference.optimize.numerics.robust import HUBER, Cauchy, Loss, cauchy
 
 LOSSES = [HUBER, Cauchy(1.0), Cauchy(0.3)]
 

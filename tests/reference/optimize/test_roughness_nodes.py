@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from unirender_reference.optimize.roughness_nodes import NODES, node_weights
+from unirender_reference.optimize.transport.roughness_nodes import NODES, node_weights
 
 
 def test_nodes_are_met_and_smooth_functions_followed() -> None:

@@ -16,16 +16,16 @@ import pytest
 from optimizer_runs import CONFIG, REFINE, flat_start, rendered_views, run, truth
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.placement import placed
-from unirender_reference.optimize.report import Report
-from unirender_reference.optimize.run import _plan, _Run, optimize
+from unirender_reference.optimize.files.solution import read_solution_file, write_solution_file
+from unirender_reference.optimize.files.state import HISTORY, PROGRESS, open_run
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.run import _plan, _Run, optimize
+from unirender_reference.optimize.refine.watch import Watch
+from unirender_reference.optimize.shape.placement import placed
+from unirender_reference.optimize.show.report import Report
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.solution_file import read_solution_file, write_solution_file
-from unirender_reference.optimize.state import HISTORY, PROGRESS, open_run
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.transport.config import TransportConfig
 from unirender_reference.optimize.views import Step
-from unirender_reference.optimize.watch import Watch
 from unirender_reference.shapes import Sphere
 
 FILES = ("mesh.glb", "environment.exr", "mitsuba/roughness.png", "mitsuba/mesh.ply")

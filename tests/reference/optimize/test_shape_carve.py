@@ -9,12 +9,12 @@ from reference_scenes import environment, sphere
 
 from unirender.color import image_srgb
 from unirender_reference.exposure import scene_exposure
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.coverage import masks_of
-from unirender_reference.optimize.run import _Run
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.run import _Run
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.carve import carve, carved_object
 from unirender_reference.optimize.shape.config import ShapeConfig
+from unirender_reference.optimize.shape.coverage import masks_of
 from unirender_reference.optimize.shape.hull import visual_hull
 from unirender_reference.optimize.shape.measure import score_shape
 from unirender_reference.optimize.shape.reconstruct import reconstruct

@@ -11,9 +11,8 @@ from posed_spheres import blank_views, mask_views
 from reference_scenes import environment, sphere
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.placement import placed, sphere_of_masks
-from unirender_reference.optimize.run import optimize
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.multiview.run import optimize
 from unirender_reference.optimize.shape import tracer
 from unirender_reference.optimize.shape.bounds import check_masks, check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
@@ -22,6 +21,7 @@ from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.shape.fit import MeshFit
 from unirender_reference.optimize.shape.hull import extract, mask_distance, visual_hull
 from unirender_reference.optimize.shape.measure import score_shape
+from unirender_reference.optimize.shape.placement import placed, sphere_of_masks
 from unirender_reference.optimize.shape.reconstruct import reconstruct
 from unirender_reference.optimize.shape.silhouette import outline
 from unirender_reference.optimize.shape.topology import mesh_edges, neighbours, vertex_normals

@@ -13,10 +13,10 @@ from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.lighting import resample_environment
-from unirender_reference.optimize.single_config import COLD, Priors, SingleConfig, Trust
-from unirender_reference.optimize.single_fit import Fit, Unknowns
-from unirender_reference.optimize.single_picture import make_picture
-from unirender_reference.optimize.single_view import optimize_image
+from unirender_reference.optimize.single.config import COLD, Priors, SingleConfig, Trust
+from unirender_reference.optimize.single.fit import Fit, Unknowns
+from unirender_reference.optimize.single.pixels import make_picture
+from unirender_reference.optimize.single.run import optimize_image
 from unirender_reference.optimize.views import Step
 from unirender_reference.render import Renderer
 from unirender_reference.shade import shade

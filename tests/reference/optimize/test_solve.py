@@ -8,9 +8,12 @@ import pytest
 
 from unirender.camera import Camera
 from unirender_reference.multiview import orbit
-from unirender_reference.optimize.pixel_fit import patches
 from unirender_reference.optimize.solution_scene import solution_images
-from unirender_reference.optimize.solve import (
+from unirender_reference.optimize.surface.points import blocker, trace_points
+from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.optimize.transport.pixel_fit import patches
+from unirender_reference.optimize.transport.progress import solve_shares
+from unirender_reference.optimize.transport.solve import (
     FINE,
     LEAST_SIDE,
     STARTS,
@@ -20,9 +23,6 @@ from unirender_reference.optimize.solve import (
     solve_appearance,
     start_solution,
 )
-from unirender_reference.optimize.surface_points import blocker, trace_points
-from unirender_reference.optimize.transport_config import TransportConfig
-from unirender_reference.optimize.transport_progress import solve_shares
 from unirender_reference.optimize.views import View, Views
 
 CONFIG = TransportConfig(iterations=6, rounds=1, correction_spp=64)

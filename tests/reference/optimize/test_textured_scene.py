@@ -12,9 +12,9 @@ import refine_problems as problems
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.optimize.parameters import LIMITS, NAMES, Name, parameter_gradient, to_map, to_parameter
-from unirender_reference.optimize.refine_config import Space
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
+from unirender_reference.optimize.refine.config import Space
+from unirender_reference.optimize.refine.parameters import LIMITS, NAMES, Name, parameter_gradient, to_map, to_parameter
+from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
 from unirender_reference.render import Renderer
 from unirender_reference.statistics import z_test
 

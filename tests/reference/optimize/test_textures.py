@@ -6,8 +6,8 @@ import pytest
 
 from unirender.camera import Camera
 from unirender_reference.multiview import orbit
-from unirender_reference.optimize.surface_points import blocker, trace_points
-from unirender_reference.optimize.textures import best_smoothness, fit_texels, footprint, spread
+from unirender_reference.optimize.surface.points import blocker, trace_points
+from unirender_reference.optimize.surface.textures import best_smoothness, fit_texels, footprint, spread
 from unirender_reference.optimize.views import View
 
 SIZE = 32

@@ -6,10 +6,10 @@ import pytest
 
 from unirender.camera import Camera
 from unirender_reference.multiview import orbit
-from unirender_reference.optimize.light_grid import LightGrid
-from unirender_reference.optimize.pixel_fit import Appearance, PixelFit, observe
-from unirender_reference.optimize.surface_points import blocker, trace_points
-from unirender_reference.optimize.transport import light_transport, refined
+from unirender_reference.optimize.surface.points import blocker, trace_points
+from unirender_reference.optimize.transport.light_grid import LightGrid
+from unirender_reference.optimize.transport.matrices import light_transport, refined
+from unirender_reference.optimize.transport.pixel_fit import Appearance, PixelFit, observe
 from unirender_reference.optimize.views import View
 from unirender_reference.render import Renderer
 

@@ -4,9 +4,9 @@ import itertools
 
 import pytest
 
-from unirender_reference.optimize.solve import STARTS
-from unirender_reference.optimize.transport_config import TransportConfig
-from unirender_reference.optimize.transport_progress import solve_shares
+from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.optimize.transport.progress import solve_shares
+from unirender_reference.optimize.transport.solve import STARTS
 
 
 @pytest.mark.parametrize(("materials", "rounds"), [("one", 0), ("maps", 2)])

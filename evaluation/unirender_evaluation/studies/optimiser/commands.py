@@ -91,7 +91,7 @@ class BenchRace:
         from unirender_evaluation.studies.optimiser.race import RaceSettings, race_all
         from unirender_evaluation.studies.optimiser.race_report import draw, race_table, to_json
         from unirender_evaluation.studies.optimiser.study import Study
-        from unirender_reference.optimize.config import OptimizeConfig
+        from unirender_reference.optimize.multiview.config import OptimizeConfig
 
         console = Console()
         with open_folder(self.out) as folder:

@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from unirender_evaluation.multiview.methods import PLAIN_ITERATIONS, PLAIN_TEXTURE
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
+from unirender_reference.optimize.transport.config import TransportConfig
 
 FULL = "full"
 START, REFINEMENT, PRIORS, GREY = "start", "refinement", "priors", "grey"

@@ -21,9 +21,9 @@ from unirender_evaluation.store import Store
 from unirender_evaluation.studies.optimiser.ingredients import Ingredient
 from unirender_evaluation.studies.optimiser.study import Study, work_through
 from unirender_evaluation.suites.suite import Scene
-from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.transport_config import TransportConfig
+from unirender_reference.optimize.transport.config import TransportConfig
 
 TABLE = "ingredients"
 RECORDS = "records.jsonl"
@@ -47,8 +47,8 @@ class Starts:
 def _solve(
     scene: MultiviewScene, transport: TransportConfig, size: int, light_rows: int, seed: int
 ) -> tuple[Solution, float]:
-    from unirender_reference.optimize.solve import solve_appearance
-    from unirender_reference.optimize.uv import charted
+    from unirender_reference.optimize.shape.uv import charted
+    from unirender_reference.optimize.transport.solve import solve_appearance
 
     views, mesh = scene.views, scene.mesh  # rendered before the clock starts
     began = time.perf_counter()
@@ -60,7 +60,7 @@ def _solve(
 
 def measure(scene: MultiviewScene, starts: Starts, config: OptimizeConfig) -> dict[str, float]:
     """Metric key -> value of what the optimiser finds, with its seconds; without LPIPS."""
-    from unirender_reference.optimize.run import optimize
+    from unirender_reference.optimize.multiview.run import optimize
 
     start, seconds = starts.of(config)
     began = time.perf_counter()

@@ -23,8 +23,8 @@ from unirender_evaluation.scoring import score_colour
 from unirender_evaluation.studies.optimiser.curves import Curve, Point
 from unirender_evaluation.studies.optimiser.study import Study, work_through
 from unirender_evaluation.suites.suite import Scene
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.refine_config import RefineConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Step
 
@@ -132,7 +132,7 @@ def descend(
         every: iterations between two measures; the end is measured, too.
         first: points that were measured before.
     """
-    from unirender_reference.optimize.refine import RefineState, refine
+    from unirender_reference.optimize.refine.run import RefineState, refine
 
     state, points = RefineState.begin(start, config), list(first)
 
@@ -149,8 +149,8 @@ def descend(
 
 def run_ours(scene: MultiviewScene, settings: RaceSettings) -> tuple[Curve, Solution]:
     """Our curve: the transport stage, then refinement."""
-    from unirender_reference.optimize.solve import solve_appearance
-    from unirender_reference.optimize.uv import charted
+    from unirender_reference.optimize.shape.uv import charted
+    from unirender_reference.optimize.transport.solve import solve_appearance
 
     config = settings.ours
     views, mesh, _ = scene.views, scene.mesh, scene.buffers  # rendered before the clock starts
@@ -172,8 +172,8 @@ def run_ours(scene: MultiviewScene, settings: RaceSettings) -> tuple[Curve, Solu
 
 def run_plain(scene: MultiviewScene, settings: RaceSettings, loss: str) -> tuple[Curve, float]:
     """A plain loop's curve, and the albedo of its start in dB."""
-    from unirender_reference.optimize.solve import start_solution
-    from unirender_reference.optimize.uv import charted
+    from unirender_reference.optimize.shape.uv import charted
+    from unirender_reference.optimize.transport.solve import start_solution
 
     views, mesh, _ = scene.views, scene.mesh, scene.buffers
     watch = StopWatch()

@@ -8,7 +8,7 @@ import tyro
 
 from unirender.errors import UsageError
 from unirender.option_checks import at_least
-from unirender_reference.optimize.config import OptimizeConfig
+from unirender_reference.optimize.multiview.config import OptimizeConfig
 
 LEAST_VIEWS = 4
 

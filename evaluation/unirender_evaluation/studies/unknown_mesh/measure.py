@@ -20,8 +20,8 @@ from unirender_evaluation.store import Store, content_key
 from unirender_evaluation.studies.folder import write_files
 from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.versions import MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
-from unirender_reference.optimize.config import OptimizeConfig
-from unirender_reference.optimize.report import OnReport
+from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.show.report import OnReport
 
 TABLE, PROTOCOL, METHOD = "unknown-mesh", "unknown-mesh", "unirender-optimize"
 USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
@@ -88,7 +88,7 @@ def measured(what: UnknownMesh, scene: Scene, progress: OnReport | None = None) 
     """Optimises one object from its pictures, scores the result and draws it."""
     from unirender_evaluation.studies.unknown_mesh.pictures import found_strip
     from unirender_evaluation.studies.unknown_mesh.scoring import score_found
-    from unirender_reference.optimize.run import optimize
+    from unirender_reference.optimize.multiview.run import optimize
 
     world, folder = suite_scene(what.suite, scene, what.settings), what.folder(scene)
     solution = optimize(world.views, None, what.config, folder, progress=progress, pictures=False)
@@ -106,8 +106,8 @@ def stage_seconds(folder: Path) -> dict[str, float]:
 
     What is done between two stages (charts, textures) counts for the later one.
     """
-    from unirender_reference.optimize.result import stage_table
-    from unirender_reference.optimize.state import HISTORY, PROGRESS, STATE
+    from unirender_reference.optimize.files.state import HISTORY, PROGRESS, STATE
+    from unirender_reference.optimize.multiview.result import stage_table
 
     lines = (folder / HISTORY).read_text(encoding="utf-8").splitlines()
     values, before = {}, 0.0

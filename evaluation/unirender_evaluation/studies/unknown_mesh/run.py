@@ -13,8 +13,8 @@ from unirender_evaluation.studies.unknown_mesh import tables
 from unirender_evaluation.studies.unknown_mesh.measure import UnknownMesh, measure
 from unirender_evaluation.suites.stratification import MetallicRoughness
 from unirender_evaluation.suites.suite import Scene
-from unirender_reference.optimize.live import live_report
-from unirender_reference.optimize.report import OnReport
+from unirender_reference.optimize.show.live import live_report
+from unirender_reference.optimize.show.report import OnReport
 
 NAME = "unknown_mesh"
 

@@ -7,7 +7,7 @@ from typing import get_args
 import tyro
 
 from unirender.option_checks import at_least
-from unirender_reference.optimize.single_config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tasks import picture
 from unirender_evaluation.truth.render import item_seed
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, SEPARATOR, Versions, modules_version
-from unirender_reference.optimize.single_config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig
 
 Geometry = Literal["known-mesh", "predicted-normals", "true-normals"]
 COLD, WARM, PREDICTION = "cold", "warm", "prediction"
@@ -125,7 +125,7 @@ class Case:
             nonlocal steps
             steps = step.iteration
 
-        from unirender_reference.optimize.single_view import optimize_image
+        from unirender_reference.optimize.single.run import optimize_image
 
         start = time.perf_counter()
         found = optimize_image(**self._seen, config=self.what.config, on_step=count, **options)

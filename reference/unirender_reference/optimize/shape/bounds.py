@@ -10,10 +10,10 @@ import logging
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender_reference.optimize.coverage import masks_of
-from unirender_reference.optimize.placement import sphere_of_masks
 from unirender_reference.optimize.shape.cameras import Cameras
+from unirender_reference.optimize.shape.coverage import masks_of
 from unirender_reference.optimize.shape.hull import hull_reach, visual_hull
+from unirender_reference.optimize.shape.placement import sphere_of_masks
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION_TOLERANCE
 
@@ -72,5 +72,5 @@ def _check_placed(views: Views) -> None:
         raise UnirenderError(
             f"views: the masks show an object about {np.round(shown.center, 3).tolist()} with a radius of "
             f"{shown.radius:.3g}, expected the unit sphere: move the views there with "
-            "placed(views, sphere_of_masks(views)) of unirender_reference.optimize.placement"
+            "placed(views, sphere_of_masks(views)) of unirender_reference.optimize.shape.placement"
         )

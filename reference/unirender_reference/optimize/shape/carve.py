@@ -7,7 +7,7 @@ of the cameras that see it cannot agree is not on the surface, and is taken away
 A camera says an interval for each channel: of the four pixels around the point, which allows for half a pixel of
 misplacement. Intervals agree if one value lies in all of them, to within a tolerance. Surfaces whose colour depends
 on the direction, mirrors above all, disagree with themselves and are carved away; so a carved shape is only a
-proposal. It has to fill the masks as well as the hull does, and then to explain the pictures better (`run`).
+proposal. It has to fill the masks as well as the hull does, and then to explain the pictures better (`multiview.run`).
 """
 
 import numpy as np
@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from unirender.color import image_srgb
-from unirender_reference.optimize.coverage import coverage_of, masks_of
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.config import ShapeConfig
+from unirender_reference.optimize.shape.coverage import coverage_of, masks_of
 from unirender_reference.optimize.shape.hull import HALF, visual_hull
 from unirender_reference.optimize.shape.reconstruct import charted_object, fit_masks
 from unirender_reference.optimize.views import Views

@@ -6,11 +6,11 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-from unirender_reference.optimize.coverage import masks_of
 from unirender_reference.optimize.shape.bounds import check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap
 from unirender_reference.optimize.shape.config import ShapeConfig
+from unirender_reference.optimize.shape.coverage import masks_of
 from unirender_reference.optimize.shape.fit import MeshFit
 from unirender_reference.optimize.shape.hull import extract, visual_hull
 from unirender_reference.optimize.shape.topology import vertex_normals

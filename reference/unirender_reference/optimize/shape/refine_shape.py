@@ -15,6 +15,7 @@ from scipy.sparse import coo_array
 
 from unirender.color import display_slope, image_srgb
 from unirender.pictures import DISPLAY_WHITE
+from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -23,7 +24,6 @@ from unirender_reference.optimize.shape.normal_matrix import normal_matrix
 from unirender_reference.optimize.shape.shading import shade_points
 from unirender_reference.optimize.shape.topology import vertex_normals
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.textured_scene import TexturedScene, maps_of
 from unirender_reference.optimize.views import Step, Views
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION
 

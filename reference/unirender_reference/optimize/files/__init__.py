@@ -1,0 +1,1 @@
+"""Files of the optimiser: posed pictures in, the state of a run, and what it found."""

@@ -1,0 +1,1 @@
+"""Refinement of textures and light by Mitsuba's derivatives, from any start."""

@@ -1,0 +1,210 @@
+"""Refinement: Adam on textures and light, by Mitsuba's derivatives, from any start.
+
+Notation: a *parameter* is a map in the space in which steps are made (`parameters`).
+"""
+
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender_reference.optimize.refine.config import RefineConfig
+from unirender_reference.optimize.refine.losses import ImageLoss
+from unirender_reference.optimize.refine.parameters import NAMES, Name, parameter_gradient, to_map, to_parameter
+from unirender_reference.optimize.refine.priors import anchor, neutral_light, smoothness, white_light
+from unirender_reference.optimize.refine.scene import TexturedScene
+from unirender_reference.optimize.refine.state import RefineState
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.views import Step, Views
+from unirender_reference.passes import derive_seed
+
+__all__ = ["RefineConfig", "RefineState", "refine"]
+
+LIGHT_WIDTH, TEXTURE_WIDTH = 0.1, 0.02  # of the smoothness priors
+WEIGHT_SPP = 256  # of the pictures that say what the start explains
+HELD_OUT_SPP = 64  # always the same samples: differences between steps are sharper than the figure
+
+Maps = Mapping[str, Float[np.ndarray, "..."]]
+Gradients = Mapping[Name, Float[np.ndarray, "h w c"]]
+
+
+def refine(
+    views: Views,
+    start: Solution,
+    config: RefineConfig,
+    on_step: Callable[[Step], bool] = lambda step: True,
+    state: RefineState | None = None,
+) -> Solution:
+    """Improves textures and light of a solution by gradient descent on the pictures.
+
+    Args:
+        views: `seen` is fitted; of `held_out` only the fit is measured (`RefineConfig.held_out_every`).
+        start: mesh, first textures and light.
+        config: the ingredients.
+        on_step: called after every step; False ends the refinement.
+        state: where to go on (`RefineState.load`), moved on in place; None: from the start.
+
+    Returns:
+        The start's mesh with new textures and light.
+
+    Raises:
+        UsageError: the configuration has a value outside its range.
+    """
+    config.check()
+    if not config.enabled:
+        return start
+    state = RefineState.begin(start, config) if state is None else state
+    began = time.perf_counter()
+    fit = Fit(views, state.solution(start, config), config)
+    if config.robust:
+        fit.weigh(state.maps(config, state.first))
+    while state.iteration < config.iterations:
+        values = fit.step(state)
+        if not on_step(Step("refine", state.iteration, time.perf_counter() - began, values)):
+            break
+    return state.solution(start, config)
+
+
+class HeldOut:
+    """The fit to views that are only watched.
+
+    Args:
+        views: `held_out` of them.
+        first: any solution of the right mesh and sizes.
+        config: of the refinement.
+    """
+
+    def __init__(self, views: Views, first: Solution, config: RefineConfig) -> None:
+        self.config = config
+        self.scene = TexturedScene(first, views.held_out, config.depth)
+        self.loss = ImageLoss(views, config.loss, config.one_sided, views.held_out)
+
+    def psnr(self, state: RefineState) -> float:
+        """Masked PSNR in dB."""
+        images = self.scene.image(state.maps(self.config), HELD_OUT_SPP, derive_seed(self.config.seed, "held out"))
+        return self.loss.psnr(images[..., :3])
+
+
+class Fit:
+    """The objective of a refinement, and its steps.
+
+    Args:
+        views: the pictures.
+        first: any solution of the right mesh and sizes.
+        config: the ingredients.
+    """
+
+    def __init__(self, views: Views, first: Solution, config: RefineConfig) -> None:
+        self.config = config
+        self.scene = TexturedScene(first, views.seen, config.depth)
+        self.loss = ImageLoss(views, config.loss, config.one_sided)
+        self._held_out = HeldOut(views, first, config) if config.held_out_every and views.held_out else None
+
+    def weigh(self, maps: Maps) -> None:
+        """Lets pixels count, from now on, by how well these maps explain them."""
+        images = self.scene.image(maps, WEIGHT_SPP, derive_seed(self.config.seed, "weights"))
+        self.loss.weigh(images[..., :3])
+
+    def step(self, state: RefineState) -> dict[str, float]:
+        """One step of Adam; returns the losses by name."""
+        config = self.config
+        values, gradients = self.pictures(state)
+        for name, (value, gradient) in self.priors(state).items():
+            values[name] = value
+            for key, part in gradient.items():
+                gradients[key] = gradients[key] + part
+        remaining = config.decay ** (state.iteration / max(1, config.iterations))
+        rates = (config.albedo_rate, config.roughness_rate, config.metallic_rate, config.light_rate)
+        for name, rate in zip(NAMES, rates, strict=True):
+            if rate:
+                moved = state.parameters[name] + state.moments[name].step(gradients[name], rate * remaining)
+                within = to_map(name, moved, config.parametrisation)
+                state.parameters[name] = to_parameter(name, within, config.parametrisation)
+        state.iteration += 1
+        if self._held_out and state.iteration % config.held_out_every == 0:
+            values["held_out_psnr"] = self._held_out.psnr(state)
+        return values
+
+    def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Float[np.ndarray, "h w c"]]]:
+        """The loss of the pictures with the fit in dB, and derivatives with respect to the parameters."""
+        config, maps = self.config, state.maps(self.config)
+        seed = derive_seed(config.seed, "refine", 0 if config.common_random_numbers else state.iteration)
+        other = derive_seed(seed, "gradient") if config.decorrelated else seed
+        images = self.scene.image(maps, config.spp, seed)
+        background = np.random.default_rng(seed).random(3).astype(np.float32) if config.random_background else None
+        value, image_gradient = self.loss(images[..., :3], background, images[..., 3:])
+        found = self.scene.gradients(maps, image_gradient, config.spp_gradient, other)
+        values = {"loss": value, "psnr": self.loss.psnr(images[..., :3])}
+        if config.demodulated:
+            value, light = self._demodulated(maps, seed)
+            values["demodulated"] = value
+            found["environment"] = found["environment"] + config.demodulated * light
+        gradients = {name: found[name].reshape(state.parameters[name].shape) for name in NAMES}
+        return values, {
+            name: parameter_gradient(name, state.parameters[name], gradients[name], config.parametrisation)
+            for name in NAMES
+        }
+
+    def priors(self, state: RefineState) -> dict[str, tuple[float, Gradients]]:
+        """Value and weighted derivatives of every prior that has a weight."""
+        config, now, first = self.config, state.parameters, state.first
+        found: dict[str, tuple[float, Gradients]] = {}
+
+        def add(label: str, weight: float, name: Name, prior: Callable[[], tuple[float, np.ndarray]]) -> None:
+            if weight:
+                value, slope = prior()
+                found[label] = value, {name: weight * slope}
+
+        light = to_map("environment", now["environment"], config.parametrisation)
+        logs = np.log(light)
+
+        def of_light(gradient: np.ndarray) -> np.ndarray:
+            return parameter_gradient("environment", now["environment"], gradient, config.parametrisation)
+
+        def white() -> tuple[float, np.ndarray]:
+            value, slope = white_light(light)
+            return value, of_light(slope)
+
+        def neutral() -> tuple[float, np.ndarray]:
+            value, slope = neutral_light(logs)
+            return value, of_light(slope / light)
+
+        def smooth_light() -> tuple[float, np.ndarray]:
+            value, slope = smoothness(logs, LIGHT_WIDTH, circular=True)
+            return value, of_light(slope / light)
+
+        add("white_light", config.white_light, "environment", white)
+        add("neutral_light", config.neutral_light, "environment", neutral)
+        add("light_smoothness", config.light_smoothness, "environment", smooth_light)
+        add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
+        for name in ("roughness", "metallic"):
+            add(
+                f"{name}_smoothness",
+                config.material_smoothness,
+                name,
+                lambda name=name: smoothness(now[name], TEXTURE_WIDTH),
+            )
+        anchors = (config.albedo_anchor, config.material_anchor, config.material_anchor, config.light_anchor)
+        for name, weight in zip(NAMES, anchors, strict=True):
+            add(f"{name}_anchor", weight, name, lambda name=name: anchor(now[name], first[name]))
+        return found
+
+    def _demodulated(self, maps: Maps, seed: int) -> tuple[float, Float[np.ndarray, "eh ew 3"]]:
+        """NvDiffRecMC's |Y(light) - V(picture)|: the light that a white object reflects, against the picture's value.
+
+        (Hasselgren et al. 2022, eq. 8): Y is the mean over channels of the light, V the largest channel of the picture.
+        """
+        config = self.config
+        white = {**maps, "albedo": np.ones_like(maps["albedo"]), "metallic": np.zeros_like(maps["metallic"])}
+        images = self.scene.image(white, config.spp, derive_seed(seed, "white"))
+        luminance = images[..., :3].mean(axis=-1, keepdims=True)
+        value = self.loss.target.max(axis=-1, keepdims=True)
+        difference = np.log1p(luminance) - np.log1p(value)
+        covered = self.loss.coverage > 0
+        count = float(self.loss.coverage.sum())
+        slope = np.where(covered, np.sign(difference) / (1 + luminance) / 3 / count, 0)
+        gradient = np.repeat(slope, 3, axis=-1).astype(np.float32)
+        own = derive_seed(seed, "white gradient")
+        found = self.scene.gradients(white, gradient, config.spp_gradient, own, ("environment",))
+        return float(np.abs(difference).sum(where=covered)) / count, found["environment"]

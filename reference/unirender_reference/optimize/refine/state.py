@@ -1,0 +1,108 @@
+"""Where a refinement stands: maps, moments and the iteration, in memory and in a file."""
+
+import dataclasses
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.errors import UnirenderError
+from unirender.whole_files import whole_file
+from unirender_reference.optimize.numerics.descent import PyramidAdam
+from unirender_reference.optimize.refine.config import RefineConfig
+from unirender_reference.optimize.refine.parameters import NAMES, Name, to_map, to_parameter
+from unirender_reference.optimize.solution import Solution
+from unirender_reference.optimize.transport.light_grid import interpolated_light
+
+
+@dataclass
+class RefineState:
+    """Where a refinement stands; `refine` moves it on in place, so that a caller may save it after any step.
+
+    Attributes:
+        iteration: steps made.
+        parameters: the maps in the space of steps, by name; roughness and metallic have one channel.
+        moments: Adam's, by name.
+        first: the parameters of the start.
+    """
+
+    iteration: int
+    parameters: dict[Name, Float[np.ndarray, "h w c"]]
+    moments: dict[Name, PyramidAdam]
+    first: dict[Name, Float[np.ndarray, "h w c"]]
+
+    @classmethod
+    def begin(cls, start: Solution, config: RefineConfig) -> "RefineState":
+        """The state before the first step."""
+        light = start.environment
+        if config.light_rows:
+            light = interpolated_light(light, config.light_rows)
+        assert start.obj.roughness is not None
+        assert start.obj.metallic is not None
+        maps = (start.obj.albedo, start.obj.roughness[..., None], start.obj.metallic[..., None], light)
+        first: dict[Name, np.ndarray] = {
+            name: to_parameter(name, values, config.parametrisation) for name, values in zip(NAMES, maps, strict=True)
+        }
+        levels = (config.albedo_levels, config.material_levels, config.material_levels, config.light_levels)
+        moments: dict[Name, PyramidAdam] = {
+            name: PyramidAdam(first[name].shape, count, name == "environment", config.uniform, config.beta_2)
+            for name, count in zip(NAMES, levels, strict=True)
+        }
+        return cls(0, {name: values.copy() for name, values in first.items()}, moments, first)
+
+    def maps(self, config: RefineConfig, parameters: Mapping[Name, Any] | None = None) -> dict[str, Any]:
+        """What a `TexturedScene` shows: the present parameters, or others, such as `first`."""
+        shown = self.parameters if parameters is None else parameters
+        maps = {name: to_map(name, shown[name], config.parametrisation) for name in NAMES}
+        return {name: values[..., 0] if name in ("roughness", "metallic") else values for name, values in maps.items()}
+
+    def solution(self, start: Solution, config: RefineConfig) -> Solution:
+        """The present maps on the start's mesh."""
+        maps = self.maps(config)
+        textures = {name: maps[name] for name in ("albedo", "roughness", "metallic")}
+        return Solution(dataclasses.replace(start.obj, **textures), maps["environment"])
+
+    def save(self, path: Path) -> None:
+        """Writes an npz file; a killed run leaves the file that was there, or the new one."""
+        arrays: dict[str, Any] = {f"parameter.{name}": values for name, values in self.parameters.items()}
+        arrays |= {f"first.{name}": values for name, values in self.first.items()}
+        for name, moments in self.moments.items():
+            arrays |= {f"moment.{name}.{index}": array for index, array in enumerate(moments.arrays())}
+        with whole_file(path) as file:
+            np.savez(file, iteration=self.iteration, **arrays)
+
+    @classmethod
+    def load(cls, path: Path, start: Solution, config: RefineConfig) -> "RefineState":
+        """What `save` wrote, for the same start and configuration.
+
+        Raises:
+            UnirenderError: the file is unreadable or belongs to another start or configuration.
+        """
+        state = cls.begin(start, config)
+        try:
+            with np.load(path) as file:
+                arrays = {name: file[name] for name in file.files}
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            raise UnirenderError(
+                f"{path}: no readable state of a refinement ({error}); delete it to begin anew"
+            ) from error
+        expected = {f"parameter.{name}": values.shape for name, values in state.parameters.items()}
+        for name, moments in state.moments.items():
+            expected |= {f"moment.{name}.{index}": array.shape for index, array in enumerate(moments.arrays())}
+        for name, shape in expected.items():
+            found = arrays[name].shape if name in arrays else None
+            if found != shape:
+                raise UnirenderError(
+                    f"{path}: {name} has shape {found}, expected {shape}; the state belongs to another start or "
+                    "configuration: delete it to begin anew"
+                )
+        state.iteration = int(arrays["iteration"])
+        for name in NAMES:
+            state.parameters[name], state.first[name] = arrays[f"parameter.{name}"], arrays[f"first.{name}"]
+            own = [arrays[f"moment.{name}.{index}"] for index in range(len(state.moments[name].arrays()))]
+            state.moments[name].restore(own, state.iteration)
+        return state

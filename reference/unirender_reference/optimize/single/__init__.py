@@ -1,0 +1,1 @@
+"""One picture: its maps and its light by optimisation."""

@@ -1,0 +1,1 @@
+"""The start by light transport: light, materials and base colour solved for together, without descent."""
