@@ -23,7 +23,7 @@ OUT ?= results
 # Of the multi-view table, which is not the paper's: 3 minutes each. `unirender bench run` takes 4.
 VIEW_OBJECTS ?= 2
 
-# Where it is set, every process of every run would compile what it imports again: a minute for each of pytest's.
+# Where it is set, every process of every run would compile what it imports again: 30 s for each of pytest's.
 export PYTHONDONTWRITEBYTECODE :=
 
 VENV := .venv
