@@ -23,32 +23,29 @@ OUT ?= results
 # Of the multi-view table, which is not the paper's: 3 minutes each. `unirender bench run` takes 4.
 VIEW_OBJECTS ?= 2
 
-# Where it is set, every process of every run would compile the sources and the tests again: 30 s for each of pytest's.
+# Where it is set, every process of every run would compile what it imports again: 30 s for each of pytest's.
 export PYTHONDONTWRITEBYTECODE :=
 
 VENV := .venv
 BIN := $(VENV)/bin
-# pip would compile what it installs on one core. Files that cannot be compiled are templates and tests of packages.
+# Python compiles what is imported when it is: a third of what is installed, which pip would compile whole.
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt $(PIP_ARGS)
-COMPILE := $(BIN)/python -m compileall -qq --workers 0 $(VENV)/lib || true
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs docs-check format clean
+.PHONY: all setup lpips-vgg bench bench-full test collected test-long test-large test-report test-demo test-latex lint docs docs-check format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
 $(VENV)/.runtime: $(REQUIREMENTS)
-	@echo "setting up $(VENV): 2 or 3 minutes, once"
+	@echo "setting up $(VENV): a minute or two, once"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable .
-	$(COMPILE)
 	touch $@
 
 $(VENV)/.dev: $(REQUIREMENTS)
-	@echo "setting up $(VENV) with the development tools: 2 or 3 minutes, once"
+	@echo "setting up $(VENV) with the development tools: a minute or two, once"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[dev,docs,cluster,denoise,sd,demo]'
-	$(COMPILE)
 	touch $(VENV)/.runtime $@
 
 setup: $(VENV)/.dev
@@ -69,10 +66,14 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-# Type checks and documentation use one core each.
+# Type checks take one core, and as long as documentation and collecting take another.
 test: $(VENV)/.dev
-	$(MAKE) --jobs=2 --no-print-directory lint docs-check
+	$(MAKE) --jobs=2 --no-print-directory lint docs-check collected
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+# What tests import, compiled once; all of pytest's processes would compile all of it. What fails here fails in `test`.
+collected: $(VENV)/.dev
+	$(BIN)/python -m pytest --collect-only -qq > /dev/null || true
 
 # The notebooks run in `docs`.
 test-long: docs

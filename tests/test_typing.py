@@ -3,8 +3,10 @@
 import re
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import pytest
@@ -92,11 +94,11 @@ def test_an_axis_has_one_size_in_the_arguments_and_the_result_of_a_call() -> Non
         return x[::step]
 
     looked_at = shape_checks.checked(typechecker=None)(every)
-    assert len(looked_at(np.ones(4), 1)) == 4
+    assert len(looked_at(np.ones(4), 1)) == len(looked_at(np.ones(4), step=1)) == 4
     with pytest.raises(TypeCheckError):
         looked_at(np.ones(4), 2)
     with pytest.raises(TypeCheckError):
-        looked_at(np.ones(4), "1")
+        looked_at(np.ones(4), step="1")
 
     def rows(count: int) -> Float[np.ndarray, "{count} 3"]:
         return np.ones((2, 3))
@@ -105,3 +107,79 @@ def test_an_axis_has_one_size_in_the_arguments_and_the_result_of_a_call() -> Non
     assert len(looked_at(2)) == 2
     with pytest.raises(TypeCheckError):
         looked_at(3)
+
+
+class _Named(Protocol):
+    name: str
+
+
+class _Thing:
+    """Of no name, unless it is given one."""
+
+
+def _thing(name: str) -> _Thing:
+    thing = _Thing()
+    thing.name = name  # pyright: ignore[reportAttributeAccessIssue] - one that its class does not know
+    return thing
+
+
+@pytest.mark.parametrize(
+    ("hint", "right", "wrong"),
+    [
+        (Float[np.ndarray, "n 3"], np.ones((2, 3)), np.ones((2, 4))),
+        (Float[np.ndarray, "n 3"], np.ones((2, 3)), np.ones((2, 3), int)),
+        (Float[np.ndarray, "n 3"], np.ones((2, 3)), np.ones((2, 3, 1))),
+        (tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]], (np.ones(2),) * 2, (np.ones(2), np.ones(3))),
+        (tuple[int, ...], (1, 1), ("1", "1")),
+        (list[int] | None, [1], ["1"]),
+        (Sequence[int], [1], ["1"]),
+        (Mapping[str, int], {"1": 1}, {"1": "1"}),
+        (Literal["1"] | None, "1", "2"),
+        (runtime_checkable(_Named), _thing("1"), _Thing()),
+        (int, 1, "1"),
+    ],
+)
+def test_what_passed_lets_nothing_pass_that_is_unlike_it(hint: Any, right: Any, wrong: Any) -> None:
+    """Of an argument and of a result: a call like one before is not looked at again."""
+
+    def same(x: Any) -> None:
+        return None
+
+    def other(x: Any) -> Any:
+        return x
+
+    same.__annotations__["x"] = other.__annotations__["return"] = hint
+    for function in (same, other):
+        looked_at = shape_checks.checked(typechecker=None)(function)
+        looked_at(right)
+        looked_at(right)
+        with pytest.raises(TypeCheckError):
+            looked_at(wrong)
+        looked_at(right)
+
+
+def test_a_result_is_looked_at_beside_the_arguments_that_it_came_from() -> None:
+    """Also where both are of kinds that passed, but not together."""
+    results = [np.ones(2), np.ones(3), np.ones(3)]
+
+    def given(x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return results.pop(0)
+
+    looked_at = shape_checks.checked(typechecker=None)(given)
+    looked_at(np.ones(2))
+    looked_at(np.ones(3))
+    with pytest.raises(TypeCheckError):
+        looked_at(np.ones(2))
+
+
+def test_an_argument_is_looked_at_by_its_own_name() -> None:
+    def of(count: int = 0, name: str = "") -> None:
+        return None
+
+    looked_at = shape_checks.checked(typechecker=None)(of)
+    looked_at(count=1)
+    looked_at(name="1")
+    with pytest.raises(TypeCheckError):
+        looked_at(name=1)
+    with pytest.raises(TypeCheckError):
+        looked_at(count="1")

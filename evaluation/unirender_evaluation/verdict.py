@@ -1,5 +1,6 @@
 """The verdict: which claims about the rows hold on this run, by the paired 95 % interval."""
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -102,18 +103,18 @@ def findings(
 ) -> list[Finding]:
     """Every claim; without a comparison where its two rows share no sample, or where they are not to be compared: a
     picture that is the truth to the bit has an infinite PSNR. `lights`: of all samples, or None."""
-    found = []
+    found, of_selection = [], functools.cache(lambda selection: selection.of(records))
     for claim in claims:
-        chosen = Selection(claim.table, claim.protocol).of(records)
-        a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
+        chosen, key = of_selection(Selection(claim.table, claim.protocol)), claim.key
+        a, b = (values_of(chosen, method, key) for method in (claim.a, claim.b))
         common = a.keys() & b.keys()
         if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
-            comparison = compare(chosen, claim.kind, claim.key, claim.a, claim.b)
+            comparison = compare(chosen, claim.kind, key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
-            asked = len({record.sample for record in chosen if claim.key in record.values})
+            asked = len({record.sample for record in chosen if key in record.values})
             finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
             if lights:
-                other = difference_over_lights(chosen, claim.key, claim.a, claim.b, lights)
+                other = difference_over_lights(chosen, key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
             found.append(finding)
         else:
