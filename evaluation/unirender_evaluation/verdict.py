@@ -104,21 +104,30 @@ def findings(
     picture that is the truth to the bit has an infinite PSNR. `lights`: of all samples, or None."""
     found = []
     for claim in claims:
-        chosen = Selection(claim.table, claim.protocol).of(records)
+        whole, chosen = Selection(claim.table, claim.protocol).of(records), _comparable(records, claim)
         a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
         common = a.keys() & b.keys()
-        if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
+        if common and all(math.isfinite(b[sample]) for sample in common):
             comparison = compare(chosen, claim.kind, claim.key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
-            asked = len({record.sample for record in chosen if claim.key in record.values})
+            asked = len({record.sample for record in whole if claim.key in record.values})
             finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
             if lights:
                 other = difference_over_lights(chosen, claim.key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
             found.append(finding)
         else:
-            found.append(Finding(claim, None, None, "infinite PSNR, not compared " if common else "not run "))
+            exact = common or math.inf in values_of(whole, claim.a, claim.key).values()
+            found.append(Finding(claim, None, None, "infinite PSNR, not compared " if exact else "not run "))
     return found
+
+
+def _comparable(records: Sequence[Record], claim: Claim) -> list[Record]:
+    """The records of a claim's question but for samples on which its first row is right to the bit: there is no
+    difference in dB, and without them that row has less to show."""
+    chosen = Selection(claim.table, claim.protocol).of(records)
+    exact = {sample for sample, value in values_of(chosen, claim.a, claim.key).items() if math.isinf(value)}
+    return [record for record in chosen if record.sample not in exact]
 
 
 @dataclass(frozen=True)
@@ -165,6 +174,12 @@ def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
     return breaches
 
 
+def _no_breach(records: Sequence[Record]) -> str:
+    if any(record.method == CEILING for record in records):
+        return "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
+    return "  open   noise ceiling: these results have no row of it, which a row could exceed"
+
+
 UNNAMED = "what holds under other lights is not told: the lights of the samples are not named"
 HEAD = (
     "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, under these lights, "
@@ -186,9 +201,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  {finding}" for finding in found]
     lines += [f"  ({line})" for line in summary(records, found)]
     breaches = ceiling_breaches(records)
-    lines += [f"  FAILS  {breach}" for breach in breaches] or [
-        "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
-    ]
+    lines += [f"  FAILS  {breach}" for breach in breaches] or [_no_breach(records)]
     lines += _truth_lines(check) if check else ["  open   truth: what its check found stands in the run's verdict.txt"]
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
@@ -240,7 +253,7 @@ def _other_lights_lines(found: Sequence[Finding]) -> list[str]:
 
 
 def _p_value(records: Sequence[Record], claim: Claim) -> float:
-    chosen = Selection(claim.table, claim.protocol).of(records)
+    chosen = _comparable(records, claim)
     a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
     return paired_p_value(a, b, {record.sample: record.object for record in chosen})
 
