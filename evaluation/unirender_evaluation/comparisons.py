@@ -1,7 +1,7 @@
 """Who beats whom: values of two rows, paired by sample, with the interval of their difference."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from unirender.errors import UnirenderError
@@ -100,12 +100,15 @@ def difference_over_lights(records: Sequence[Record], key: str, a: str, b: str, 
     return over_lights({s: of_a[s] - of_b[s] for s in sorted(of_a.keys() & of_b.keys())}, records, lights)
 
 
-def exact_fit(key: str, value: float) -> bool:
-    """Whether a value, or a mean of values, is infinite because a fitted factor made a picture the truth itself.
+def misleading_exact(key: str, values: Collection[float]) -> int:
+    """How many samples are right to the bit where their infinite PSNR makes a mean that says nothing of the others.
 
-    Any constant becomes exact on an object of one colour; such a mean says nothing of the other pictures.
+    Under a fitted factor any constant becomes exact on an object of one colour, so each of them counts. As it is, a row
+    that is right to the bit on all of its samples is perfect, and none counts.
     """
-    return math.isinf(value) and key.partition("@")[2].split("-")[-1] in SCALES[1:]
+    exact = sum(map(math.isinf, values))
+    fitted = key.partition("@")[2].split("-")[-1] in SCALES[1:]
+    return exact if fitted or exact < len(values) else 0
 
 
 def agree(a: Mapping[str, float], b: Mapping[str, float]) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
-from unirender_evaluation.light_metrics import score_light
+from unirender_evaluation.light_metrics import DIMMEST, score_light
 from unirender_evaluation.methods.method import Image
 from unirender_evaluation.methods.plausible import picture_doubt
 from unirender_evaluation.methods.plugin_source import raised_in
@@ -120,18 +120,18 @@ def check_light(row: Row, task: Task, maps: Intrinsics | None) -> None:
     """Refuses a stranger's light that cannot be scored.
 
     Raises:
-        UnirenderError: it is no lat-long map twice as wide as high, is black, or brighter than `BRIGHTEST`.
+        UnirenderError: it is no lat-long map twice as wide as high, is black (`DIMMEST`), or brighter than `BRIGHTEST`.
     """
     light = None if maps is None else maps.environment
     if light is None or not task.asks_light:
         return
     shape, largest = light.shape, float(light.max())
-    if len(shape) == 3 and shape[0] >= 2 and shape[1] == 2 * shape[0] and 0 < largest <= BRIGHTEST:
+    if len(shape) == 3 and shape[0] >= 2 and shape[1] == 2 * shape[0] and DIMMEST < largest <= BRIGHTEST:
         return
     raise UnirenderError(
         f"method {row.info.label!r}, decompose ({task.identity}): got an environment of shape {shape} with radiance up "
-        f"to {largest:.3g}, expected [height, 2 height, 3], at least 2 rows, and radiance in (0, {BRIGHTEST:g}]; "
-        "leave it out where none is found"
+        f"to {largest:.3g}, expected [height, 2 height, 3], at least 2 rows, and radiance in ({DIMMEST:g}, "
+        f"{BRIGHTEST:g}]; leave it out where none is found"
     )
 
 
@@ -167,6 +167,8 @@ def ask(row: Row, capability: str, what: str, **inputs: Any) -> Any:
             )
         if map_name in IMAGE_MAPS and value.shape[:2] != size:
             raise UnirenderError(f"{name}: got maps of size {value.shape[:2]}, expected {size}")
+        if map_name in IMAGE_MAPS:
+            _check_brightness(value, map_name, name)
     try:
         return _own(result)
     except UnirenderError as error:  # the method wrote into its arrays after it had made maps of them
@@ -203,7 +205,14 @@ def _picture(result: Any, size: tuple[int, int], name: str) -> Image:
     picture = picture.astype(np.float32)
     if bad := int(np.count_nonzero(~np.isfinite(picture))):
         raise UnirenderError(f"{name}: {bad} of {picture.size} values are NaN or infinite, {expected}")
+    _check_brightness(picture, "a picture", name)
     return picture
+
+
+def _check_brightness(value: np.ndarray, what: str, name: str) -> None:
+    """Refuses what is no float32 any more once it is divided by an edge's coverage, and would be scored as NaN."""
+    if (largest := float(np.abs(value).max())) > BRIGHTEST:
+        raise UnirenderError(f"{name}: got {what} with values up to {largest:.3g}, expected at most {BRIGHTEST:g}")
 
 
 def score(task: Task, prediction: Prediction, backbones: Sequence[str]) -> dict[str, float]:

@@ -30,6 +30,7 @@ CONE_DEG = 10.0  # half-angle of the cone that a lamp is looked for with
 CONE_SHAPE = (46, 90)  # directions and quadrature of the cones: 4 degrees
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 LARGEST_SCALE = 1e4  # of k, either way, times that of equal energy
+DIMMEST = 1e-12  # no light has less radiance at its brightest: the factor that would make it the true one overflows
 UNIFORM = 1e-3  # relative differences below which a light has no brightest direction: of all cones, or all around
 
 SCALED_LOG_RMSE = Metric(
@@ -96,8 +97,8 @@ def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]
     Raises:
         UnirenderError: `p` is black, which no factor makes a light.
     """
-    if not p.max() > 0:
-        raise UnirenderError("light metric: the found light is black, expected some radiance")
+    if not p.max() > DIMMEST:
+        raise UnirenderError(f"light metric: the found light is black, expected radiance above {DIMMEST:g}")
     w = texel_solid_angles(*p.shape[:2])[..., None]
 
     def error(log_scale: float) -> float:

@@ -138,9 +138,6 @@ METRICS: dict[str, Metric] = {
         Metric("mse_object", "MSE (object)", "", LOWER, 0.0, (), 4, "squared difference of the in-mask means"),
         Metric("cosine", "cos", "", HIGHER, 1.0, (), 3, "coverage-weighted mean cosine of the angle between normals"),
         Metric("angle_deg", "angle", "deg", LOWER, 0.0, (), 1, "coverage-weighted mean angle between normals"),
-        Metric("away", "facing away", "", LOWER, 0.0, (), 2, "share of the normals in the mask that face away"),
-        Metric("turned", "turned", "", LOWER, 0.0, (), 2, "mean cosine that normals gain with another sign of x or y"),
-        Metric("decoded", "decoded", "dB", LOWER, 0.0, (), 1, "masked sRGB PSNR that colours gain as display values"),
         Metric("ciede2000", "CIEDE2000", "", LOWER, 0.0, ("scale",), 2, "coverage-weighted mean difference, D65"),
         Metric("log_rmse", "log-RMSE", "", LOWER, 0.0, ("scale",), 3, f"RMSE of ln(x + {LOG_EPSILON}), in mask, HDR"),
         Metric("rmse_relative", "error", "", LOWER, 0.0, ("scale",), 3, "RMSE over the truth's mean, in mask, HDR"),
@@ -156,8 +153,6 @@ def metric_key(quantity: str, metric: Metric | str, variant: Variant = DEFAULT_V
 
 
 OWN_MASK = metric_key("mask", "iou")  # recorded where maps were scored with a mask of the method's own
-FACING_AWAY = metric_key("normal", "away")  # recorded of a stranger's normals where nearly all do
-TURNED = metric_key("normal", "turned")  # and where they gain much with another sign of x or y
 
 
 def pair(p: Any, t: Any) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:

@@ -1,5 +1,6 @@
-"""Every table that a run fills, and every metric that stands in one."""
+"""Every table that a run fills, and every metric that stands in one or is recorded beside it."""
 
+from unirender_evaluation.methods.mistakes import GAINS
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics.tests import PHYSICS_TABLE
@@ -11,4 +12,5 @@ ALL_TABLES: dict[str, TableSpec] = {**TABLES, **{spec.name: spec for spec in BES
 ALL_METRICS: dict[str, Metric] = {
     **{column.metric.name: column.metric for spec in ALL_TABLES.values() for column in spec.columns},
     **METRICS,
+    **GAINS,
 }

@@ -105,21 +105,30 @@ def findings(
     picture that is the truth to the bit has an infinite PSNR. `lights`: of all samples, or None."""
     found, of_selection = [], functools.cache(lambda selection: selection.of(records))
     for claim in claims:
-        chosen, key = of_selection(Selection(claim.table, claim.protocol)), claim.key
+        whole, key = of_selection(Selection(claim.table, claim.protocol)), claim.key
+        chosen = _comparable(whole, claim.a, key)
         a, b = (values_of(chosen, method, key) for method in (claim.a, claim.b))
         common = a.keys() & b.keys()
-        if common and all(math.isfinite(a[sample]) and math.isfinite(b[sample]) for sample in common):
+        if common and all(math.isfinite(b[sample]) for sample in common):
             comparison = compare(chosen, claim.kind, key, claim.a, claim.b)
             claimed = claim.expected == "beats" and comparison.decided
-            asked = len({record.sample for record in chosen if key in record.values})
+            asked = len({record.sample for record in whole if key in record.values})
             finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
             if lights:
                 other = difference_over_lights(chosen, key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
             found.append(finding)
         else:
-            found.append(Finding(claim, None, None, "infinite PSNR, not compared " if common else "not run "))
+            exact = common or math.inf in values_of(whole, claim.a, key).values()
+            found.append(Finding(claim, None, None, "infinite PSNR, not compared " if exact else "not run "))
     return found
+
+
+def _comparable(whole: list[Record], first: str, key: str) -> list[Record]:
+    """The records of a claim's question but for samples on which its first row is right to the bit: there is no
+    difference in dB, and without them that row has less to show."""
+    exact = {sample for sample, value in values_of(whole, first, key).items() if math.isinf(value)}
+    return [record for record in whole if record.sample not in exact] if exact else whole
 
 
 @dataclass(frozen=True)
@@ -166,6 +175,12 @@ def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
     return breaches
 
 
+def _no_breach(records: Sequence[Record]) -> str:
+    if any(record.method == CEILING for record in records):
+        return "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
+    return "  open   noise ceiling: these results have no row of it, which a row could exceed"
+
+
 UNNAMED = "what holds under other lights is not told: the lights of the samples are not named"
 HEAD = (
     "masked, sRGB and unaligned, where nothing else is said; paired 95 % intervals over objects, under these lights, "
@@ -187,9 +202,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  {finding}" for finding in found]
     lines += [f"  ({line})" for line in summary(records, found)]
     breaches = ceiling_breaches(records)
-    lines += [f"  FAILS  {breach}" for breach in breaches] or [
-        "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
-    ]
+    lines += [f"  FAILS  {breach}" for breach in breaches] or [_no_breach(records)]
     lines += _truth_lines(check) if check else ["  open   truth: what its check found stands in the run's verdict.txt"]
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
@@ -241,8 +254,9 @@ def _other_lights_lines(found: Sequence[Finding]) -> list[str]:
 
 
 def _p_value(records: Sequence[Record], claim: Claim) -> float:
-    chosen = Selection(claim.table, claim.protocol).of(records)
-    a, b = (values_of(chosen, method, claim.key) for method in (claim.a, claim.b))
+    key, whole = claim.key, Selection(claim.table, claim.protocol).of(records)
+    chosen = _comparable(whole, claim.a, key)
+    a, b = (values_of(chosen, method, key) for method in (claim.a, claim.b))
     return paired_p_value(a, b, {record.sample: record.object for record in chosen})
 
 

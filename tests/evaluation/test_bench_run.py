@@ -76,6 +76,7 @@ def test_a_strangers_row_brings_the_trivial_ones(tmp_path: Path) -> None:
         ("return intrinsics.albedo[..., 0]", r"expected finite linear radiance, floats of shape"),
         ("return intrinsics.albedo[:1]", r"of shape \(1, 2, 3\), expected finite linear radiance"),
         ("return intrinsics.albedo / 0", r"render \(x\): 12 of 12 values are NaN or infinite, expected finite linear"),
+        ("return 4e30 * intrinsics.albedo", r"got a picture with values up to 2e\+30, expected at most 1e\+30"),
         ("return [[0.5], [0.5, 0.5]]", r"render \(x\): got list, of which no array can be made .*, expected finite"),
         (
             "import torch; return torch.ones((2, 2, 3), requires_grad=True)",

@@ -141,9 +141,10 @@ def test_resolutions_are_brought_together() -> None:
 
 
 def test_a_black_light_is_refused() -> None:
-    black = np.zeros((*SHAPE, 3), np.float32)
-    with pytest.raises(UnirenderError, match="the found light is black"):
-        light_values(black, lamp(7.5, 8.0))
+    """And one so dim that the factor which makes it the true one is no float32."""
+    for radiance in (0, 1e-38):
+        with pytest.raises(UnirenderError, match="the found light is black"):
+            light_values(np.full((*SHAPE, 3), radiance, np.float32), lamp(7.5, 8.0))
 
 
 def test_no_angle_is_taken_from_a_light_without_direction() -> None:

@@ -11,6 +11,7 @@ import pytest
 from small_results import RUN, small_document, small_lights, small_records, small_results, written
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.methods.mistakes import GAINS
 from unirender_evaluation.records import write_records, write_run
 from unirender_evaluation.results.check import content_problems, remarks
 from unirender_evaluation.results.data import Results, definitions
@@ -26,7 +27,7 @@ def test_every_metric_says_which_way_is_better() -> None:
     """Ranks, intervals and verdicts follow it: of what the light and the physics are measured by, as well."""
     higher = {name for name, metric in ALL_METRICS.items() if metric.higher_is_better}
     assert higher == {"psnr", "ssim", "cosine", "iou", "correlation"}
-    assert {metric.perfect for name, metric in ALL_METRICS.items() if name not in higher} == {0}
+    assert {metric.perfect for name, metric in ALL_METRICS.items() if name not in {*higher, *GAINS}} == {0}
 
 
 def test_what_is_written_comes_back(tmp_path: Path) -> None:
@@ -133,6 +134,10 @@ def run_field(**fields: Any) -> Callable[[dict[str, Any]], None]:
     return lambda document: document["run"].update(fields)
 
 
+def values(numbers: dict[str, float]) -> Callable[[dict[str, Any]], None]:
+    return lambda document: document["records"][0]["values"].update(numbers)
+
+
 def value(key: str, number: Any) -> Callable[[dict[str, Any]], None]:
     return lambda document: document["records"][0]["values"].update({key: number})
 
@@ -153,6 +158,12 @@ CONTRADICTIONS = {
     "backbone": (value("albedo.lpips_vgg@masked-raw", 0.1), "LPIPS-vgg, but `run.lpips` does not list 'vgg'"),
     "above": (value("normal.cosine", 1.01), r"a cos is better than a perfect one \(1\)"),
     "below": (value("roughness.mse@masked", -0.1), r"a MSE is better than a perfect one \(0\)"),
+    "jensen": (values({"roughness.mse@masked": 0.1, "roughness.mse_object": 0.2}), "square of a mean error is above"),
+    "cosine": (values({"normal.cosine": 0.9, "normal.angle_deg": 26.0}), "mean cosine is above the cosine of the mean"),
+    "pasted": (
+        values({"albedo.lpips_alex@masked-raw": 0.2, "albedo.lpips_alex@whole-raw": 0.1}),
+        r"lpips_alex@whole-raw'\]: differs from that of the masked picture, though",
+    ),
     "infinite": (value("roughness.mse@masked", "inf"), "is infinitely bad"),
     "owner": (record(0, object="ball-9"), "sample 'ball-0_l0' is of"),
     "published": (lambda d: d["run"]["methods"][0].update(published="Mine"), r"run.methods\[0\].published: .*Mine"),

@@ -1,20 +1,24 @@
 """Scores of whole predictions: compositing, pasted and own masks, absent maps, refusals."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from unirender.color import image_srgb, srgb_encode, unpremultiply
+from unirender.color import image_srgb, srgb_decode, srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import load
-from unirender_evaluation.methods.plausible import facing_away, picture_doubt, range_doubt
-from unirender_evaluation.methods.suspicions import decoding_gain, suspicions, turning_gain
-from unirender_evaluation.metrics import FACING_AWAY, OWN_MASK, SCALES, TURNED, metric_key
+from unirender_evaluation.methods.mistakes import GAINS, MISTAKES, MOST_DB
+from unirender_evaluation.methods.plausible import picture_doubt, range_doubt
+from unirender_evaluation.methods.suspicions import suspicions
+from unirender_evaluation.metrics import OWN_MASK, SCALES, metric_key
+from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import MATERIALS, score_colour, score_image, score_maps
 from unirender_evaluation.suites.suite import Scene
+from unirender_evaluation.tables.mistakes import mistakes_said, truth_said
 from unirender_evaluation.task import Asked, Task
 
 SIZE = 32
@@ -88,19 +92,6 @@ def test_the_background_is_what_no_filter_of_the_object_reaches() -> None:
     assert picture_doubt(np.ones((20, 20, 3)), np.maximum(around(9), mask)) is None, "nothing is further away"
 
 
-def test_normals_that_face_away_or_lie_in_other_axes_are_told_apart() -> None:
-    """By the share of what is covered, and by the cosine, which gains 2 n_y^2 from the right sign of y."""
-    true, mask = intrinsics(0).require("normal")["normal"], disc()
-    inside = mask[..., 0] > 0
-    assert facing_away(true, mask) == (true[inside][:, 2] < 0).mean() < 0.1
-    assert facing_away(true, 0 * mask) == 0
-    weight = mask[..., 0] / mask.sum()
-    for signs in ((-1, 1, 1), (1, -1, 1), (-1, -1, 1)):
-        gain = 2 * sum((weight * true[..., axis] ** 2).sum() for axis in (0, 1) if signs[axis] < 0)
-        assert turning_gain(true * signs, true, mask) == pytest.approx(gain, rel=1e-4)
-    assert turning_gain(true, true, mask) < 0
-
-
 def asked(truth: Intrinsics, picture: np.ndarray | None = None) -> Task:
     mask = truth.require("mask")["mask"]
     known = Asked(mask, {}, truth_image=picture, truth_maps=truth)
@@ -108,34 +99,75 @@ def asked(truth: Intrinsics, picture: np.ndarray | None = None) -> Task:
     return Task("inverse", "single-image", "s", scene, ("decompose",), "s", "intrinsics", lambda: known)
 
 
-def test_only_what_is_probably_in_other_conventions_is_suspicious() -> None:
+def changed(name: str, undo: Callable[[np.ndarray], np.ndarray]) -> Callable[[Intrinsics], Intrinsics]:
+    return lambda maps: maps.replace(**{name: np.ascontiguousarray(undo(maps.require(name)[name]))})
+
+
+def exchanged(maps: Intrinsics) -> Intrinsics:
+    return maps.replace(roughness=maps.metallic, metallic=maps.roughness)
+
+
+MADE: dict[
+    str, tuple[str, Callable[[Intrinsics], Intrinsics]]
+] = {  # mistake -> the quantity that tells, how it is made
+    "if_decoded": ("albedo", changed("albedo", srgb_encode)),
+    "if_encoded": ("albedo", changed("albedo", srgb_decode)),
+    "if_bgr": ("specular", changed("specular", lambda x: x[..., ::-1])),
+    "if_mirrored": ("normal", changed("normal", lambda x: x[:, ::-1] * np.array([-1, 1, 1], np.float32))),
+    "if_upside_down": ("diffuse", changed("diffuse", lambda x: x[::-1])),
+    "if_shifted": ("albedo", changed("albedo", lambda x: np.roll(x, 1, 0))),
+    "if_other_signs": ("normal", changed("normal", lambda x: -x)),
+    "if_other_axes": ("normal", changed("normal", lambda x: x[..., [0, 2, 1]] * np.array([1, -1, 1], np.float32))),
+    "if_turned": ("environment", changed("environment", lambda x: np.roll(x, 16, 1))),
+    "if_inverted": ("roughness", changed("roughness", lambda x: 1 - x)),
+    "if_root": ("roughness", changed("roughness", np.square)),
+    "if_swapped": ("roughness", exchanged),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_usual_mistake_that_is_undone_gains_most_and_what_is_sound_gains_nothing(mistake: str) -> None:
+    """Whichever it is, the note names it and no other; of three pictures it says nothing."""
+    quantity, make = MADE[mistake]
+    truth = intrinsics(0).replace(diffuse=intrinsics(1).diffuse)
+    mask = truth.require("mask")["mask"]
+    values = suspicions(asked(truth), None, make(truth))
+    gains = {key: gain for key, gain in values.items() if key.startswith(f"{quantity}.")}
+    assert gains.pop(metric_key(quantity, GAINS[mistake])) == MOST_DB
+    assert max(gains.values(), default=0) < 15
+    assert max(suspicions(asked(truth), None, truth).values()) < 0
+    rng = np.random.default_rng(2)
+    noisy = np.clip(truth.require("albedo")["albedo"] + rng.normal(0, 0.2, mask.shape), 0, 1)
+    assert suspicions(asked(truth), None, truth.replace(albedo=noisy))["albedo.if_decoded"] < 0
+    records = [Record("inverse", "single-image", "m", f"s{i}", f"o{i}", values) for i in range(4)]
+    said = mistakes_said(records)
+    assert said.startswith(f"its answers are nearer to the truth {MISTAKES[mistake].said}: ")
+    assert said.endswith(" (4 of 4, +20.0 dB)")
+    assert mistakes_said(records[:3]) == ""
+
+
+def test_maps_that_no_picture_tells_are_noted() -> None:
+    def records(db: float, degrees: float, **gains: float) -> list[Record]:
+        values = {"albedo.psnr@masked-srgb-raw": db, "normal.angle_deg": degrees}
+        values |= {f"{name}.if_shifted": gain for name, gain in gains.items()}
+        return [Record("inverse", "single-image", "m", f"s{i}", f"o{i}", values) for i in range(4)]
+
+    said = (
+        "its answers are the truth but for rounding: albedo (4 of 4 pictures), normal (4 of 4 pictures) (was it told?)"
+    )
+    assert truth_said(records(math.inf, 0.1, albedo=-20.0, normal=-20.0)) == said
+    few = records(math.inf, 0.1, albedo=-20.0)[:3]
+    assert truth_said(records(40.0, 1.0, albedo=-9.0, normal=-9.0)) == truth_said(few) == ""
+    assert truth_said(records(math.inf, 0.1)) == "", "no stranger's"
+
+
+def test_pictures_and_lights_have_gains_and_nothing_has_none_of_its_own() -> None:
     truth = intrinsics(0)
-    mask, truth = truth.require("mask")["mask"], truth.replace(specular=truth.require("diffuse")["diffuse"])
-    picture = truth.require("albedo")["albedo"] * mask
-    task = asked(truth, picture)
-    assert suspicions(task, picture, truth) == suspicions(task, None, None) == {}
-    assert suspicions(task, None, truth.replace(normal=None)) == {}
-    rng = np.random.default_rng(1)
-    worse = np.clip(truth.require("albedo")["albedo"] + rng.normal(0, 0.2, mask.shape), 0, 1)
-    assert suspicions(task, worse * mask, truth.replace(albedo=worse)) == {}, "errors are none"
-    encoded = {name: srgb_encode(value) for name, value in truth.require("albedo", "specular", "diffuse").items()}
-    found = suspicions(task, srgb_encode(unpremultiply(picture, mask)) * mask, truth.replace(**encoded))
-    assert found.keys() == {metric_key(name, "decoded") for name in (*encoded, "relit")}
-    assert min(found.values()) > 40
-    normal = truth.require("normal")["normal"]
-    down, back = (normal * np.array(signs, np.float32) for signs in ((1, -1, 1), (1, -1, -1)))
-    assert suspicions(task, None, truth.replace(normal=down)) == {TURNED: turning_gain(down, normal, mask)}
-    assert suspicions(task, None, truth.replace(normal=back)) == {FACING_AWAY: facing_away(back, mask)}
-
-
-def test_taken_for_display_values_colours_gain_what_is_nearer() -> None:
-    """In dB of the masked error of display values; nothing where they are linear."""
-    true, mask = np.linspace(0.05, 0.9, SIZE**2 * 3).reshape(SIZE, SIZE, 3), disc()
-    shown = image_srgb(true)
-    near = shown + 0.01
-    errors = [metrics.mse(p, shown, mask) for p in (image_srgb(near), near)]
-    assert decoding_gain(near, true, mask) == pytest.approx(10 * math.log10(errors[0] / errors[1]), abs=1e-3)
-    assert decoding_gain(true, true, mask) == 0
+    picture = truth.require("albedo")["albedo"] * truth.require("mask")["mask"]
+    found = suspicions(asked(truth, picture), np.ascontiguousarray(picture[..., ::-1]), None)
+    assert max(found, key=lambda key: found[key]) == "relit.if_bgr"
+    assert suspicions(asked(truth, picture), None, None) == {}
+    assert suspicions(asked(truth), None, Intrinsics(environment=np.zeros((16, 32, 3)))) == {}
 
 
 def test_absent_maps_have_no_values() -> None:

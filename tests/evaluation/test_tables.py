@@ -585,10 +585,20 @@ def test_rounding_does_not_add_to_a_difference(differing: int, verdict: str) -> 
     assert compare(records, METRICS["psnr"], key, "sample", "ours").verdict == verdict
 
 
-@pytest.mark.parametrize(("scale", "ranks"), [("aligned_rgb", [1, None, 2]), ("raw", [2, 1, None])])
-def test_an_exact_fit_is_not_ranked_and_is_counted(scale: Any, ranks: list[int | None]) -> None:
+@pytest.mark.parametrize(
+    ("scale", "exact", "ranks", "said"),
+    [
+        ("aligned_rgb", 2, [1, None, 2], "exact fit"),
+        ("aligned_rgb", 4, [1, None, 2], "exact fit"),
+        ("raw", 2, [1, None, 2], "truth to the bit"),
+        ("raw", 4, [2, 1, None], None),
+    ],
+)
+def test_a_mean_that_is_infinite_by_a_fit_or_by_a_part_is_not_ranked_and_is_counted(
+    scale: Any, exact: int, ranks: list[int | None], said: str | None
+) -> None:
     variant = Variant(scale=scale)
-    levels = {"ours": [21.0] * 4, "constant": [math.inf, 12.0, math.inf, 12.0], "input": [12.0] * 4}
+    levels = {"ours": [21.0] * 4, "constant": [math.inf] * exact + [12.0] * (4 - exact), "input": [12.0] * 4}
     records = [
         Record("inverse", "single-image", method, f"s{i}", f"o{i}", {metric_key("albedo", "psnr", variant): value})
         for method, values in levels.items()
@@ -598,4 +608,5 @@ def test_an_exact_fit_is_not_ranked_and_is_counted(scale: Any, ranks: list[int |
     assert [r.cells[0].measured_rank for r in found.rows] == ranks
     assert "| Constant 0.5 | " in (text := to_markdown(found))
     assert "∞" in text
-    assert ("Constant 0.5 (Albedo PSNR: 2 of 4 samples)" in text) == (scale != "raw")
+    assert (f"Constant 0.5 (Albedo PSNR: {exact} of 4 samples)" in text) == (said is not None)
+    assert said is None or said in text

@@ -1,6 +1,7 @@
 """Claims and verdict: what holds, what fails, what was not run, and what a stranger's row is asked."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from unirender_evaluation.claims import (
     stranger_claims,
 )
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.verdict import Finding, ceiling_breaches, findings, verdict_text
+from unirender_evaluation.verdict import Finding, ceiling_breaches, findings, summary, verdict_text
 
 CHECK = {
     "passed": True,
@@ -277,12 +278,24 @@ def test_what_the_optimiser_does_not_look_for_is_said_beside_the_figure() -> Non
 
 
 def test_identical_pictures_do_not_end_the_run() -> None:
-    """An infinite PSNR has no interval: said, not raised."""
-    for a, b in ((math.inf, math.inf), (math.inf, 19), (20, math.inf)):
-        records = [*rows("a", ALBEDO, np.array([20, a])), *rows("b", ALBEDO, np.array([19, b]))]
-        found = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
-        assert found[0].comparison is None
-        assert "infinite PSNR, not compared inverse/single-image albedo PSNR: a against b" in str(found[0])
+    """An infinite PSNR has no interval. What a row has exact is left out of its claims; against what is exact, and of
+    nothing else, there are none."""
+    claim = Claim("inverse", "single-image", "albedo", "psnr", "a", "b")
+
+    def found(a: Sequence[float], b: Sequence[float]) -> Finding:
+        records = [r for method, values in (("a", a), ("b", b)) for r in rows(method, ALBEDO, np.array(values))]
+        judged = findings(records, [claim])
+        assert len(summary(records, judged)) == 2 * (judged[0].holds is True), "by the same samples"
+        return judged[0]
+
+    levels = [20.0, 21.0, 22.5, 20.0, 21.5, 22.0]
+    part = found([*levels, math.inf, math.inf], [19.0] * 7 + [math.inf])
+    assert (part.holds, part.asked, part.comparison and part.comparison.difference.n) == (True, 8, 6)
+    assert "(n 6 of 8, 3 objects" in str(part)
+    for a, b in (([20, 20.0], [19, math.inf]), ([math.inf] * 2, [math.inf] * 2), ([math.inf] * 2, [19, 19])):
+        none = found(a, b)
+        assert none.comparison is None
+        assert "infinite PSNR, not compared inverse/single-image albedo PSNR: a against b" in str(none)
 
 
 @pytest.mark.parametrize(("objects", "sign"), [(18, "open"), (20, "FAILS")])
@@ -319,6 +332,7 @@ def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> No
     assert "HOLDS  no measured row" not in text
     below = [record for record in records if record.method in ("noise-ceiling", "below")]
     assert "  HOLDS  no measured row exceeds the noise ceiling" in verdict_text(below, run_of(), CHECK)
+    assert "  open   noise ceiling: these results have no row of it" in verdict_text(below[-1:], run_of(), CHECK)
 
 
 def test_one_object_decides_nothing() -> None:

@@ -1,11 +1,9 @@
 """What an answer looks like that is in other units or conventions than the contract's: told before it is scored.
 
-A picture is linear radiance, premultiplied: at a suite's exposure about 1, and black where no object is. A normal that
-is seen faces the viewer.
+A picture is linear radiance, premultiplied: at a suite's exposure about 1, and black where no object is.
 """
 
 import numpy as np
-from jaxtyping import Float
 from scipy.ndimage import binary_dilation
 
 from unirender_evaluation.methods.method import Image, Mask
@@ -14,8 +12,6 @@ TOO_BRIGHT = 20.0  # median in the mask; that of the suites' pictures is below 1
 NEGATIVE = -0.25  # a tenth of the values may be below: networks, denoisers and resampling ring
 BACKGROUND = 0.02  # median radiance behind the object, 39 of 255 as a display value: stray pixels do no harm
 AWAY = 2  # pixels from the object, which antialiasing and resampling do not reach
-
-NEARLY_ALL = 0.75  # of the normals; random ones have a half
 
 
 def picture_doubt(image: Image, mask: Mask) -> str | None:
@@ -54,9 +50,3 @@ def _background_doubt(image: Image, mask: Mask) -> str | None:
     if median <= BACKGROUND:
         return None
     return f"it has radiance {median:.3g} (median) where no object is, expected a premultiplied picture, black there"
-
-
-def facing_away(normal: Float[np.ndarray, "h w 3"], mask: Mask) -> float:
-    """The share of the normals in the mask that point away from the viewer, in [0, 1]."""
-    inside = normal[..., 2][mask[..., 0] > 0]
-    return float((inside < 0).mean()) if inside.size else 0.0

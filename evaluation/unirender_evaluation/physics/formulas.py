@@ -5,6 +5,7 @@ and channels; *unclipped* are pixels where no term exceeds display white. The te
 each with its unit, direction, expected value and a broken twin, stand in `tests`.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -19,6 +20,12 @@ from unirender_evaluation.metrics import weighted_mean
 
 Render = Callable[[Intrinsics], Image]
 FURNACE_RADIANCE = 0.5
+NO_LIGHT = 1e-9  # sum of radiance up to which a picture is black
+
+
+def inside(render: Render) -> Render:
+    """The renderer, black where no object is: a background would thin out the errors of the object."""
+    return lambda maps: (render(maps) * (maps.require("mask")["mask"] > 0)).astype(np.float32)
 
 
 def changed(maps: Intrinsics, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Intrinsics:
@@ -37,9 +44,10 @@ def add_lights(a: Intrinsics, b: Intrinsics) -> Intrinsics:
 
 
 def relative_error(a: Image, b: Image, keep: Float[np.ndarray, "h w"] | None = None) -> float:
-    """`sum |a - b| / sum |b|` over the pixels to keep."""
+    """`sum |a - b| / sum |b|` over the pixels to keep; NaN where both are black there: every law holds of no light."""
     weight = np.ones(a.shape[:2]) if keep is None else keep
-    return float(np.sum(np.abs(a - b) * weight[..., None]) / max(float(np.sum(np.abs(b) * weight[..., None])), 1e-9))
+    error, radiance = (np.sum(np.abs(x) * weight[..., None]) for x in (a - b, b))
+    return math.nan if max(error, radiance) <= NO_LIGHT else float(error / max(float(radiance), NO_LIGHT))
 
 
 def _unclipped(*images: Image) -> Float[np.ndarray, "h w"]:

@@ -3,13 +3,14 @@
 A *problem* makes a file invalid. A *remark* is what a reader must know of a valid one.
 """
 
+import math
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import MASKS, SCALES, SPACES
+from unirender_evaluation.metrics import MASKS, OWN_MASK, SCALES, SPACES
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.results.data import Results, metric_definition, metric_name, protocol_definition
 from unirender_evaluation.results.schema_check import Problem, did_you_mean
@@ -20,7 +21,10 @@ from unirender_evaluation.tables.specs import PROTOCOLS
 if TYPE_CHECKING:
     from unirender_evaluation.suites.suite import Suite
 
+MATERIALS = ("roughness", "metallic")
 WORDS = {"mask": MASKS, "space": SPACES, "scale": SCALES}
+ROUNDING = 1e-5  # relative
+CONCAVE_DEG = 45.0  # mean angle up to which no cosines, of any angles, have a mean above its own
 TOLERANCE = 1e-6  # by which rounding may carry a value beyond a perfect one
 NO_BOUND = ("loss",)  # metrics whose perfect value is another row's, which noise may carry a row past
 VIEW = re.compile(r"_\d+$")  # of one camera of several: `relit_3`
@@ -34,6 +38,7 @@ def content_problems(results: Results) -> list[Problem]:
         *_definition_problems(results),
         *_gathered(results.records, _record_problems),
         *_gathered(results.records, _value_problems(results.run.lpips)),
+        *_gathered(results.records, _impossible_together),
         *_twice(results.records),
         *_light_problems(results),
         *_strangers_to_the_suite(results),
@@ -162,6 +167,22 @@ def _value_problems(backbones: Iterable[str]) -> Callable[[Record], Iterator[tup
                     )
 
     return check
+
+
+def _impossible_together(record: Record) -> Iterator[tuple[str, str]]:
+    """Values of one answer that no answer has together: one of them was changed."""
+    values = record.values
+    for name in MATERIALS:
+        whole, per_pixel = values.get(f"{name}.mse_object", 0), values.get(f"{name}.mse@masked", math.inf)
+        if whole > per_pixel * (1 + ROUNDING) + TOLERANCE:
+            yield f".values['{name}.mse_object']", "the square of a mean error is above the mean of its squares"
+    cosine, angle = values.get("normal.cosine", -1), values.get("normal.angle_deg", 0)
+    if angle <= CONCAVE_DEG and cosine > math.cos(math.radians(angle)) + TOLERANCE:
+        yield ".values['normal.cosine']", "a mean cosine is above the cosine of the mean angle"
+    for key in values if OWN_MASK not in values else ():
+        pasted = key.replace("@whole", "@masked")
+        if ".lpips_" in key and not math.isclose(values[key], values.get(pasted, values[key]), rel_tol=ROUNDING):
+            yield f".values[{key!r}]", "differs from that of the masked picture, though the mask is pasted in both"
 
 
 def _key_problem(key: str, backbones: Iterable[str]) -> str:

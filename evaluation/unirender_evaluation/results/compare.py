@@ -10,7 +10,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError, UsageError
-from unirender_evaluation.comparisons import Comparison, Selection, compare, exact_fit, values_by_method, values_of
+from unirender_evaluation.comparisons import (
+    Comparison,
+    Selection,
+    compare,
+    misleading_exact,
+    values_by_method,
+    values_of,
+)
 from unirender_evaluation.metrics import Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results.data import Results
@@ -126,8 +133,8 @@ def compare_pair(
 
 
 def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, method: str) -> Rank | None:
-    """A row's rank in its own run; None for a bound, for a row on fewer samples than the fullest one, and for an
-    `exact_fit`.
+    """A row's rank in its own run; None for a bound, for a row on fewer samples than the fullest one, and where it
+    is infinite of a part (`misleading_exact`).
 
     Args:
         records: of one `Selection`.
@@ -140,7 +147,8 @@ def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, meth
     fullest = max(map(len, values.values()), default=0)
     ranked = [info.key for info in run.methods if info.kind in RANKED_KINDS]
     competing = [row for row in ranked if row in values and len(values[row]) == fullest]
-    means = {row: mean for row in competing if not exact_fit(key, mean := sum(values[row].values()) / fullest)}
+    telling = [row for row in competing if not misleading_exact(key, values[row].values())]
+    means = {row: sum(values[row].values()) / fullest for row in telling}
     if method not in means:
         return None
     rounded = {row: round(mean, metric.decimals) for row, mean in means.items()}

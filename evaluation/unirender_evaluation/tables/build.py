@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.comparisons import Lights, Selection, exact_fit, over_lights, values_of
+from unirender_evaluation.comparisons import Lights, Selection, misleading_exact, over_lights, values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import Estimate, mean_estimate
@@ -46,6 +46,7 @@ class Cell:
     unavailable: bool = False  # the metric could not be computed here: "n/a" instead of "-"
     published_rank: int | None = None  # 1 = best, 2 = second, on rounded values
     measured_rank: int | None = None
+    exact: int = 0  # samples that are right to the bit, and make a mean that says nothing (`misleading_exact`)
     dagger: bool = False  # published value worse than the constant's
 
 
@@ -132,7 +133,7 @@ def build_table(
     measured = {info.key: _measured_row(spec, chosen, run, info, variant, lights) for info in methods}
     rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
     total = max((row.n for row in rows), default=0)
-    rows = _rank(spec, rows, variant)
+    rows = _rank(spec, rows)
     return Table(
         name=spec.name,
         title=spec.title,
@@ -143,7 +144,7 @@ def build_table(
         columns=spec.columns,
         rows=tuple(rows),
         protocol=protocol_line(declared, variant, run, methods, chosen, published_in, lights is not None),
-        notes=table_notes(spec, chosen, rows, variant, lights is not None),
+        notes=table_notes(spec, rows, variant, lights is not None),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
     )
@@ -213,7 +214,7 @@ def _measured_row(
                 estimate = mean_estimate(list(values.values()), [objects[sample] for sample in values])
             else:
                 estimate = over_lights(values, records, lights)
-            cells.append(Cell(measured=estimate))
+            cells.append(Cell(measured=estimate, exact=misleading_exact(column.key(variant), values.values())))
             n = max(n, estimate.n)
         else:
             cells.append(Cell(unavailable=missing and column.quantity in answered))
@@ -239,9 +240,9 @@ def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping
     return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))
 
 
-def _rank(spec: TableSpec, rows: Sequence[Row], variant: Variant) -> list[Row]:
+def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
     """Ranks 1 and 2 per column on rounded values; a cell on fewer samples than the column's fullest is not ranked, nor
-    is one that is infinite by a fit.
+    is one that is infinite by a part of its samples, or by a fit.
     """
     short = [short_cells(rows, row) for row in rows]
     ranked = [list(row.cells) for row in rows]
@@ -250,7 +251,7 @@ def _rank(spec: TableSpec, rows: Sequence[Row], variant: Variant) -> list[Row]:
         published = {r: cell.published for r, cell in enumerate(cells) if cell.published is not None}
         means = {r: cell.measured.mean for r, cell in enumerate(cells) if cell.measured is not None}
         competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and i not in short[r]}
-        competing = {r: mean for r, mean in competing.items() if not exact_fit(column.key(variant), mean)}
+        competing = {r: mean for r, mean in competing.items() if not cells[r].exact}
         published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
         trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
         grid = column.uniform_grid  # comparable only where the suite's materials are spread over the paper's grid

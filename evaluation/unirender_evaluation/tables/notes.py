@@ -4,9 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from unirender_evaluation.comparisons import exact_fit, values_of
 from unirender_evaluation.metrics import Variant
-from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import UNTOLD, unprinted_note
 from unirender_evaluation.tables.counts import cell_counts, label_n
 from unirender_evaluation.tables.specs import TableSpec
@@ -20,14 +18,11 @@ if TYPE_CHECKING:
     from unirender_evaluation.tables.build import Row
 
 
-def table_notes(
-    spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant, over_lights: bool = False
-) -> tuple[str, ...]:
+def table_notes(spec: TableSpec, rows: Sequence["Row"], variant: Variant, over_lights: bool = False) -> tuple[str, ...]:
     """The notes, in their order.
 
     Args:
         spec: of the table.
-        records: behind it.
         rows: ranked.
         variant: how its numbers are taken.
         over_lights: whether its intervals are over lights, too.
@@ -55,7 +50,7 @@ def table_notes(
         )
     origins = dict.fromkeys(row.stored for row in rows if row.stored)
     stored = {origin: "; ".join(row.label for row in rows if row.stored == origin) for origin in origins}
-    notes += _exact_fits(spec, records, rows, variant)
+    notes += _exact(spec, rows, variant)
     return (*notes, *(f"{labels}: stored, not measured in this run ({origin})" for origin, labels in stored.items()))
 
 
@@ -71,15 +66,15 @@ def _counts_said(spec: TableSpec, rows: Sequence["Row"], row: "Row") -> str:
     return ", ".join(found)
 
 
-def _exact_fits(spec: TableSpec, records: Sequence[Record], rows: Sequence["Row"], variant: Variant) -> tuple[str, ...]:
-    """The note on infinite means under a fitted scale; empty where there is none."""
-    found = []
+def _exact(spec: TableSpec, rows: Sequence["Row"], variant: Variant) -> tuple[str, ...]:
+    """The notes on infinite means that say nothing: by a fitted scale, and by a part of the samples."""
+    by_fit, by_part = [], []
     for row in rows:
         for column, cell in zip(spec.columns, row.cells, strict=True):
-            key = column.key(variant)
-            if cell.measured is not None and exact_fit(key, cell.measured.mean):
-                exact = sum(map(math.isinf, values_of(records, row.key, key).values()))
+            if cell.measured is not None and cell.exact:
+                found = by_part if column.variant(variant).scale == "raw" else by_fit
                 what = f"{column.group} {column.metric.label}"
-                found.append(f"{row.label} ({what}: {exact} of {cell.measured.n} samples)")
-    said = "∞ under a fitted scale is an exact fit, as any constant has on an object of one colour, and is not ranked"
-    return (f"{said}: {'; '.join(found)}.",) if found else ()
+                found.append(f"{row.label} ({what}: {cell.exact} of {cell.measured.n} samples)")
+    fit = "∞ under a fitted scale is an exact fit, as any constant has on an object of one colour, and is not ranked"
+    part = "∞ by samples that are the truth to the bit says nothing of the others, and is not ranked"
+    return tuple(f"{said}: {'; '.join(found)}." for said, found in ((fit, by_fit), (part, by_part)) if found)

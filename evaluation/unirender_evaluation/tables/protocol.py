@@ -1,12 +1,12 @@
 """The protocol line: everything one must know to compare a number with one's own."""
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Literal
 
-from unirender_evaluation.metrics import FACING_AWAY, LPIPS_SCALES, OWN_MASK, TURNED, Variant, metric_key
+from unirender_evaluation.metrics import LPIPS_SCALES, OWN_MASK, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import CONFIDENCE, CROSSED, METHOD
+from unirender_evaluation.tables.mistakes import mistakes_said, truth_said
 from unirender_evaluation.tables.published import taken_how
 from unirender_evaluation.tables.specs import Protocol
 
@@ -15,16 +15,6 @@ SCALE_TEXT = {
     "raw": "none",
     "aligned": "one least-squares factor per image, fitted in linear light in the true mask",
     "aligned_rgb": "one least-squares factor per image and channel, fitted in linear light in the true mask",
-}
-NORMALS = metric_key("normal", "cosine")
-MOST = 0.75  # of a row's pictures: fewer are its errors
-COLOURS = {
-    "albedo": "albedo",
-    "specular": "s",
-    "diffuse": "d",
-    "edit_metallic": "another metallic",
-    "edit_roughness": "another roughness",
-    "relit": "relit",
 }
 MASKED_QUANTITIES = ("albedo", "specular", "diffuse", "roughness", "metallic")  # maps, which a method's mask belongs to
 
@@ -36,40 +26,13 @@ def mask_source(method: str, records: Iterable[Record]) -> Literal["own", "paste
 
 
 def doubts(method: str, records: Iterable[Record]) -> list[str]:
-    """What a run's records say of a stranger's maps that is probably a mistake, a sentence each, for its note."""
+    """What a run's records say of a stranger's answers that is probably a mistake, a sentence each, for its note."""
     of_method = [record for record in records if record.method == method]
     own = [record.values for record in of_method]
     empty, masks = sum(values.get(OWN_MASK) == 0 for values in own), sum(OWN_MASK in values for values in own)
-    away, normals = sum(FACING_AWAY in values for values in own), sum(NORMALS in values for values in own)
     found = [f"its own mask misses the object on {empty} of {masks} pictures (is it 0?)"] if empty else []
-    if away:
-        found.append(
-            f"its normals face away from the viewer on {away} of {normals} pictures (OpenCV axes? normal_axes in "
-            "conventions.toml turns those of a folder)"
-        )
-    turned = sum(TURNED in values for values in own)
-    if turned > MOST * normals:
-        found.append(
-            f"its normals are nearer to the truth with another sign of x or y on {turned} of {normals} pictures (+y is "
-            "up; normal_axes in conventions.toml turns those of a folder)"
-        )
-    decoded = [f"{name} ({count})" for quantity, name in COLOURS.items() if (count := _decoded(quantity, of_method))]
-    if decoded:
-        found.append(
-            f"taken for display values these of its answers are nearer to the truth: {', '.join(decoded)} (encoded? "
-            "expected linear; exr_colour in conventions.toml decodes those of a folder)"
-        )
+    found += [said for said in (mistakes_said(of_method), truth_said(of_method)) if said]
     return found
-
-
-def _decoded(quantity: str, records: Sequence[Record]) -> str:
-    """On how many pictures colours would be nearer to the truth as display values; empty where it is not on most."""
-    scored, gained = (
-        Counter((r.table, r.protocol) for r in records if metric_key(quantity, metric) in r.values)
-        for metric in ("psnr", "decoded")
-    )
-    asked = [question for question, count in scored.items() if gained[question] > MOST * count]
-    return f"{sum(gained[q] for q in asked)} of {sum(scored[q] for q in asked)} pictures" if asked else ""
 
 
 def protocol_line(

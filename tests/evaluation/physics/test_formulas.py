@@ -39,6 +39,23 @@ def test_perfect_renderer_passes_and_twin_fails(name: str, suite: Suite) -> None
     assert not test.fails(good, good)
 
 
+def test_no_law_is_kept_by_a_picture_without_light_nor_by_a_background(suite: Suite) -> None:
+    """Black pictures obey all laws but the furnace's; a background that obeys them would thin out the object's
+    errors."""
+    stage = Stage(suite, suite.scenes[0])
+    black = renderer_tests(lambda maps: np.zeros((maps.height, maps.width, 3), np.float32), stage)
+    assert black == {"white_furnace": 1.0, "roughness_response": 0.0}
+    bright = renderer_tests(lambda maps: np.full((maps.height, maps.width, 3), 2, np.float32), stage)
+    assert {"superposition", "exposure_linearity"}.isdisjoint(bright), "no pixel that is not clipped"
+
+    def over_light(maps: Intrinsics) -> Image:
+        empty = maps.require("mask")["mask"] == 0
+        return TESTS["superposition"].twin(maps) + 0.5 * empty * maps.require("environment")["environment"].mean()
+
+    broken = renderer_tests(TESTS["superposition"].twin, stage)
+    assert renderer_tests(over_light, stage) == broken
+
+
 def test_roughness_response(suite: Suite) -> None:
     """The composite's truth is its own composite: correlation 1; a renderer blind to roughness scores 0."""
     stage, test = Stage(suite, suite.scenes[1]), TESTS["roughness_response"]

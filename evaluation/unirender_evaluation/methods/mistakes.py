@@ -1,0 +1,159 @@
+"""Usual mistakes of predictions: by how many dB a stranger's answer is nearer to the truth once one is undone.
+
+One answer tells little: a bad albedo may be nearer to the truth upside down. Over many pictures an answer that is
+sound, however bad, is further away. So all gains are recorded, and a note judges them together (`tables.mistakes`).
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import permutations, product
+
+import numpy as np
+from jaxtyping import Float
+
+from unirender.color import srgb_encode
+from unirender.intrinsics import Intrinsics
+from unirender.lighting import resample_environment
+from unirender_evaluation import metrics
+from unirender_evaluation.light_metrics import DIMMEST, SHAPE, scaled_log_rmse
+from unirender_evaluation.methods.method import Mask
+from unirender_evaluation.metrics import LOWER, Metric
+
+Map = Float[np.ndarray, "h w c"]
+Light = Float[np.ndarray, "h w 3"]
+EXACT = 1e-9  # error of what is right but for rounding
+MOST_DB = 20.0  # of a gain: a few answers that are exact otherwise do not outvote the others
+TONE, PLACE = 4.0, 1.0  # mean dB that tell: a biased map gains by another scale, too, but by no other side or axes
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A usual mistake.
+
+    Attributes:
+        said: what undoes it, as a note says it.
+        least: mean gain in dB from which the note does.
+    """
+
+    said: str
+    least: float
+
+
+MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the gain; of equal ones the first is said
+    "if_decoded": Mistake("taken for display values (encoded? expected linear)", TONE),
+    "if_encoded": Mistake("encoded once more (decoded twice?)", TONE),
+    "if_bgr": Mistake("with red and blue exchanged (BGR?)", PLACE),
+    "if_other_signs": Mistake("with other signs (+x is right, +y up, +z to the viewer)", PLACE),
+    "if_other_axes": Mistake("with x, y and z exchanged (z up?)", PLACE),
+    "if_mirrored": Mistake("mirrored left to right", PLACE),
+    "if_upside_down": Mistake("upside down (rows from the bottom?)", PLACE),
+    "if_shifted": Mistake("moved by one pixel (cropped or resampled by other rules?)", PLACE),
+    "if_turned": Mistake("turned by half a turn (its middle is behind the camera)", PLACE),
+    "if_inverted": Mistake("taken for 1 minus it (smoothness?)", TONE),
+    "if_root": Mistake("as its square root (the GGX alpha?)", TONE),
+    "if_swapped": Mistake("exchanged with metallic", TONE),
+}
+GAINS: Mapping[str, Metric] = {
+    name: Metric(
+        name, name.replace("_", " "), "dB", LOWER, -MOST_DB, (), 1, f"gain of a stranger's answer {mistake.said}"
+    )
+    for name, mistake in MISTAKES.items()
+}
+
+
+def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
+    """Mistake -> gain in masked error of display values.
+
+    Args:
+        found: linear, not premultiplied.
+        true: the same.
+        mask: true coverage.
+    """
+    linear, aim = np.clip(found, 0, 1), srgb_encode(np.clip(true, 0, 1))
+    shown = srgb_encode(linear)
+
+    def error(x: Map) -> float:
+        return metrics.mse(x, aim, mask)
+
+    undone = {
+        "if_decoded": [linear],
+        "if_encoded": [srgb_encode(shown)],
+        "if_bgr": [shown[..., ::-1]],
+        "if_mirrored": [shown[:, ::-1]],
+        "if_upside_down": [shown[::-1]],
+        "if_shifted": _moved(shown),
+    }
+    as_it_is = error(shown)
+    return {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
+
+
+def normal_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
+    """Mistake -> gain in 1 minus the mean cosine; arguments as in `colour_gains`."""
+
+    def error(x: Map) -> float:
+        return 1 - metrics.weighted_mean(metrics.cosine(x, true), mask)
+
+    undone = {
+        "if_mirrored": [found[:, ::-1], found[:, ::-1] * np.array([-1, 1, 1], np.float32)],
+        "if_upside_down": [found[::-1], found[::-1] * np.array([1, -1, 1], np.float32)],
+        "if_shifted": _moved(found),
+    }
+    as_it_is = error(found)
+    gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
+    p, t = (x / np.maximum(np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True), EXACT) for x in (found, true))
+    shares = np.einsum("hwi,hwj->ij", p * mask, t) / mask.sum(dtype=np.float64)  # of channel i in axis j
+    axes: dict[str, list[float]] = {"if_other_signs": [], "if_other_axes": []}
+    as_they_are, *others = product(permutations(range(3)), product((1, -1), repeat=3))
+    for order, signs in others:
+        cosine = float(np.sum(np.array(signs) * shares[list(order), range(3)]))
+        axes["if_other_signs" if order == as_they_are[0] else "if_other_axes"].append(1 - cosine)
+    return gains | {name: _gain(as_it_is, errors) for name, errors in axes.items()}
+
+
+def light_gains(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, float]:
+    """Mistake -> gain in the squared log-RMSE of the light; none of a black one.
+
+    Args:
+        found: lat-long radiance, any size; negative values count as 0.
+        true: the same.
+    """
+    p, t = (resample_environment(np.maximum(light, 0), SHAPE) for light in (found, true))
+    if not p.max() > DIMMEST:
+        return {}
+
+    def error(x: Map) -> float:
+        return scaled_log_rmse(x, t) ** 2
+
+    undone = {
+        "if_bgr": p[..., ::-1],
+        "if_mirrored": p[:, ::-1],
+        "if_upside_down": p[::-1],
+        "if_turned": np.roll(p, SHAPE[1] // 2, 1),
+    }
+    as_it_is = error(p)
+    return {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
+
+
+def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:
+    """Mistake -> gain in the masked squared error of roughness, or of roughness and metallic together."""
+    p, t = found.roughness, true.roughness
+    if p is None or t is None:
+        return {}
+    undone = {"if_inverted": 1 - p, "if_root": np.sqrt(p)}
+    gains = {name: _gain(metrics.mse(p, t, mask), [metrics.mse(x, t, mask)]) for name, x in undone.items()}
+    m, n = found.metallic, true.metallic
+    if m is None or n is None:
+        return gains
+    as_it_is, swapped = (
+        sum(metrics.mse(x, y, mask) for x, y in pairs) for pairs in (((p, t), (m, n)), ((p, n), (m, t)))
+    )
+    return gains | {"if_swapped": _gain(as_it_is, [swapped])}
+
+
+def _gain(error: float, undone: Iterable[float]) -> float:
+    """dB by which the least of the errors is below another one, in [-MOST_DB, MOST_DB]."""
+    return float(np.clip(10 * np.log10((error + EXACT) / (min(undone) + EXACT)), -MOST_DB, MOST_DB))
+
+
+def _moved(x: Map) -> list[Map]:
+    return [np.roll(x, by, (0, 1)) for by in product((-1, 0, 1), repeat=2) if any(by)]

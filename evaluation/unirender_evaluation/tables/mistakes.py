@@ -1,0 +1,76 @@
+"""What the gains of a stranger's answers with a mistake undone say together: a sentence for the row's note."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from unirender_evaluation.methods.mistakes import GAINS, MISTAKES
+from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.records import Record
+
+QUANTITIES = {
+    "albedo": "albedo",
+    "normal": "normal",
+    "roughness": "roughness",
+    "specular": "s",
+    "diffuse": "d",
+    "environment": "light",
+    "edit_metallic": "another metallic",
+    "edit_roughness": "another roughness",
+    "relit": "relit",
+}
+TRUE: tuple[tuple[str, str, Callable[[float], bool]], ...] = (  # of maps, which have no noise ceiling
+    ("albedo", metric_key("albedo", "psnr"), lambda db: db > 50),
+    ("normal", metric_key("normal", "angle_deg"), lambda degrees: degrees < 0.5),
+)
+MOST = 0.75  # of the pictures that say anything
+LEAST_DB = 0.1  # smaller gains say nothing, as those of a constant or of an object of one colour
+FEWEST = 4  # objects whose pictures say something: of fewer it may be chance
+
+
+def mistakes_said(records: Sequence[Record]) -> str:
+    """The sentence about one method's records; empty where nothing is probably a mistake. Of each quantity and question
+    the mistake that explains most."""
+    told: dict[str, dict[str, list[list[float]]]] = {}  # mistake -> quantity -> gains of each question
+    questions: dict[tuple[str, str], list[Record]] = {}
+    for record in records:
+        questions.setdefault((record.table, record.protocol), []).append(record)
+    for quantity, name in QUANTITIES.items():
+        for of_question in questions.values():
+            likely = _likely(quantity, of_question)
+            if likely:
+                mistake = max(likely, key=lambda which: np.mean(likely[which]))
+                told.setdefault(mistake, {}).setdefault(name, []).append(likely[mistake])
+    found = [f"{MISTAKES[mistake].said}: {_counts(of_names)}" for mistake, of_names in told.items()]
+    return f"its answers are nearer to the truth {', or '.join(found)}" if found else ""
+
+
+def truth_said(records: Sequence[Record]) -> str:
+    """The sentence on maps that no picture tells so well; empty where they are too few to be noted."""
+    found = []
+    for name, key, is_true in TRUE:
+        of_stranger = metric_key(name, GAINS["if_shifted"])  # Mitsuba's own maps have no gains
+        asked = [record for record in records if key in record.values and of_stranger in record.values]
+        true = [record.object for record in asked if is_true(record.values[key])]
+        if len(set(true)) >= FEWEST:
+            found.append(f"{name} ({len(true)} of {len(asked)} pictures)")
+    return f"its answers are the truth but for rounding: {', '.join(found)} (was it told?)" if found else ""
+
+
+def _counts(of_names: Mapping[str, Sequence[Sequence[float]]]) -> str:
+    """On how many pictures, and by how much, by the name of the quantity."""
+    pooled = {name: np.concatenate(list(gains)) for name, gains in of_names.items()}
+    return ", ".join(f"{name} ({np.sum(g > 0)} of {len(g)}, {g.mean():+.1f} dB)" for name, g in pooled.items())
+
+
+def _likely(quantity: str, records: Sequence[Record]) -> dict[str, list[float]]:
+    """Mistake -> its gains that say something, of those that are probably made."""
+    found = {}
+    for name, metric in GAINS.items():
+        key = metric_key(quantity, metric)
+        telling = [record for record in records if abs(record.values.get(key, 0.0)) > LEAST_DB]
+        gains = [record.values[key] for record in telling]
+        enough = len({record.object for record in telling}) >= FEWEST and sum(g > 0 for g in gains) > MOST * len(gains)
+        if enough and np.mean(gains) > MISTAKES[name].least:
+            found[name] = gains
+    return found
