@@ -17,8 +17,18 @@ FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one:
 
 
 def cache_dir() -> Path:
-    """Returns `${UNIRENDER_CACHE:-~/.cache/unirender}` (not created)."""
-    return Path(os.environ.get("UNIRENDER_CACHE") or Path.home() / ".cache" / "unirender")
+    """Returns `${UNIRENDER_CACHE:-~/.cache/unirender}` (not created), `~` replaced by the home directory.
+
+    Raises:
+        UnirenderError: there is none, as of a user without an entry in the system's list, in a container say.
+    """
+    named = os.environ.get("UNIRENDER_CACHE") or "~/.cache/unirender"
+    try:
+        return Path(named).expanduser()
+    except RuntimeError as error:
+        raise UnirenderError(
+            f"{named}: this user has no home directory, expected one for what is kept; set UNIRENDER_CACHE to a folder"
+        ) from error
 
 
 @contextlib.contextmanager

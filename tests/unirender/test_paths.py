@@ -8,7 +8,7 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.files import new_folder
-from unirender.paths import cached_folder
+from unirender.paths import cache_dir, cached_folder
 from unirender.whole_files import replace_file
 from unirender_evaluation.suites.truth_file import write_tar
 from unirender_reference.shards import write_shard
@@ -46,6 +46,22 @@ def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
     with cached_folder(tmp_path / "next"):
         pass
     assert {path.name for path in tmp_path.iterdir()} == {"key", "next", "other", new.name}
+
+
+def test_the_cache_is_where_the_variable_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`~` as well, which only a shell replaces; a user of a container may have no home."""
+    monkeypatch.setenv("HOME", "/home/ada")
+    monkeypatch.setenv("UNIRENDER_CACHE", "~/big disk")
+    assert cache_dir() == Path("/home/ada/big disk")
+    monkeypatch.delenv("UNIRENDER_CACHE")
+    assert cache_dir() == Path("/home/ada/.cache/unirender")
+
+    def nobody(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", nobody)
+    with pytest.raises(UnirenderError, match=r"this user has no home directory, .*; set UNIRENDER_CACHE to a folder"):
+        cache_dir()
 
 
 @pytest.mark.parametrize("umask", [0o002, 0o022, 0o077])
