@@ -82,3 +82,14 @@ def test_others_may_read_and_write_what_the_umask_lets_them(tmp_path: Path, umas
     modes = {path.name: path.stat().st_mode & 0o7777 for path in tmp_path.iterdir()}
     files = dict.fromkeys(["file", "shard.tar", "truth.tar"], 0o666 & ~umask)
     assert modes == files | dict.fromkeys(["cached", "result"], 0o2777 & ~umask)
+
+
+def test_a_shard_is_written_where_folders_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Windows."""
+    monkeypatch.delattr(os, "O_DIRECTORY")
+
+    def refused(*args: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refused)
+    assert len(write_shard(tmp_path / "shard.tar", [])) == 64
