@@ -2,8 +2,8 @@
 
 Dr.Jit's CPU backend loads libLLVM as soon as drjit is imported. LLVM 14 to 16 *abort the process* on
 AVX-512 machines ("Cannot select fminimum"), so the library is chosen here, before that can happen: the variable
-`DRJIT_LIBLLVM_PATH`, then the wheel `karellen-llvm-core`, then the newest system LLVM. Everything older than
-`MINIMUM_LLVM` is refused.
+`DRJIT_LIBLLVM_PATH`, then the wheel `karellen-llvm-core`, then the newest LLVM of the system or of the folder that
+Python is installed in, as conda's is. Everything older than `MINIMUM_LLVM` is refused.
 
 Call `mitsuba()` instead of importing mitsuba.
 """
@@ -138,10 +138,11 @@ def _wheel_libraries() -> Iterator[Path]:
 
 
 def _system_libraries() -> list[Path]:
+    patterns = [(Path("/"), pattern.lstrip("/")) for pattern in SYSTEM_PATTERNS]
     found = {
         path.resolve()
-        for pattern in SYSTEM_PATTERNS
-        for path in Path("/").glob(pattern.lstrip("/"))
+        for folder, pattern in [*patterns, (Path(sys.prefix), "lib/libLLVM*")]
+        for path in folder.glob(pattern)
         if ".so" in path.name or path.suffix == ".dylib"
     }
     named = ctypes.util.find_library("LLVM")
