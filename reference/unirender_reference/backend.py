@@ -160,7 +160,8 @@ def mitsuba(variant: str | None = None) -> Any:
     """The mitsuba module with its variant set (`llvm_ad_rgb` unless asked otherwise). Cheap after the first call.
 
     Raises:
-        UnirenderError: mitsuba is not installed, the variant does not exist, or no usable LLVM is found.
+        UnirenderError: mitsuba is not installed or cannot be loaded, the variant does not exist, or no usable LLVM is
+            found.
     """
     name = variant_name(variant)
     module = sys.modules.get("mitsuba")
@@ -173,7 +174,14 @@ def mitsuba(variant: str | None = None) -> Any:
     except UnirenderError:
         if name.startswith("llvm"):
             raise
-    import mitsuba as module
+    try:
+        import mitsuba as module
+    except (ImportError, NameError) as error:  # Dr.Jit stumbles over the name of what it could not load
+        why = error.__cause__ or error.__context__ or error
+        raise UnirenderError(
+            f"mitsuba: cannot be loaded ({why}), expected its package and the shared libraries that it needs; install "
+            "what is missing (libatomic.so.1: the system's package libatomic1 or libatomic)"
+        ) from error
 
     loaded = _loaded_llvm_major()
     if name.startswith("llvm") and 0 < loaded < MINIMUM_LLVM:

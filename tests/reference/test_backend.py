@@ -88,6 +88,21 @@ def test_refusal_is_an_exception_and_not_an_abort(tmp_path: Path) -> None:
     assert "LLVM 14" in run.stderr
 
 
+def test_what_mitsuba_cannot_load_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a slim container has no libatomic: Dr.Jit fails on its own message."""
+    (tmp_path / "mitsuba.py").write_text(
+        "try:\n    raise ImportError('libatomic.so.1: cannot open shared object file')\n"
+        "except ImportError:\n    _drjit_ext.__file__\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mitsuba", raising=False)
+    monkeypatch.setattr(backend, "choose_llvm", lambda: None)
+    with pytest.raises(
+        UnirenderError, match=r"cannot be loaded \(libatomic.so.1: cannot open .*install what is missing"
+    ):
+        backend.mitsuba()
+
+
 def test_unknown_variant_is_refused() -> None:
     with pytest.raises(UnirenderError, match="no_such_variant"):
         backend.mitsuba("no_such_variant")
