@@ -11,12 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hatchling.builders.sdist import SdistBuilder
 from PIL import Image
 
 from unirender.exr import read_exr
 
 ROOT = Path(__file__).resolve().parents[1]
 MAX_WHEEL_MB = 95
+MAX_SDIST_MB = 108  # of its files: they shrink by a tenth or more (weights do), and a package index takes 100
 MAX_CHECKPOINT_MB = 80  # all of them
 MAX_HELP_SECONDS = 0.7
 
@@ -84,6 +86,16 @@ def test_the_wheel_holds_its_data_and_stays_small(wheel: Path) -> None:
     checkpoint_mb = sum(size for name, size in sizes.items() if name.startswith("unirender/checkpoints/")) / 1e6
     assert 0.1 < checkpoint_mb <= MAX_CHECKPOINT_MB
     assert not [name for name in sizes if name.endswith((".pyc", ".DS_Store")) or "__pycache__" in name]
+
+
+def test_the_source_distribution_stays_small() -> None:
+    files = {
+        file.distribution_path: os.path.getsize(file.path) for file in SdistBuilder(str(ROOT)).recurse_included_files()
+    }
+    size_mb = sum(files.values()) / 1e6
+    assert size_mb <= MAX_SDIST_MB, f"{size_mb:.1f} MB, expected at most {MAX_SDIST_MB}"
+    assert {"Makefile", "constraints.txt", "evaluation/results/tiny/results.json.gz"} <= set(files)
+    assert "evaluation/unirender_evaluation/data/suites/tiny.tar" in files
 
 
 def test_decompose_runs_from_the_wheel(installed: Path, tmp_path: Path) -> None:

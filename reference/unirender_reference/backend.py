@@ -2,8 +2,8 @@
 
 Dr.Jit's CPU backend loads libLLVM as soon as drjit is imported. LLVM 14 to 16 *abort the process* on
 AVX-512 machines ("Cannot select fminimum"), so the library is chosen here, before that can happen: the variable
-`DRJIT_LIBLLVM_PATH`, then the wheel `karellen-llvm-core`, then the newest system LLVM. Everything older than
-`MINIMUM_LLVM` is refused.
+`DRJIT_LIBLLVM_PATH`, then the wheel `karellen-llvm-core`, then the newest LLVM of the system or of the folder that
+Python is installed in, as conda's is. Everything older than `MINIMUM_LLVM` is refused.
 
 Call `mitsuba()` instead of importing mitsuba.
 """
@@ -138,10 +138,11 @@ def _wheel_libraries() -> Iterator[Path]:
 
 
 def _system_libraries() -> list[Path]:
+    patterns = [(Path("/"), pattern.lstrip("/")) for pattern in SYSTEM_PATTERNS]
     found = {
         path.resolve()
-        for pattern in SYSTEM_PATTERNS
-        for path in Path("/").glob(pattern.lstrip("/"))
+        for folder, pattern in [*patterns, (Path(sys.prefix), "lib/libLLVM*")]
+        for path in folder.glob(pattern)
         if ".so" in path.name or path.suffix == ".dylib"
     }
     named = ctypes.util.find_library("LLVM")
@@ -159,7 +160,8 @@ def mitsuba(variant: str | None = None) -> Any:
     """The mitsuba module with its variant set (`llvm_ad_rgb` unless asked otherwise). Cheap after the first call.
 
     Raises:
-        UnirenderError: mitsuba is not installed, the variant does not exist, or no usable LLVM is found.
+        UnirenderError: mitsuba is not installed or cannot be loaded, the variant does not exist, or no usable LLVM is
+            found.
     """
     name = variant_name(variant)
     module = sys.modules.get("mitsuba")
@@ -172,7 +174,14 @@ def mitsuba(variant: str | None = None) -> Any:
     except UnirenderError:
         if name.startswith("llvm"):
             raise
-    import mitsuba as module
+    try:
+        import mitsuba as module
+    except (ImportError, NameError) as error:  # Dr.Jit stumbles over the name of what it could not load
+        why = error.__cause__ or error.__context__ or error
+        raise UnirenderError(
+            f"mitsuba: cannot be loaded ({why}), expected its package and the shared libraries that it needs; install "
+            "what is missing (libatomic.so.1: the system's package libatomic1 or libatomic)"
+        ) from error
 
     loaded = _loaded_llvm_major()
     if name.startswith("llvm") and 0 < loaded < MINIMUM_LLVM:

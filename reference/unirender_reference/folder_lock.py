@@ -68,7 +68,7 @@ def _acquire(folder: Path, path: Path) -> int:
 
     while True:
         try:
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError as error:
             raise UnirenderError(f"{path}: cannot be made ({error.strerror}); choose another --out") from error
         try:

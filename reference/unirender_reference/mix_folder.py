@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.whole_files import aside, replace_file
 from unirender_reference.dataset_sides import MIXES, check_sides
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
@@ -210,10 +209,10 @@ def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
     if any(id(texture.texels) in borrowed for texture in pictures_of(mix)):
         header.append(f"with a picture of {_named(drawn.files[donor])}")
     try:
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        temporary = aside(folder, "partial")
         try:
+            temporary.mkdir()
             write_obj(mix, temporary, folder.name, header)
-            temporary.chmod(0o755)
             temporary.rename(folder)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)

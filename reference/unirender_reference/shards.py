@@ -11,7 +11,6 @@ import io
 import json
 import os
 import tarfile
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import file_sha256
+from unirender.whole_files import aside, file_sha256
 
 MANIFEST = "manifest.json"
 FAILURES = "failures.jsonl"
@@ -143,18 +142,17 @@ def write_shard(path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -
         UnirenderError: a key has a dot (WebDataset cuts there: groups would merge) or occurs twice, or the disk fails.
     """
     try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        temporary = aside(path, "part")
         try:
-            with os.fdopen(handle, "wb") as stream:
+            with temporary.open("xb") as stream:
                 _write_tar(stream, path, groups)
                 stream.flush()
                 os.fsync(stream.fileno())
-            sha256 = file_sha256(Path(temporary))
-            os.chmod(temporary, 0o644)
+            sha256 = file_sha256(temporary)
             os.replace(temporary, path)
             _sync_folder(path.parent)
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
     except OSError as error:
         raise UnirenderError(
@@ -237,7 +235,9 @@ def _replace(path: Path, data: bytes) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
     finally:

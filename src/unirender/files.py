@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import os
 import secrets
 import shutil
 from collections.abc import Iterator, Mapping
@@ -96,12 +95,11 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None, tidy: bool = 
             path.parent.mkdir(parents=True, exist_ok=True)
             if tidy:
                 forget_half_made(path.parent, {path.name})
-            temporary.mkdir(mode=0o700)
+            temporary.mkdir()
         except OSError as error:
             raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
         with naming(Path(shown)):
             yield temporary
-        os.chmod(temporary, 0o755)
         try:
             move_into_place(temporary, path)
         except OSError as error:

@@ -1,7 +1,9 @@
 """What the machine has, or leaves to this process."""
 
+import importlib.util
 import math
 import os
+import sys
 from pathlib import Path
 
 GIB = 2**30
@@ -23,6 +25,16 @@ def memory_bytes() -> float:
 def unswapped_bytes() -> float:
     """The same without swap."""
     return _allowed_bytes(0)
+
+
+def peak_bytes() -> float:
+    """The most memory that this process has had so far; NaN where the system does not tell, as Windows."""
+    if importlib.util.find_spec("resource") is None:
+        return math.nan
+    import resource
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return float(unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 def memory_excess(wanted: float) -> str | None:

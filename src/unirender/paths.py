@@ -3,22 +3,32 @@
 import contextlib
 import os
 import re
+import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from unirender.errors import UnirenderError
 
-HALF_MADE = ".*.????????"  # folders of `tempfile`
+HALF_MADE = ".*.????????"  # folders of `cached_folder`
 HALF_WRITTEN = re.compile(r"\.(.+)\.[0-9a-f]{12}")  # folders of `files.new_folder`
 FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one: it takes minutes
 
 
 def cache_dir() -> Path:
-    """Returns `${UNIRENDER_CACHE:-~/.cache/unirender}` (not created)."""
-    return Path(os.environ.get("UNIRENDER_CACHE") or Path.home() / ".cache" / "unirender")
+    """Returns `${UNIRENDER_CACHE:-~/.cache/unirender}` (not created), `~` replaced by the home directory.
+
+    Raises:
+        UnirenderError: there is none, as of a user without an entry in the system's list, in a container say.
+    """
+    named = os.environ.get("UNIRENDER_CACHE") or "~/.cache/unirender"
+    try:
+        return Path(named).expanduser()
+    except RuntimeError as error:
+        raise UnirenderError(
+            f"{named}: this user has no home directory, expected one for what is kept; set UNIRENDER_CACHE to a folder"
+        ) from error
 
 
 @contextlib.contextmanager
@@ -29,12 +39,12 @@ def cached_folder(folder: Path) -> Iterator[Path]:
     Raises:
         UnirenderError: the cache cannot be written.
     """
-    temporary = None
+    temporary = folder.with_name(f".{folder.name[:16]}.{secrets.token_hex(4)}")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         for half_made in folder.parent.glob(HALF_MADE):
             _forget(half_made)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name[:16]}.", dir=folder.parent))
+        temporary.mkdir()  # others may read it, as the umask says: a cache can be shared
         yield temporary
         try:
             os.rename(temporary, folder)
@@ -46,8 +56,7 @@ def cached_folder(folder: Path) -> Iterator[Path]:
             f"{folder}: cannot be written ({error.strerror}); free some space or set UNIRENDER_CACHE"
         ) from error
     finally:
-        if temporary is not None:
-            shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def forget_half_made(parent: Path, names: Collection[str]) -> None:

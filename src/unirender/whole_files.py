@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -22,19 +23,27 @@ def replace_file(path: Path, content: str | bytes) -> Path:
         OSError: it cannot be written; what was there stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".partial", dir=path.parent)
-    temporary = Path(name)
+    temporary = aside(path, "partial")
     try:
-        with naming(path), os.fdopen(handle, "wb") as file:
+        with naming(path), temporary.open("xb") as file:
             file.write(content if isinstance(content, bytes) else content.encode())
             file.flush()
             os.fsync(file.fileno())
-        temporary.chmod(0o644)  # mkstemp gives it to its owner alone
         temporary.replace(path)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         raise
     return path
+
+
+def aside(path: Path, ending: str) -> Path:
+    """A hidden name beside a file or folder, which nobody else uses: for what is renamed to `path` when it is complete.
+
+    Made by `open` or `mkdir` it has the rights that the user's umask leaves, and a folder's group where that is passed
+    on; what `tempfile` makes is its owner's alone.
+    """
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
 
 
 @contextlib.contextmanager
@@ -88,16 +97,16 @@ def move_into_place(temporary: Path, path: Path) -> None:
     if not path.is_dir():
         os.rename(temporary, path)
         return
-    aside = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
+    before = Path(tempfile.mkdtemp(prefix=f".{path.name}.old.", dir=path.parent))
     try:
-        os.rename(path, aside / "old")
+        os.rename(path, before / "old")
     except BaseException:
-        aside.rmdir()
+        before.rmdir()
         raise
     try:
         os.rename(temporary, path)
     except BaseException:
-        os.rename(aside / "old", path)
-        aside.rmdir()
+        os.rename(before / "old", path)
+        before.rmdir()
         raise
-    shutil.rmtree(aside)
+    shutil.rmtree(before)

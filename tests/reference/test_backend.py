@@ -61,6 +61,21 @@ def test_missing_llvm_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         backend.find_llvm()
 
 
+def test_llvm_of_a_conda_environment_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(backend.LLVM_VARIABLE, raising=False)
+    monkeypatch.setattr(backend, "_wheel_libraries", list)
+    monkeypatch.setattr(backend, "SYSTEM_PATTERNS", (str(tmp_path / "usr" / "libLLVM*"),))
+    monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "env"))
+    for folder, name in (("usr", "libLLVM-14.so.1"), ("env/lib", "libLLVM.so.21.1")):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / name).touch()
+    assert backend.find_llvm() == backend.LlvmLibrary(tmp_path / "env" / "lib" / "libLLVM.so.21.1", 21, "system")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    with pytest.raises(UnirenderError, match=r"found LLVM 14 .*expected >= 17; .* install libllvm19 or newer"):
+        backend.find_llvm()
+
+
 def test_refusal_is_an_exception_and_not_an_abort(tmp_path: Path) -> None:
     old = tmp_path / "libLLVM-14.so.1"
     old.touch()
@@ -71,6 +86,21 @@ def test_refusal_is_an_exception_and_not_an_abort(tmp_path: Path) -> None:
     assert run.returncode == 1
     assert "UnirenderError" in run.stderr
     assert "LLVM 14" in run.stderr
+
+
+def test_what_mitsuba_cannot_load_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a slim container has no libatomic: Dr.Jit fails on its own message."""
+    (tmp_path / "mitsuba.py").write_text(
+        "try:\n    raise ImportError('libatomic.so.1: cannot open shared object file')\n"
+        "except ImportError:\n    _drjit_ext.__file__\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mitsuba", raising=False)
+    monkeypatch.setattr(backend, "choose_llvm", lambda: None)
+    with pytest.raises(
+        UnirenderError, match=r"cannot be loaded \(libatomic.so.1: cannot open .*install what is missing"
+    ):
+        backend.mitsuba()
 
 
 def test_unknown_variant_is_refused() -> None:

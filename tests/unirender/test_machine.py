@@ -1,11 +1,12 @@
 """Memory that a process may have: of the machine, its swap, and the control groups around the process."""
 
+import importlib.util
 import math
 from pathlib import Path
 
 import pytest
 
-from unirender.machine import GIB, memory_bytes, memory_excess, needs_swap, unswapped_bytes
+from unirender.machine import GIB, memory_bytes, memory_excess, needs_swap, peak_bytes, unswapped_bytes
 
 NONE = 9223372036854771712  # what the first version of control groups says where nothing is limited
 INNER = "system.slice/job.scope"
@@ -79,3 +80,10 @@ def test_a_machine_that_does_not_count_its_memory_has_enough(monkeypatch: pytest
     assert memory_bytes() > 2**28
     monkeypatch.setattr("os.sysconf", lambda name: -1 if name == "SC_PHYS_PAGES" else 4096)
     assert memory_bytes() == math.inf
+
+
+def test_where_nobody_counts_a_process_memory_it_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows has no module `resource`."""
+    assert 2**24 < peak_bytes() < 2**40
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert math.isnan(peak_bytes())

@@ -1,4 +1,4 @@
-"""Folders of the cache."""
+"""Folders of the cache, and who may read what is written."""
 
 import os
 import time
@@ -7,7 +7,11 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.paths import cached_folder
+from unirender.files import new_folder
+from unirender.paths import cache_dir, cached_folder
+from unirender.whole_files import replace_file
+from unirender_evaluation.suites.truth_file import write_tar
+from unirender_reference.shards import write_shard
 
 
 def test_a_folder_of_the_cache_is_whole_or_not_there(tmp_path: Path) -> None:
@@ -42,3 +46,50 @@ def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
     with cached_folder(tmp_path / "next"):
         pass
     assert {path.name for path in tmp_path.iterdir()} == {"key", "next", "other", new.name}
+
+
+def test_the_cache_is_where_the_variable_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`~` as well, which only a shell replaces; a user of a container may have no home."""
+    monkeypatch.setenv("HOME", "/home/ada")
+    monkeypatch.setenv("UNIRENDER_CACHE", "~/big disk")
+    assert cache_dir() == Path("/home/ada/big disk")
+    monkeypatch.delenv("UNIRENDER_CACHE")
+    assert cache_dir() == Path("/home/ada/.cache/unirender")
+
+    def nobody(path: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", nobody)
+    with pytest.raises(UnirenderError, match=r"this user has no home directory, .*; set UNIRENDER_CACHE to a folder"):
+        cache_dir()
+
+
+@pytest.mark.parametrize("umask", [0o002, 0o022, 0o077])
+def test_others_may_read_and_write_what_the_umask_lets_them(tmp_path: Path, umask: int) -> None:
+    """A group shares a folder, its members' caches and results; or a user keeps his own to himself."""
+    tmp_path.chmod(0o2777)  # what is made in it has its group
+    before = os.umask(umask)
+    try:
+        replace_file(tmp_path / "file", "")
+        write_shard(tmp_path / "shard.tar", [])
+        write_tar(tmp_path / "truth.tar", {})
+        with cached_folder(tmp_path / "cached"):
+            pass
+        with new_folder(tmp_path / "result"):
+            pass
+    finally:
+        os.umask(before)
+    modes = {path.name: path.stat().st_mode & 0o7777 for path in tmp_path.iterdir()}
+    files = dict.fromkeys(["file", "shard.tar", "truth.tar"], 0o666 & ~umask)
+    assert modes == files | dict.fromkeys(["cached", "result"], 0o2777 & ~umask)
+
+
+def test_a_shard_is_written_where_folders_cannot_be_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on Windows."""
+    monkeypatch.delattr(os, "O_DIRECTORY")
+
+    def refused(*args: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refused)
+    assert len(write_shard(tmp_path / "shard.tar", [])) == 64

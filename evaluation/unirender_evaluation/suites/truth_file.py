@@ -26,7 +26,6 @@ further render took the next. `camera` of a light says the frame that its direct
 import io
 import os
 import tarfile
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +36,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.exr import Channels
+from unirender.whole_files import aside
 from unirender_evaluation.suites.stratification import MetallicRoughness, material_key, roughness_key
 
 Kind = Literal["image", "specular", "diffuse"]
@@ -148,9 +148,9 @@ class Stored:
 
 def write_tar(path: Path, members: Mapping[str, bytes] | Mapping[str, bytes | Stored]) -> None:
     """Writes a reproducible tar (sorted, no times or owners), moved into place when complete."""
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    temporary = aside(path, "partial")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with temporary.open("xb") as stream:
             with tarfile.open(fileobj=stream, mode="w") as tar:
                 for name in sorted(members):
                     member = members[name]
@@ -160,10 +160,9 @@ def write_tar(path: Path, members: Mapping[str, bytes] | Mapping[str, bytes | St
                     tar.addfile(info, io.BytesIO(data))
             stream.flush()
             os.fsync(stream.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
+        temporary.replace(path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 

@@ -91,7 +91,7 @@ class Figures:
 
     seconds: Mapping[str, float]
     bytes: Mapping[str, float]
-    peak_bytes: int
+    peak_bytes: float
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,9 @@ def plans() -> dict[str, Plan]:
 
 def measure(resolution: int, spp: int, scenes: int) -> Figures:
     """Figures of a resolution, in this process with one thread."""
-    import resource
     import statistics
-    import sys
 
+    from unirender.machine import peak_bytes
     from unirender_reference import backend
     from unirender_reference.lights import make_light
     from unirender_reference.render import Renderer
@@ -149,11 +148,10 @@ def measure(resolution: int, spp: int, scenes: int) -> Figures:
         first, _ = one_scene(renderer, light, spp, seed)  # compiles some kernels
         seconds, sizes = one_scene(renderer, light, spp, seed + 1)
         measured.append(({part: min(spent, first[part]) for part, spent in seconds.items()} | {"load": load}, sizes))
-    unit = 1 if sys.platform == "darwin" else 1024
     return Figures(
         {part: statistics.fmean(seconds[part] for seconds, _ in measured) for part in PARTS},
         {file: statistics.fmean(sizes[file] for _, sizes in measured) for file in FILES},
-        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit,
+        peak_bytes(),
     )
 
 

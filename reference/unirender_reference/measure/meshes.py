@@ -1,7 +1,6 @@
 """`unirender meshes`: reads every mesh of a folder as a data set would, and prints what came of it."""
 
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -114,10 +113,10 @@ class MeshSummary:
 
     def table(self):
         """A table for the terminal; times are of this process's CPU, memory is its largest so far."""
-        import resource
-
         import numpy as np
         from rich.table import Table
+
+        from unirender.machine import peak_bytes
 
         table = Table("", "", show_header=False)
         table.add_row("meshes", f"{len(self.seconds):,}")
@@ -132,7 +131,5 @@ class MeshSummary:
         median, tail, largest = np.quantile(self.seconds or [0.0], [0.5, 0.9, 1.0])
         table.add_row("CPU seconds: median, 90 %, largest", f"{median:.2f}, {tail:.2f}, {largest:.2f}")
         table.add_row("CPU seconds: all", f"{sum(self.seconds):.0f}")
-        unit = 2**20 if sys.platform == "darwin" else 2**10
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-        table.add_row("largest memory", f"{peak:,.0f} MiB")
+        table.add_row("largest memory", f"{peak_bytes() / 2**20:,.0f} MiB")
         return table
