@@ -142,6 +142,7 @@ def test_every_exported_pipeline_has_its_card(tmp_path: Path) -> None:
 
     trainer.fit(source, validate=validate)
     folder = export_pipeline(trainer, tmp_path / "run" / "pipeline")
+    assert len({file.stat().st_mode for file in folder.rglob("*.*") if file.is_file()}) == 1, "the umask's"
     assert source.dataset is not None
     groups, fingerprint = len(source.dataset), source.dataset.fingerprint
     source.close()

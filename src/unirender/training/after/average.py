@@ -100,7 +100,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
     from unirender.training.loop.card import CARD_FILE, card_text
-    from unirender.training.loop.export import TRAINING_FILE, read_history
+    from unirender.training.loop.export import TRAINING_FILE, read_history, save_weights
     from unirender.writing import writing
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
@@ -126,9 +126,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
         facts = averaged_facts(histories, [_label(folder) for folder in folders], shares) | {"stored_as": store}
         facts.setdefault("train", {"model": {"codec": model.config["codec"]}})  # the card's licence depends on it
         with writing(out, "free some space or choose another --out"):
-            pipeline.save_pretrained(new, safe_serialization=True)
-            for weights in new.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
-                weights.chmod(0o644)
+            save_weights(pipeline, new)
             (new / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
             (new / CARD_FILE).write_text(card_text(out.resolve().name, facts), encoding="utf-8")
 

@@ -68,6 +68,14 @@ def read_history(folder: Path) -> list[dict[str, Any]]:
         ) from error
 
 
+def save_weights(pipeline: UniRenderPipeline, folder: Path) -> None:
+    """`save_pretrained`, with the rights that the umask leaves: diffusers writes weights for their owner alone."""
+    pipeline.save_pretrained(folder, safe_serialization=True)
+    rights = (folder / "model_index.json").stat().st_mode & 0o777
+    for weights in folder.rglob("*.safetensors"):
+        weights.chmod(rights)
+
+
 def export_pipeline(
     trainer: "Trainer",
     folder: Path,
@@ -94,9 +102,7 @@ def export_pipeline(
         facts |= {} if trainer.run.scored_on is None else {"scored_on": trainer.run.scored_on}
     try:
         with writing(folder):
-            pipeline.save_pretrained(partial, safe_serialization=True)
-            for path in partial.rglob("*.safetensors"):  # diffusers writes them readable by their owner only
-                path.chmod(0o644)
+            save_weights(pipeline, partial)
             (partial / TRAINING_FILE).write_text(json.dumps(facts, indent=2) + "\n")
             for name, text in beside.items():
                 (partial / name).write_text(text)
