@@ -477,7 +477,7 @@ def test_other_conventions_that_only_the_score_tells_are_noted(suite: Suite, tmp
     (said,) = doubts("encoded", records)
     n = 4 * len(suite.scenes[0].materials)
     assert f"taken for display values (encoded? expected linear): albedo ({n} of {n}, +20.0 dB)" in said
-    assert f", or with other signs (+x is right, +y up, +z to the viewer): normal ({n} of {n}, +20.0 dB)" in said
+    assert f", and with other signs (+x is right, +y up, +z to the viewer): normal ({n} of {n}, +20.0 dB)" in said
     assert [note for row in rows[1:] for note in doubts(row.info.key, records[: len(records) // 4])] == []
 
 

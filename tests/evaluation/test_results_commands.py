@@ -96,13 +96,21 @@ def test_a_table_may_have_some_rows_and_columns_alone(bench, files: tuple[Path, 
     assert status == 0
     assert [row["label"] for row in made["rows"]] == ["input as albedo"]
     assert {column["metric"]["name"] for column in made["columns"]} == {"mse"}
-    for given, said in (("--method", "ours-meen"), "did you mean 'ours-mean'"), (("--metric", "psnrr"), "'psnr'"):
+    wrong = (
+        (("--method", "Ours-Meen"), "did you mean 'ours-mean'"),
+        (("--metric", "PSNR"), "did you mean 'psnr'"),
+        (("--metric", "if_bgr"), "no column has that metric"),
+    )
+    for given, said in wrong:
         status, _, err = bench(*asked, *given)
         assert status == 2
         assert said in err
     status, _, err = bench(*asked, "--table", "relighting", "--metric", "cosine")
     assert status == 1
     assert "no values of relighting, cosine" in err
+    status, out, err = bench(*asked, "--table", "inverse", "--method", "input-as-albedo", "--metric", "cosine")
+    assert (status, out) == (1, "")  # the row is in the table, but has no value in the columns that are left
+    assert "no values of inverse, input-as-albedo, cosine" in err
 
 
 def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Path]) -> None:

@@ -96,7 +96,7 @@ class BenchTables:
         run, records = rows_of(run, records, self.method)
         specs = {name: spec for name in self.table or ALL_TABLES if (spec := columns_of(ALL_TABLES[name], self.metric))}
         lights = lights_of(found) if self.interval == "objects-and-lights" else None
-        tables = build_tables(records, run, specs, variants, lights)
+        tables = [table for table in build_tables(records, run, specs, variants, lights) if table.columns]
         if not tables:
             asked = ", ".join([*(self.table or ALL_TABLES), *self.method, *self.metric])
             raise UnirenderError(f"tables: the files have no values of {asked}; name fewer --table, --method, --metric")
@@ -126,14 +126,15 @@ def columns_of(spec: "TableSpec", metrics: Sequence[str]) -> "TableSpec | None":
     """The table with the columns of these metrics; without names, as it is; None where it has none of them.
 
     Raises:
-        UsageError: there is no such metric.
+        UsageError: no column of any table has such a metric.
     """
     from unirender_evaluation.results.schema_check import did_you_mean
-    from unirender_evaluation.table_list import ALL_METRICS
+    from unirender_evaluation.table_list import ALL_TABLES
 
+    known = dict.fromkeys(column.metric.name for each in ALL_TABLES.values() for column in each.columns)
     for name in metrics:
-        if name not in ALL_METRICS:
-            raise UsageError(f"--metric {name}: no such metric{did_you_mean(name, ALL_METRICS)}")
+        if name not in known:
+            raise UsageError(f"--metric {name}: no column has that metric{did_you_mean(name, known)}")
     kept = tuple(column for column in spec.columns if not metrics or column.metric.name in metrics)
     return replace(spec, columns=kept) if kept else None
 

@@ -168,7 +168,7 @@ def quoted(value: Any) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A suggestion, or the names that there are."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, 1)
-    return f", did you mean {close[0]!r}?" if close else f", expected one of {', '.join(names)}"
+    """A suggestion, whatever the case of its letters, or the names that there are."""
+    names = {each.casefold(): each for each in known}
+    close = difflib.get_close_matches(name.casefold(), names, 1)
+    return f", did you mean {names[close[0]]!r}?" if close else f", expected one of {', '.join(names.values())}"

@@ -42,7 +42,7 @@ def mistakes_said(records: Sequence[Record]) -> str:
                 mistake = max(likely, key=lambda which: np.mean(likely[which]))
                 told.setdefault(mistake, {}).setdefault(name, []).append(likely[mistake])
     found = [f"{MISTAKES[mistake].said}: {_counts(of_names)}" for mistake, of_names in told.items()]
-    return f"its answers are nearer to the truth {', or '.join(found)}" if found else ""
+    return f"its answers are nearer to the truth {', and '.join(found)}" if found else ""
 
 
 def truth_said(records: Sequence[Record]) -> str:

@@ -14,8 +14,8 @@ class BenchDerivedLight:
     """Score s and d derived from normal, roughness and an HDRI against Mitsuba's unshadowed passes. A second run
     continues.
 
-    A sphere and procedural objects under bundled lights; beside it the fast lookups that are usual instead. Takes about
-    3 minutes on 2 cores.
+    A sphere and procedural objects under bundled lights; beside it the fast lookups that are usual instead. Takes
+    about 3 minutes on 2 cores.
     """
 
     out: Path = Path("results/derived-light")
