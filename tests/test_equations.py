@@ -13,11 +13,11 @@ MODEL, TRUTH = ROOT / "src" / "unirender", ROOT / "reference" / "unirender_refer
     [
         ("Eq. 1", TRUTH / "shader.py"),  # the rendering equation, as it is sampled
         ("Eq. 1", MODEL / "composite.py"),  # and in closed form
-        ("Eq. 2", MODEL / "training" / "loss_terms.py"),  # the regression
+        ("Eq. 2", MODEL / "training" / "losses" / "terms.py"),  # the regression
         ("Eq. 3", MODEL / "diffusion" / "timesteps.py"),  # which stream is clean, in training
         ("Eq. 3", MODEL / "diffusion" / "inference.py"),  # and in use
         ("Eq. 4", MODEL / "diffusion" / "timesteps.py"),  # the timestep of the other one
-        ("Eq. 5", MODEL / "training" / "consistency.py"),  # the cycle
+        ("Eq. 5", MODEL / "training" / "losses" / "consistency.py"),  # the cycle
         ("Algorithm 1", MODEL / "diffusion" / "timesteps.py"),  # the supplement's timesteps
     ],
 )
