@@ -41,7 +41,7 @@ class Mistake:
 
 MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the gain; of equal ones the first is said
     "if_decoded": Mistake("taken for display values (encoded? expected linear)", TONE),
-    "if_encoded": Mistake("encoded once more (decoded twice?)", PLACE),
+    "if_encoded": Mistake("encoded once more (decoded twice?)", TONE),
     "if_bgr": Mistake("with red and blue exchanged (BGR?)", PLACE),
     "if_other_signs": Mistake("with other signs (+x is right, +y up, +z to the viewer)", PLACE),
     "if_other_axes": Mistake("with x, y and z exchanged (z up?)", PLACE),
