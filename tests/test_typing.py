@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pytest
@@ -109,6 +109,11 @@ def test_an_axis_has_one_size_in_the_arguments_and_the_result_of_a_call() -> Non
         looked_at(3)
 
 
+class _Pair(NamedTuple):
+    first: Any
+    second: Any
+
+
 class _Named(Protocol):
     name: str
 
@@ -131,6 +136,7 @@ def _thing(name: str) -> _Thing:
         (Float[np.ndarray, "n 3"], np.ones((2, 3)), np.ones((2, 3, 1))),
         (tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]], (np.ones(2),) * 2, (np.ones(2), np.ones(3))),
         (tuple[int, ...], (1, 1), ("1", "1")),
+        (tuple[int, ...], _Pair(1, 1), _Pair("1", "1")),
         (list[int] | None, [1], ["1"]),
         (Sequence[int], [1], ["1"]),
         (Mapping[str, int], {"1": 1}, {"1": "1"}),

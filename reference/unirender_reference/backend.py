@@ -3,7 +3,8 @@
 Dr.Jit's CPU backend loads libLLVM as soon as drjit is imported. LLVM 14 to 16 *abort the process* on
 AVX-512 machines ("Cannot select fminimum"), so the library is chosen here, before that can happen: the variable
 `DRJIT_LIBLLVM_PATH`, then the wheel `karellen-llvm-core`, then the newest LLVM of the system or of the folder that
-Python is installed in, as conda's is. Everything older than `MINIMUM_LLVM` is refused.
+Python is installed in, as conda's is, also where a virtual environment was made with conda's Python. Everything older
+than `MINIMUM_LLVM` is refused.
 
 Call `mitsuba()` instead of importing mitsuba.
 """
@@ -139,9 +140,10 @@ def _wheel_libraries() -> Iterator[Path]:
 
 def _system_libraries() -> list[Path]:
     patterns = [(Path("/"), pattern.lstrip("/")) for pattern in SYSTEM_PATTERNS]
+    patterns += [(Path(prefix), "lib/libLLVM*") for prefix in (sys.prefix, sys.base_prefix)]
     found = {
         path.resolve()
-        for folder, pattern in [*patterns, (Path(sys.prefix), "lib/libLLVM*")]
+        for folder, pattern in patterns
         for path in folder.glob(pattern)
         if ".so" in path.name or path.suffix == ".dylib"
     }

@@ -146,6 +146,13 @@ def test_a_usual_mistake_that_is_undone_gains_most_and_what_is_sound_gains_nothi
     assert mistakes_said(records[:3]) == ""
 
 
+def test_an_albedo_of_another_brightness_is_not_taken_for_one_that_was_decoded_twice() -> None:
+    """A dark one is nearer to the truth when it is encoded, and so it is at the right brightness."""
+    truth = intrinsics(0)
+    dark = truth.replace(albedo=truth.require("albedo")["albedo"] * np.float32(0.1))
+    assert suspicions(asked(truth), None, dark)["albedo.if_encoded"] < 0
+
+
 def test_maps_that_no_picture_tells_are_noted() -> None:
     def records(db: float, degrees: float, **gains: float) -> list[Record]:
         values = {"albedo.psnr@masked-srgb-raw": db, "normal.angle_deg": degrees}

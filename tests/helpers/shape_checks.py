@@ -116,8 +116,8 @@ def _kind(value: Any, by_value: bool) -> Any:
     kind = type(value)
     if kind in _PLAIN:
         return (kind, value) if by_value else kind
-    if kind is tuple:
-        return tuple([_kind(part, by_value) for part in value])
+    if issubclass(kind, tuple):
+        return (kind, *[_kind(part, by_value) for part in value])
     if hasattr(kind, "dtype") and hasattr(kind, "shape"):
         return (kind, value.dtype, value.shape)
     return kind

@@ -61,17 +61,20 @@ def test_missing_llvm_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         backend.find_llvm()
 
 
-def test_llvm_of_a_conda_environment_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("prefix", ["prefix", "base_prefix"])
+def test_llvm_of_a_conda_environment_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefix: str) -> None:
+    """Also from a virtual environment that was made with its Python."""
     monkeypatch.delenv(backend.LLVM_VARIABLE, raising=False)
     monkeypatch.setattr(backend, "_wheel_libraries", list)
     monkeypatch.setattr(backend, "SYSTEM_PATTERNS", (str(tmp_path / "usr" / "libLLVM*"),))
     monkeypatch.setattr("ctypes.util.find_library", lambda name: None)
-    monkeypatch.setattr(sys, "prefix", str(tmp_path / "env"))
+    for name in ("prefix", "base_prefix"):
+        monkeypatch.setattr(sys, name, str(tmp_path / ("env" if name == prefix else "venv")))
     for folder, name in (("usr", "libLLVM-14.so.1"), ("env/lib", "libLLVM.so.21.1")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / name).touch()
     assert backend.find_llvm() == backend.LlvmLibrary(tmp_path / "env" / "lib" / "libLLVM.so.21.1", 21, "system")
-    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(sys, prefix, str(tmp_path))
     with pytest.raises(UnirenderError, match=r"found LLVM 14 .*expected >= 17; .* install libllvm19 or newer"):
         backend.find_llvm()
 

@@ -75,6 +75,13 @@ def test_a_vertex_between_joints_is_their_weighted_mean(tmp_path):
     assert found.normals == pytest.approx(np.tile([0.6, 0, 0.8], (2, 3, 1)), abs=1e-6)
 
 
+def test_a_joint_without_weight_may_have_any_number(tmp_path):
+    """Some exporters leave what was there before."""
+    found = skinned(tmp_path, [[0, 7, 0, 0]] * 4, [[1, 0, 0, 0]] * 4, JOINT)
+    expected = skinned(tmp_path, [[0, 0, 0, 0]] * 4, [[1, 0, 0, 0]] * 4, JOINT)
+    assert np.array_equal(found.vertices, expected.vertices)
+
+
 def test_broken_skins_are_refused(tmp_path):
     for joints, weights, said in (
         ([7, 0, 0, 0], [1, 0, 0, 0], "its vertices name joint 7, its skin has 1"),

@@ -512,7 +512,7 @@ def test_find_meshes(tmp_path):
     for pattern, message in {
         f"{tmp_path}/absent": "no such file or folder",
         f"{tmp_path}/absent/*.glb": "no folder .*absent; expected one before the first wildcard",
-        f"{tmp_path}/*.fbx": "no mesh found; expected files ending in",
+        f"{tmp_path}/*.fbx": r"no mesh found; expected files ending in [a-z., ]+$",  # not below it, as the pattern
         f"{tmp_path}/others": r"; chair\.FBX is there: export it as GLB, from Blender or with assimp$",
         f"{tmp_path}/others/chair.*": r"; chair\.FBX is there: export it as GLB",
         f"{tmp_path}/notes.txt": "no mesh found",

@@ -62,7 +62,8 @@ GAINS: Mapping[str, Metric] = {
 
 
 def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
-    """Mistake -> gain in masked error of display values.
+    """Mistake -> gain in masked error of display values. What is encoded once more gains beyond what another brightness
+    does: no picture fixes that of an albedo or a light, and all that is dark is nearer to the truth when it is encoded.
 
     Args:
         found: linear, not premultiplied.
@@ -84,7 +85,9 @@ def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
         "if_shifted": _moved(shown),
     }
     as_it_is = error(shown)
-    return {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
+    gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
+    as_bright = srgb_encode(np.clip(metrics.align_scale(found, true, mask, "aligned"), 0, 1))
+    return gains | {"if_encoded": _gain(min(as_it_is, error(as_bright)), map(error, undone["if_encoded"]))}
 
 
 def normal_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:

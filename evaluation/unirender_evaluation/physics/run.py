@@ -10,7 +10,8 @@ of Mitsuba's own posterior and of our samples (mode `sample`); who has none has 
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -66,10 +67,21 @@ def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Itera
         stage = Stage(suite, scene)
         tracer = PathTracer(stage, spp)
         for test in TESTS.values():
-            yield [
-                Value(test.name, row, scene.key, scene.object, test.run(subject, stage))
-                for row, subject in subjects(test, tracer, ours, sampler).items()
-            ]
+            yield values_of(test, stage, subjects(test, tracer, ours, sampler))
+
+
+def values_of(test: PhysicsTest, stage: Stage, asked: Mapping[str, Any]) -> list[Value]:
+    """What each row scores in a test on a scene, as the table of `bench run` has it: a law that is asked of black
+    pictures, or of none but clipped pixels, has no value.
+
+    Args:
+        test: the test.
+        stage: the scene.
+        asked: who answers, by the row's name.
+    """
+    scores = {row: test.run(subject, stage) for row, subject in asked.items()}
+    key, name = stage.scene.key, stage.scene.object
+    return [Value(test.name, row, key, name, score) for row, score in scores.items() if not math.isnan(score)]
 
 
 def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any, sampler: Posterior | None = None) -> dict[str, Any]:
@@ -144,7 +156,9 @@ class Finding:
 
     @property
     def refused(self) -> bool:
-        """Whether the test tells its twin from Mitsuba."""
+        """Whether the test tells its twin from Mitsuba; not where one of them has no value."""
+        if not {TWIN, MITSUBA} <= self.rows.keys():
+            return False
         return self.test.fails(self.rows[TWIN].mean, self.rows[MITSUBA].mean)
 
 

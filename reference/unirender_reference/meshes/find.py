@@ -5,7 +5,7 @@ Nothing is opened: a folder of 200,000 files costs one `os.scandir` and the name
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -68,12 +68,13 @@ def find_meshes(pattern: str | Path, unreadable: Callable[[Path, str], None] | N
 
 
 def _other(path: Path) -> Path | None:
-    """A model of another kind at or below a path, or beside a pattern; None where there is none."""
-    if path.is_file():
-        files = iter([path])
-    else:
-        folder = path if path.is_dir() else path.parent
-        files = (Path(at, name) for at, _, names in os.walk(folder) for name in sorted(names))
+    """A model of another kind at or below a path, or in a pattern's folder; None where there is none."""
+    files: Iterable[Path] = [path]
+    if path.is_dir():
+        files = (Path(at, name) for at, _, names in os.walk(path) for name in sorted(names))
+    elif not path.is_file():  # a pattern: not below its folder, which may be a whole home directory
+        _, _, names = next(os.walk(path.parent), ("", [], []))
+        files = [path.parent / name for name in sorted(names)]
     return next((file for file in files if file.suffix.lower() in OTHERS), None)
 
 

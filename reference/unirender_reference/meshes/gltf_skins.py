@@ -39,13 +39,14 @@ class Skin:
         Args:
             points: as they are stored.
             normals: likewise.
-            joints: of each vertex.
+            joints: of each vertex; one without weight carries nothing, whatever its number.
             weights: of these joints.
 
         Raises:
             UnirenderError: a vertex hangs on a joint that is not there, or on none.
         """
         count, total = len(self.matrices), weights.sum(axis=1, keepdims=True)
+        joints = np.where(weights == 0, 0, joints)
         if len(joints) and joints.max() >= count:
             raise UnirenderError(f"its vertices name joint {joints.max()}, its skin has {count}; export it again")
         if not (np.isfinite(weights).all() and (total > 0).all()):

@@ -60,6 +60,17 @@ def test_a_blind_test_is_said_to_fail(tmp_path: Path) -> None:
     assert markdown(blind, {}).count("FAIL") == len(TESTS)
 
 
+def test_a_law_of_black_pictures_has_no_value(tmp_path: Path) -> None:
+    """It was NaN, and so was the mean over all scenes."""
+    suite = make_suite(tmp_path, objects=1)
+    stage, roll = Stage(suite, suite.scenes[0]), TESTS["roll"]
+    rows = {MITSUBA: Composite().render, TWIN: lambda maps: np.zeros((maps.height, maps.width, 3), np.float32)}
+    made = physics_run.values_of(roll, stage, rows)
+    assert [(value.row, value.value) for value in made] == [(MITSUBA, 0.0)]
+    finding = next(finding for finding in findings(made) if finding.test is roll)
+    assert not finding.refused
+
+
 def test_rows_of_a_test(tmp_path: Path) -> None:
     """Composite has no decomposition; everybody else answers both kinds. Only who samples has a posterior."""
     suite = make_suite(tmp_path, objects=1)
