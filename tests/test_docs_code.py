@@ -15,7 +15,7 @@ from doc_pages import EXAMPLES, Example, Names
 
 CONSOLE = ("console", "bash")
 CELL = "{code-cell} python"  # sphinx runs it; other directives hold text, and blocks that are looked at
-NOT_RUN: dict[str, list[str]] = {}
+NOT_RUN: dict[str, list[str]] = {"install.md": ["it needs Docker"]}
 """All there is of blocks that are not run; a reason stands above its block as `<!-- not run: reason -->`."""
 LONG = {"optimization.md", "tour.md"}
 """Pages whose Python takes ten seconds and more."""

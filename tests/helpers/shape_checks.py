@@ -21,6 +21,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray, TypeCheckError, install_import_hook
 
+REMEMBERED = 64  # kinds of calls of a function: where values count, there is no end of them
 _jaxtyped = jaxtyping.jaxtyped
 # An int is a float, as it is to Python and to pyright.
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
@@ -84,13 +85,16 @@ def _remembering(function: types.FunctionType, hints: dict[str, Any], in_context
         results = passed.get(arguments)
         if results is None:
             result = checked_call(*args, **kwargs)
+            if len(passed) == REMEMBERED:
+                passed.clear()
             passed[arguments] = {_kind(result, by_value)}
             return result
         result = function(*args, **kwargs)
         kind = _kind(result, by_value)
         if kind not in results:
             _checked_call(_giving(result, function), hints, in_context)(*args, **kwargs)
-            results.add(kind)
+            if len(results) < REMEMBERED:
+                results.add(kind)
         return result
 
     return wrapper
