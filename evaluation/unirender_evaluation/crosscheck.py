@@ -25,6 +25,7 @@ from unirender_evaluation.lpips import Backbone
 from unirender_evaluation.lpips_convert import GOLDEN, pattern
 from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.rows import evenly
+from unirender_evaluation.ssim import SSIM_SIGMA, crop_border, ssim
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import installed_version
 
@@ -135,16 +136,16 @@ def _ssim_scikit_image(p: Picture, t: Picture) -> tuple[float, float]:
     from skimage.metrics import structural_similarity
 
     scikit_image: Any = structural_similarity  # what it returns depends on its options, which its types do not know
-    options = {"gaussian_weights": True, "sigma": metrics.SSIM_SIGMA, "use_sample_covariance": False}
-    return metrics.ssim(p, t), float(scikit_image(t, p, channel_axis=-1, data_range=1.0, **options))
+    options = {"gaussian_weights": True, "sigma": SSIM_SIGMA, "use_sample_covariance": False}
+    return ssim(p, t), float(scikit_image(t, p, channel_axis=-1, data_range=1.0, **options))
 
 
 def _ssim_torchmetrics(p: Picture, t: Picture) -> tuple[float, float]:
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    options: Any = {"data_range": 1.0, "sigma": metrics.SSIM_SIGMA, "return_full_image": True}
+    options: Any = {"data_range": 1.0, "sigma": SSIM_SIGMA, "return_full_image": True}
     _, maps = structural_similarity_index_measure(_tensor(p), _tensor(t), **options)
-    return metrics.ssim(p, t), float(metrics.crop_border(maps[0].mean(dim=0).numpy()).mean())
+    return ssim(p, t), float(crop_border(maps[0].mean(dim=0).numpy()).mean())
 
 
 def _ciede2000_scikit_image(p: Picture, t: Picture) -> tuple[float, float]:

@@ -33,6 +33,7 @@ from unirender_evaluation.metrics import (
     Variant,
     metric_key,
 )
+from unirender_evaluation.ssim import crop_border, ssim_map
 
 Rgb = Float[np.ndarray, "h w 3"]
 Weights = Float[np.ndarray, "h w 1"]
@@ -161,7 +162,7 @@ def score_colour(
     truth = over_white(t, w)
     for space in SPACES:
         shown, shown_truth = _display(frames, space), _display(truth, space)
-        similarity = dict(zip(names, metrics.ssim_map(shown, shown_truth[None]), strict=True))
+        similarity = dict(zip(names, ssim_map(shown, shown_truth[None]), strict=True))
         pictures = dict(zip(names, shown, strict=True))
         truth_map = _display(t, space)
         for scale in scales:
@@ -171,7 +172,7 @@ def score_colour(
             values[metric_key(quantity, "psnr", whole)] = metrics.psnr(pictures[in_whole], shown_truth)
             similarity_masked = similarity["masked", scale][..., None]
             values[metric_key(quantity, "ssim", masked)] = metrics.weighted_mean(similarity_masked, w)
-            values[metric_key(quantity, "ssim", whole)] = float(metrics.crop_border(similarity[in_whole]).mean())
+            values[metric_key(quantity, "ssim", whole)] = float(crop_border(similarity[in_whole]).mean())
         if space == "srgb":
             compared = {name: picture for name, picture in pictures.items() if name[1] in lpips_scales}
             values |= _lpips_values(quantity, lpips, compared, shown_truth, pasted=own is w)

@@ -19,6 +19,7 @@ from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
 from unirender_evaluation import metrics
 from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_variants, metric_key
+from unirender_evaluation.ssim import _similarity, crop_border, ssim, ssim_map
 
 
 def images(seed: int, height: int = 40, width: int = 33, distance: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
@@ -54,17 +55,17 @@ def test_ssim_is_scikit_images(size: tuple[int, int]) -> None:
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0}
     scikit_image: Any = structural_similarity  # what it returns depends on `full`, which its types do not know
     theirs, their_map = scikit_image(t, p, channel_axis=-1, full=True, **options)
-    assert metrics.ssim(p, t) == pytest.approx(theirs, rel=0, abs=1e-12)
-    np.testing.assert_allclose(metrics.ssim_map(p, t), their_map.mean(axis=-1), rtol=0, atol=1e-12)
+    assert ssim(p, t) == pytest.approx(theirs, rel=0, abs=1e-12)
+    np.testing.assert_allclose(ssim_map(p, t), their_map.mean(axis=-1), rtol=0, atol=1e-12)
     uniform = scikit_image(t, p, channel_axis=-1, data_range=1.0)
-    assert abs(metrics.ssim(p, t) - uniform) > 1e-4  # the twin: another window is another number
+    assert abs(ssim(p, t) - uniform) > 1e-4  # the twin: another window is another number
 
 
 def test_ssim_needs_a_pixel_inside_the_border() -> None:
-    assert metrics.ssim(*images(1, 11, 11)) < 1
+    assert ssim(*images(1, 11, 11)) < 1
     for size in ((10, 40), (40, 10)):
         with pytest.raises(UnirenderError, match="expected more than 10 a side"):
-            metrics.ssim(*images(1, *size))
+            ssim(*images(1, *size))
 
 
 def test_ssim_is_torchmetrics_inside_the_border() -> None:
@@ -73,14 +74,14 @@ def test_ssim_is_torchmetrics_inside_the_border() -> None:
     preds, target = (torch.from_numpy(x).permute(2, 0, 1)[None].double() for x in (p, t))
     result = structural_similarity_index_measure(preds, target, data_range=1.0, sigma=1.5, return_full_image=True)
     theirs = result[1][0].mean(dim=0).numpy()
-    np.testing.assert_allclose(metrics.crop_border(metrics.ssim_map(p, t)), metrics.crop_border(theirs), atol=1e-9)
+    np.testing.assert_allclose(crop_border(ssim_map(p, t)), crop_border(theirs), atol=1e-9)
 
 
 def test_ssim_of_many_images_is_that_of_each() -> None:
     pairs = [images(seed, 24, 24) for seed in range(4)]
-    together = metrics.ssim_map(np.stack([p for p, _ in pairs]), pairs[0][1][None])
+    together = ssim_map(np.stack([p for p, _ in pairs]), pairs[0][1][None])
     for one, (p, _) in zip(together, pairs, strict=True):
-        np.testing.assert_allclose(one, metrics.ssim_map(p, pairs[0][1]), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(one, ssim_map(p, pairs[0][1]), rtol=0, atol=1e-13)
 
 
 def test_large_pictures_have_the_same_values_in_less_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,11 +89,11 @@ def test_large_pictures_have_the_same_values_in_less_memory(monkeypatch: pytest.
     rng = np.random.default_rng(0)
     p, t = (rng.random((n, 260, 270, 3), np.float32) for n in (3, 1))
     tracemalloc.start()
-    found = metrics.ssim_map(p, t)
+    found = ssim_map(p, t)
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert taken < 200 * p[0, ..., 0].size  # bytes; at once they take 720
-    assert np.array_equal(found, metrics._similarity(p, t).mean(axis=-1))
+    assert np.array_equal(found, _similarity(p, t).mean(axis=-1))
     expected = metrics.ciede2000(p[0], t[0], p[1, ..., :1])
     monkeypatch.setattr(metrics, "BLOCK", 20_000)
     assert metrics.ciede2000(p[0], t[0], p[1, ..., :1]) == expected
@@ -139,7 +140,7 @@ def test_a_mask_or_several_pictures_that_would_broadcast_are_an_error() -> None:
         inspect.unwrap(metrics.mse)(pictures, pictures)
 
 
-@pytest.mark.parametrize("metric", [metrics.mse, metrics.ssim, metrics.ciede2000])
+@pytest.mark.parametrize("metric", [metrics.mse, ssim, metrics.ciede2000])
 def test_whole_numbers_and_other_sizes_are_an_error(metric: Callable[..., float]) -> None:
     """PSNR of 8-bit pictures was 48 dB too low, their SSIM that of another range, and a grey truth was broadcast."""
     picture, w = np.full((16, 16, 3), 0.5), np.ones((16, 16, 1))

@@ -17,6 +17,7 @@ from unirender_evaluation.methods.suspicions import suspicions
 from unirender_evaluation.metrics import OWN_MASK, SCALES, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import MATERIALS, score_colour, score_image, score_maps
+from unirender_evaluation.ssim import ssim
 from unirender_evaluation.suites.suite import Scene
 from unirender_evaluation.tables.mistakes import mistakes_said, truth_said
 from unirender_evaluation.task import Asked, Task
@@ -201,8 +202,8 @@ def test_colours_by_hand() -> None:
                 expected = {
                     f"psnr@masked-{space}-{scale}": metrics.psnr(shown(p), shown(t), w),
                     f"psnr@whole-{space}-{scale}": metrics.psnr(shown(white(p, own)), shown(white(t, w))),
-                    f"ssim@masked-{space}-{scale}": metrics.ssim(shown(white(p, w)), shown(white(t, w)), w),
-                    f"ssim@whole-{space}-{scale}": metrics.ssim(shown(white(p, own)), shown(white(t, w))),
+                    f"ssim@masked-{space}-{scale}": ssim(shown(white(p, w)), shown(white(t, w)), w),
+                    f"ssim@whole-{space}-{scale}": ssim(shown(white(p, own)), shown(white(t, w))),
                 }
                 found = {key: values[f"{name}.{key}"] for key in expected}
                 assert found == pytest.approx(expected, rel=1e-6), name

@@ -62,7 +62,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
     ("part", "package", "files"),
     [
         ("core", "unirender", ("composite.py", "environment_brdf.npy", "lighting.py", "symmetries.py")),
-        ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "tasks.py", "tables/specs.py")),
+        ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "ssim.py", "tasks.py", "tables/specs.py")),
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),
         (REFERENCE, "unirender_reference", ("data/lights/lights.toml", "data/lights/pmndrs-city.exr")),
