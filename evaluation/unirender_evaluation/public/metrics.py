@@ -23,7 +23,8 @@ from scipy.ndimage import binary_erosion, correlate1d
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
-from unirender_evaluation.metrics import HIGHER, LOWER, SSIM_K1, SSIM_K2, SSIM_SIGMA, Metric, ciede2000, psnr_from_mse
+from unirender_evaluation.metrics import HIGHER, LOWER, Metric, ciede2000, psnr_from_mse
+from unirender_evaluation.ssim import SSIM_K1, SSIM_K2, SSIM_SIGMA
 
 ERODED = 5  # pixels, side of the square by which Stanford-ORB shrinks its masks
 PEAK_HDR, PEAK_LDR = 4.0, 1.0  # radiance at which PSNR-H and PSNR-L clip
