@@ -18,14 +18,14 @@ from seen_shapes import as_maps, gutter
 from synthetic_shards import write_dataset
 
 from unirender.cli import main, read_light, refuse
-from unirender.command_line import parse
+from unirender.command_line.parse import parse
+from unirender.command_line.remarks import missing_maps
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, intrinsics_channels, read_exr, write_exr
 from unirender.files import read_result
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
-from unirender.remarks import missing_maps
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {

@@ -23,7 +23,7 @@ from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
 
 from unirender import cli
-from unirender.command_line import parse
+from unirender.command_line.parse import parse
 from unirender.errors import UnirenderError
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,6 +19,7 @@ VOCABULARY = {
         "camera",
         "cicp",
         "color",
+        "command_line.writing",
         "composite",
         "display_files",
         "errors",
@@ -41,7 +42,6 @@ VOCABULARY = {
         "visualization",
         "whole_files",
         "worker_pool",
-        "writing",
     )
 }
 HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage", "gradio")

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from unirender.option_checks import at_least
+from unirender.command_line.option_checks import at_least
 from unirender_evaluation.crosscheck_command import BenchCrosscheck
 from unirender_evaluation.physics.command import BenchPhysics
 from unirender_evaluation.public.command import BenchPublic

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from unirender.option_checks import at_least
+from unirender.command_line.option_checks import at_least
 
 
 @dataclass(frozen=True)

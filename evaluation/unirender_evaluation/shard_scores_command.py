@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device, ModelOptions
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
-from unirender.options import Device, ModelOptions
 
 if TYPE_CHECKING:
     from unirender_evaluation.shard_scores import Scored

@@ -85,24 +85,8 @@ COMMANDS = (
     "validation",
 )
 FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
-# Of the shared vocabulary's folder: the command line, what is said where a file cannot be written, and processes.
-OUTSIDE = (
-    "__main__",
-    "cli",
-    "command_line",
-    "commands",
-    "folder_command",
-    "input_picture",
-    "notices",
-    "option_checks",
-    "options",
-    "process_ends",
-    "remarks",
-    "shipped",
-    "system_errors",
-    "worker_pool",
-    "writing",
-)
+# Of the shared vocabulary's folder: the command line, and processes.
+OUTSIDE = ("__main__", "cli", "shipped", "worker_pool")
 # The rooms that records are made in, and of the tables what is asked. Results and the report are made from records.
 ROOMS = ("*.py", "methods/*.py", "physics/*.py", "predictions/*.py", "runs/*.py", "suites/*.py", "truth/*.py")
 QUESTIONS = "tables/specs.py"

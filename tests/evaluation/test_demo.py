@@ -21,10 +21,10 @@ from PIL import Image
 from tiny_models import make_pipeline
 
 from unirender.cli import main
+from unirender.command_line.input_picture import BYTES_OF_NONE
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import exr_bytes, image_channels
 from unirender.files import read_result
-from unirender.input_picture import BYTES_OF_NONE
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from optimizer_runs import rendered_views, truth
 
-from unirender import cli, process_ends
-from unirender.command_line import Ended, causes, interrupted
-from unirender.process_ends import open_streams
-from unirender.system_errors import refused_by_system
+from unirender import cli
+from unirender.command_line import process_ends
+from unirender.command_line.parse import Ended, causes, interrupted
+from unirender.command_line.process_ends import open_streams
+from unirender.command_line.system_errors import refused_by_system
 from unirender.visualization import write_png
 from unirender_reference.optimize.files.export import write_solution
 from unirender_reference.optimize.files.folder import write_views
@@ -327,7 +328,8 @@ FEWER_SIGNALS = """
 import signal
 del signal.SIGHUP, signal.pthread_kill
 import unirender.training.loop.stopping
-from unirender import cli, process_ends
+from unirender import cli
+from unirender.command_line import process_ends
 
 cli.run = lambda command: process_ends._Ends().again(signal.SIGINT)
 cli.main()
@@ -428,7 +430,7 @@ def test_an_interrupt_while_the_command_is_imported_is_one_line() -> None:
 import signal, sys
 class Interrupts:
     def find_spec(self, name, path, target=None):
-        if name == "unirender.commands":
+        if name == "unirender.command_line.commands":
             signal.raise_signal(signal.SIGINT)
 sys.meta_path.insert(0, Interrupts())
 from unirender.__main__ import main

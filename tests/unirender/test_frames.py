@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from unirender.command_line.input_picture import read_input
 from unirender.errors import UnirenderError, UsageError
 from unirender.files import new_folder, write_result
 from unirender.folders import (
@@ -25,7 +26,6 @@ from unirender.folders import (
     write_summary,
 )
 from unirender.frames import FilmFrame, temporal_difference
-from unirender.input_picture import read_input
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture
 from unirender.pipelines.results import Decomposition

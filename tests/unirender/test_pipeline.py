@@ -15,13 +15,13 @@ from tiny_models import SIZE, make_pipeline
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
+from unirender.command_line.options import MOST_STEPS, DecompositionOptions
 from unirender.composite import split_sum_image
 from unirender.diffusion import sampling
 from unirender.diffusion.schedule import NUM_TIMESTEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.options import MOST_STEPS, DecompositionOptions
 from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 from unirender.pipelines.editing import (

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from unirender.command_line.options import ModelOptions
 from unirender.errors import UnirenderError
-from unirender.options import ModelOptions
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import (
     CHECKPOINTS,

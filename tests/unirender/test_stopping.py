@@ -13,8 +13,8 @@ from tiny_models import TRAIN, make_batch
 from torch import Tensor
 
 from unirender import cli
-from unirender.command_line import Ended
-from unirender.process_ends import SIGNALS
+from unirender.command_line.parse import Ended
+from unirender.command_line.process_ends import SIGNALS
 from unirender.training.config import RunConfig
 from unirender.training.loop import stopping
 from unirender.training.loop.checkpoint import load_state

@@ -10,12 +10,12 @@ import torch
 from tiny_models import SIZE, make_pipeline
 
 from unirender.camera import Camera
+from unirender.command_line.remarks import frame_remarks
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide, unit_normal
 from unirender.pipelines.tiling import TILED, TILES_AT_ONCE, add_detail, blend_tiles, tiles, tiles_of, window
-from unirender.remarks import frame_remarks
 
 TILE = 16
 SIZES = [(37, 91), (75, 50), (64, 64), (9, 40)]

@@ -105,7 +105,7 @@ def test_the_main_process_has_no_such_parent() -> None:
 
 HUNG_UP = """
 import time
-from unirender.process_ends import hear_ends
+from unirender.command_line.process_ends import hear_ends
 from unirender.worker_pool import WorkerPool
 
 if __name__ == "__main__":

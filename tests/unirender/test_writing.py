@@ -15,6 +15,7 @@ from tiny_models import TRAIN, make_pipeline
 from torch import nn
 
 from unirender import cli
+from unirender.command_line.writing import unusable, writing
 from unirender.errors import UnirenderError
 from unirender.training.after.average import Average
 from unirender.training.config import RunConfig
@@ -24,7 +25,6 @@ from unirender.training.loop.export import export_pipeline
 from unirender.training.loop.pictures import save_sheet
 from unirender.training.loop.trainer import Trainer
 from unirender.training.optim.processes import ALONE
-from unirender.writing import unusable, writing
 
 NO_SPACE = "No space left on device"
 

@@ -5,9 +5,9 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device
 from unirender.errors import UnirenderError, UsageError
-from unirender.option_checks import at_least
-from unirender.options import Device
 
 MOST_PORT = 65535
 

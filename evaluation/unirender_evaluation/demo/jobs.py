@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from unirender.options import Device, ModelOptions
+from unirender.command_line.options import Device, ModelOptions
 from unirender.pictures import Picture
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender_evaluation.demo import panels, session

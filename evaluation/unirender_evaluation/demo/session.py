@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 
 from unirender.color import srgb_decode
-from unirender.commands import MUCH_COARSE
+from unirender.command_line.commands import MUCH_COARSE
 from unirender.intrinsics import Intrinsics
 from unirender.lighting import rotate_environment
 from unirender.pictures import Picture

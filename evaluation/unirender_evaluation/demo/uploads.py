@@ -19,8 +19,8 @@ import OpenEXR
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.command_line.input_picture import read_input
 from unirender.errors import UnirenderError
-from unirender.input_picture import read_input
 from unirender.lighting import resample_environment
 from unirender.pictures import Picture
 from unirender_evaluation.figures.pictures import framed

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import tyro
 
+from unirender.command_line.notices import notice
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device
+from unirender.command_line.writing import check_out
 from unirender.errors import UnirenderError, UsageError
-from unirender.notices import notice
-from unirender.option_checks import at_least
-from unirender.options import Device
-from unirender.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -207,8 +207,8 @@ class Figures:
         Raises:
             UnirenderError: a checkpoint or a method is not there.
         """
+        from unirender.command_line.options import ModelOptions
         from unirender.models.precision import resolve_device
-        from unirender.options import ModelOptions
         from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
         from unirender_evaluation.figures.panels import Subject
         from unirender_evaluation.methods.pipeline import PipelineMethod

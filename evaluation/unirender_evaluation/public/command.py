@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
-from unirender.options import Device
 
 if TYPE_CHECKING:
     from unirender_evaluation.public.sets import PublicSet

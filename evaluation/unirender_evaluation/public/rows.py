@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from unirender.command_line.options import Device, ModelOptions
 from unirender.errors import UsageError
-from unirender.options import Device, ModelOptions
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.methods.decompositions import Decompositions
 from unirender_evaluation.methods.pipeline import LazyPipeline, PipelineMethod

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
-from unirender.options import Device
 from unirender_evaluation.results.commands import asked_variants
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import tyro
 
+from unirender.command_line.option_checks import at_least
 from unirender.errors import UnirenderError
-from unirender.option_checks import at_least
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from unirender.command_line.writing import unusable, writing
 from unirender.errors import UnirenderError
-from unirender.writing import unusable, writing
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -12,9 +12,9 @@ from PIL import Image, ImageFont
 from tiny_suites import SIZE, make_suite
 
 from unirender.camera import Camera
+from unirender.command_line.options import ModelOptions
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
-from unirender.options import ModelOptions
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender.whole_files import replace_file
 from unirender_evaluation.figures import grid as grid_module

@@ -12,9 +12,9 @@ from rich.console import Console
 from tiny_models import make_pipeline
 from tiny_suites import make_suite
 
+from unirender.command_line.options import MOST_STEPS, ModelOptions
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.precision import resolve_device
-from unirender.options import MOST_STEPS, ModelOptions
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record

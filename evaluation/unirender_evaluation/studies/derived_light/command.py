@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from unirender.command_line.option_checks import at_least
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
 
 LEAST_SIZE = 8
 

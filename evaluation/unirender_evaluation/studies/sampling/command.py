@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import MOST_STEPS, Device
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
-from unirender.options import MOST_STEPS, Device
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class BenchSampling:
         self.check()
         from rich.console import Console
 
+        from unirender.command_line.options import ModelOptions
         from unirender.models.precision import resolve_device
-        from unirender.options import ModelOptions
         from unirender.shipped import checkpoint_folder, checkpoint_sha256
         from unirender_evaluation.methods.pipeline import LazyPipeline
         from unirender_evaluation.rows import evenly

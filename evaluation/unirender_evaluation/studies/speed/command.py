@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from unirender.command_line.option_checks import at_least, usage
+from unirender.command_line.options import Device, DType, ModelOptions
 from unirender.errors import UnirenderError, UsageError
-from unirender.option_checks import at_least, usage
-from unirender.options import Device, DType, ModelOptions
 from unirender.training.config import TrainConfig
 from unirender.training.presets import get_preset
 from unirender_evaluation.studies.speed.parts import NEED_DATA, PARTS, PartName

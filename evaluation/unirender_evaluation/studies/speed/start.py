@@ -59,7 +59,7 @@ def watched(name, function):
 builtins.__import__ = watched("import", builtins.__import__)
 importlib.import_module = watched("import", importlib.import_module)
 from unirender import cli
-from unirender.options import ModelOptions
+from unirender.command_line.options import ModelOptions
 
 ModelOptions.load = watched("load", ModelOptions.load)
 report, sys.argv = sys.argv[1], [sys.argv[0], *sys.argv[2:]]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from unirender.command_line.option_checks import at_least
+from unirender.command_line.options import Device
 from unirender.errors import UnirenderError
-from unirender.option_checks import at_least
-from unirender.options import Device
 
 if TYPE_CHECKING:
     from unirender_evaluation.studies.training.choices import Choice

@@ -14,7 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
-from unirender.options import Device
+from unirender.command_line.options import Device
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.scoring import score_image

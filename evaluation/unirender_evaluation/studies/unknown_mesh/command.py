@@ -6,8 +6,8 @@ from typing import Annotated
 
 import tyro
 
+from unirender.command_line.option_checks import at_least
 from unirender.errors import UsageError
-from unirender.option_checks import at_least
 from unirender_reference.optimize.multiview.config import OptimizeConfig
 
 LEAST_VIEWS = 4

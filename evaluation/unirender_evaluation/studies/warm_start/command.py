@@ -6,7 +6,7 @@ from typing import get_args
 
 import tyro
 
-from unirender.option_checks import at_least
+from unirender.command_line.option_checks import at_least
 from unirender_reference.optimize.single.config import SingleConfig
 
 

@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unirender.command_line.notices import notice
+from unirender.command_line.option_checks import at_least
 from unirender.errors import UnirenderError
-from unirender.notices import notice
-from unirender.option_checks import at_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,6 +73,7 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
     """
     import diffusers
 
+    from unirender.command_line.writing import writing
     from unirender.files import new_folder
     from unirender.models.precision import resolve_device
     from unirender.pipelines.calibration import NAMES
@@ -83,7 +84,6 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
     from unirender.training.data.same_objects import objects_of
     from unirender.training.loop.export import read_history
     from unirender.training.loop.facts import dataset_facts
-    from unirender.writing import writing
 
     diffusers.utils.logging.disable_progress_bar()  # of loading: small files
     checkpoint = checkpoint_folder(options.checkpoint)

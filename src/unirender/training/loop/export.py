@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -18,7 +19,6 @@ from unirender.training.data.source import BatchSource, ShardSource
 from unirender.training.loop.card import CARD_FILE, card_text
 from unirender.training.loop.checkpoint import partial_folder, replace_folder
 from unirender.training.loop.facts import training_facts
-from unirender.writing import writing
 
 if TYPE_CHECKING:
     from unirender.training.loop.trainer import Trainer

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-from unirender.command_line import Ended
-from unirender.process_ends import HANG_UP, PASSED_ON_S, SIGNALS
+from unirender.command_line.parse import Ended
+from unirender.command_line.process_ends import HANG_UP, PASSED_ON_S, SIGNALS
 
 
 @dataclass

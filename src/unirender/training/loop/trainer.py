@@ -20,7 +20,7 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import nn
 
-from unirender.command_line import Ended
+from unirender.command_line.parse import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unirender.command_line import Ended
+from unirender.command_line.notices import notice
+from unirender.command_line.option_checks import check_seed
+from unirender.command_line.parse import Ended
+from unirender.command_line.writing import check_out, writing
 from unirender.errors import UnirenderError, UsageError
-from unirender.notices import notice
-from unirender.option_checks import check_seed
 from unirender.training.command import Alone
-from unirender.writing import check_out, writing
 
 if TYPE_CHECKING:
     import torch

@@ -11,12 +11,12 @@ from typing import Any
 
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 
+from unirender.command_line.notices import notice
 from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
 from unirender.models.config import ModelConfig
 from unirender.models.dual_stream import DualStreamModel
 from unirender.models.split_streams import SplitDualStreamModel
-from unirender.notices import notice
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
 from unirender.training.loop.beginning import Beginning, beginning

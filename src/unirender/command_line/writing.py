@@ -5,7 +5,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from unirender.command_line import causes
+from unirender.command_line.parse import causes
 from unirender.errors import UnirenderError
 
 AGAIN = "mend that and run the same command again"

@@ -7,19 +7,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unirender.command_line.input_picture import read_input
+from unirender.command_line.notices import notice
+from unirender.command_line.remarks import frame_remarks
 from unirender.errors import UnirenderError
 from unirender.files import SUMMARY_FILE
 from unirender.folders import FolderResult, decompose_folder, list_pictures, write_summary
 from unirender.frames import temporal_difference
-from unirender.input_picture import read_input
-from unirender.notices import notice
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition
-from unirender.remarks import frame_remarks
 
 if TYPE_CHECKING:
-    from unirender.commands import Decompose
+    from unirender.command_line.commands import Decompose
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 

@@ -5,9 +5,9 @@ a fact for `meta.json`, or both. Light to import.
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from unirender.command_line.input_picture import MANY_CLIPPED
+from unirender.command_line.notices import notice
 from unirender.errors import UsageError
-from unirender.input_picture import MANY_CLIPPED
-from unirender.notices import notice
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from unirender.errors import UnirenderError, UsageError
-from unirender.input_picture import (
+from unirender.command_line.input_picture import (
     DERIVED_BYTES_A_PIXEL,
     RELIT_BYTES_A_PIXEL,
     RENDERED_BYTES_A_PIXEL,
     memory_remarks,
 )
-from unirender.notices import notice
-from unirender.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
-from unirender.remarks import (
+from unirender.command_line.notices import notice
+from unirender.command_line.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
+from unirender.command_line.remarks import (
     at_white,
     check_stops,
     missing_maps,
@@ -29,6 +28,7 @@ from unirender.remarks import (
     parts_left_out,
     with_frame_remarks,
 )
+from unirender.errors import UnirenderError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,7 +80,7 @@ class Decompose:
         self.model.check()
         self.decomposition.check(self.model.mode)
         if self.input.picture.is_dir():
-            from unirender.folder_command import run_folder
+            from unirender.command_line.folder_command import run_folder
 
             return run_folder(self)
         if self.frames:

@@ -8,10 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from unirender.command_line.input_picture import (
+    BYTES_A_PIXEL,
+    TILED_BYTES_A_PIXEL,
+    TILED_SAMPLE_BYTES_A_PIXEL,
+    read_input,
+)
+from unirender.command_line.notices import notice
+from unirender.command_line.option_checks import at_least, usage
 from unirender.errors import UsageError
-from unirender.input_picture import BYTES_A_PIXEL, TILED_BYTES_A_PIXEL, TILED_SAMPLE_BYTES_A_PIXEL, read_input
-from unirender.notices import notice
-from unirender.option_checks import at_least, usage
 
 if TYPE_CHECKING:
     import torch

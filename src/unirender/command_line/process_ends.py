@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from types import FrameType
 
-from unirender.command_line import Ended
+from unirender.command_line.parse import Ended
 from unirender.models.lean_imports import lean_imports
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
