@@ -272,7 +272,11 @@ def _denoiser() -> str:
 def _code_hash() -> str:
     """Hash of every file of the two packages that decides a render: equal versions may be different checkouts."""
     digest = hashlib.sha256()
-    for package, pattern in (("unirender", "*.py"), ("unirender_reference", "**/*")):
+    for package, pattern in (
+        ("unirender", "*.py"),
+        ("unirender", "picture_files/*.py"),
+        ("unirender_reference", "**/*"),
+    ):
         spec = importlib.util.find_spec(package)
         assert spec is not None
         assert spec.origin is not None

@@ -19,7 +19,7 @@ from unirender.arguments import as_instance, as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
-from unirender.primaries import in_rec709
+from unirender.picture_files.primaries import in_rec709
 from unirender.whole_files import replace_file
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
@@ -129,7 +129,7 @@ def exr_bytes(
 def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
 
-    Colours of a file that states other primaries come in Rec.709 (`unirender.primaries`).
+    Colours of a file that states other primaries come in Rec.709 (`unirender.picture_files.primaries`).
 
     Raises:
         UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels of another part

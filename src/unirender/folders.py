@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unirender.display_files import RAW_SUFFIXES
 from unirender.errors import UnirenderError, UsageError
 from unirender.files import (
     ENVIRONMENT_FILE,
@@ -26,6 +25,7 @@ from unirender.files import (
 )
 from unirender.intrinsics import MAPS
 from unirender.paths import forget_half_made
+from unirender.picture_files.display_files import RAW_SUFFIXES
 from unirender.pictures import Picture, checked_file
 from unirender.visualization import write_png
 from unirender.whole_files import replace_file

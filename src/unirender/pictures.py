@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from unirender import display_files, exr
+from unirender import exr
 from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
-from unirender.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, read_exr
+from unirender.picture_files import display_files
+from unirender.picture_files.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
 
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 OPAQUE = DISPLAY_WHITE  # a coverage from which it is whole: no alpha of 8 bits lies between

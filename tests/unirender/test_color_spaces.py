@@ -15,10 +15,10 @@ from PIL.PngImagePlugin import PngInfo
 from unirender.color import srgb_decode, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import read_exr
-from unirender.icc import in_srgb
+from unirender.picture_files.icc import in_srgb
+from unirender.picture_files.primaries import REC709
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_picture
-from unirender.primaries import REC709
 
 RNG = np.random.default_rng(3)
 PIXELS = RNG.integers(30, 200, (6, 9, 3), dtype=np.uint8)

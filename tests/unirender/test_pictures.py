@@ -17,9 +17,15 @@ from unirender.color import srgb_encode
 from unirender.command_line.commands import Decompose, Relight, Render
 from unirender.command_line.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, RENDERED_BYTES_A_PIXEL, read_input
 from unirender.command_line.options import DecompositionOptions, InputOptions, OutputOptions
-from unirender.display_files import MAX_PIXELS, display_values, open_picture, srgb_values_and_remarks, stored_values
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
+from unirender.picture_files.display_files import (
+    MAX_PIXELS,
+    display_values,
+    open_picture,
+    srgb_values_and_remarks,
+    stored_values,
+)
 from unirender.pictures import read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from unirender.cicp import read_cicp
 from unirender.errors import UnirenderError
-from unirender.icc import states_other_colors
-from unirender.sixteen_bits import sixteen_bit_values
+from unirender.picture_files.cicp import read_cicp
+from unirender.picture_files.icc import states_other_colors
+from unirender.picture_files.sixteen_bits import sixteen_bit_values
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -65,7 +65,7 @@ def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarr
 
 
 def _other_colors(path: Path, picture: "Image.Image") -> str | None:
-    """What a PNG states of its colours that is not sRGB, by the first chunk that counts (`unirender.cicp`)."""
+    """What a PNG states of its colours that is not sRGB, by the first chunk that counts (`picture_files.cicp`)."""
     if (coded := read_cicp(path)) is not None:
         return None if coded.is_srgb else str(coded)
     if picture.info.get("icc_profile"):

@@ -17,9 +17,9 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.camera import Camera
-from unirender.display_files import srgb_values, stored_values
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.picture_files.display_files import srgb_values, stored_values
 from unirender.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant

@@ -25,7 +25,6 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from unirender import display_files
 from unirender.arguments import as_path
 from unirender.blocks import by_rows
 from unirender.color import srgb_decode
@@ -33,8 +32,9 @@ from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
 from unirender.lighting import check_shape, resample_environment
 from unirender.machine import memory_excess
+from unirender.picture_files import display_files
+from unirender.picture_files.primaries import REC709, in_rec709
 from unirender.pictures import check_finite, negative_share
-from unirender.primaries import REC709, in_rec709
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
 

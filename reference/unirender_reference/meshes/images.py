@@ -12,7 +12,14 @@ from PIL import Image, UnidentifiedImageError
 
 from unirender.color import eight_bits
 from unirender.errors import UnirenderError
-from unirender.sixteen_bits import BITS_PER_SAMPLE, SAMPLE_FORMAT, SIGNED, as_stored, misread, white_is_zero
+from unirender.picture_files.sixteen_bits import (
+    BITS_PER_SAMPLE,
+    SAMPLE_FORMAT,
+    SIGNED,
+    as_stored,
+    misread,
+    white_is_zero,
+)
 from unirender_reference.meshes.limits import MAX_IMAGE_PIXELS, MAX_IMAGE_SIDE, MAX_MODEL_PIXELS
 
 # No format whose reader starts another program (EPS) or draws (WMF, SVG).

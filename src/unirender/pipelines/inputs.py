@@ -10,10 +10,10 @@ from jaxtyping import Float
 from PIL import Image
 
 from unirender.arguments import as_instance
-from unirender.display_files import display_colors, display_values, is_turned
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.lighting import as_light
+from unirender.picture_files.display_files import display_colors, display_values, is_turned
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
 from unirender.pipelines.derived_light import derived_light

@@ -19,10 +19,10 @@ from jaxtyping import Float
 from unirender.arguments import as_instance, as_path
 from unirender.camera import Camera
 from unirender.color import unpremultiply
-from unirender.display_files import is_turned
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
 from unirender.files import new_folder
+from unirender.picture_files.display_files import is_turned
 from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender.visualization import write_png
 from unirender_reference.optimize.files.transforms import Y_UP, PosedPicture, Up, read_transforms

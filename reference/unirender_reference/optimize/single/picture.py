@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
-from unirender.display_files import stored_values
 from unirender.errors import UnirenderError
 from unirender.files import read_result
+from unirender.picture_files.display_files import stored_values
 from unirender.pictures import checked_file, read_mask
 from unirender_reference.optimize.files.folder import read_picture_file
 from unirender_reference.optimize.files.state import rounded

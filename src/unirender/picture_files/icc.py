@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageCms
 
 from unirender.errors import UnirenderError
-from unirender.exif_colors import ADOBE_RGB, adobe_rgb_in_srgb, exif_color_space
+from unirender.picture_files.exif_colors import ADOBE_RGB, adobe_rgb_in_srgb, exif_color_space
 
 SAME_PROFILE = 2  # of 255: profiles of sRGB differ by this much among one another
 PROBE = 9  # steps along each axis of the cube that two profiles are compared on
@@ -14,7 +14,7 @@ PROBE = 9  # steps along each axis of the cube that two profiles are compared on
 
 def in_srgb(image: Image.Image, name: str) -> Image.Image:
     """A picture whose ICC profile is not sRGB's, converted: relative colorimetric, 8 bits a channel, RGB or RGBA; and
-    one without a profile that is Adobe RGB by its EXIF (`unirender.exif_colors`).
+    one without a profile that is Adobe RGB by its EXIF (`unirender.picture_files.exif_colors`).
 
     Others come back as they are: those of which nothing is stated, those of sRGB, to the bit, and 16-bit grey, whose
     profile is not looked at.

@@ -8,12 +8,19 @@ import numpy as np
 from jaxtyping import Float
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
-from unirender.cicp import Cicp, read_cicp
 from unirender.errors import UnirenderError
-from unirender.exif_colors import exif_remark, keep_color_space
-from unirender.icc import in_srgb
-from unirender.primaries import REC709, SAME_PRIMARIES
-from unirender.sixteen_bits import as_stored, has_sixteen_bits, misread, opened, sixteen_bit_values, unheeded_grey
+from unirender.picture_files.cicp import Cicp, read_cicp
+from unirender.picture_files.exif_colors import exif_remark, keep_color_space
+from unirender.picture_files.icc import in_srgb
+from unirender.picture_files.primaries import REC709, SAME_PRIMARIES
+from unirender.picture_files.sixteen_bits import (
+    as_stored,
+    has_sixteen_bits,
+    misread,
+    opened,
+    sixteen_bit_values,
+    unheeded_grey,
+)
 
 FORMATS = "PNG, JPG, TIFF, WebP, BMP or EXR"
 RAW_SUFFIXES = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # Pillow may read the thumbnail inside
@@ -133,7 +140,7 @@ def srgb_values(path: str | Path, name: str | None = None) -> Float[np.ndarray, 
         name: what to call it in messages; None: the path.
 
     Raises:
-        UnirenderError: as `stored_values`, or for its ICC profile (`unirender.icc`).
+        UnirenderError: as `stored_values`, or for its ICC profile (`picture_files.icc`).
     """
     return srgb_values_and_remarks(Path(path), name or str(path))[0]
 
@@ -164,7 +171,7 @@ def srgb_values_and_remarks(
 
 def _png_remarks(image: Image.Image, coded: Cicp | None) -> dict[str, str]:
     """What is due on a PNG or an AVIF that states other colours than sRGB's and has no ICC profile, by which it is
-    converted; of gamma and primaries where nothing counts more (`unirender.cicp`)."""
+    converted; of gamma and primaries where nothing counts more (`unirender.picture_files.cicp`)."""
     if image.info.get("icc_profile"):
         return {}
     if coded is not None:
@@ -226,7 +233,7 @@ def display_values(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
 
 
 def display_colors(image: Image.Image, name: str) -> Float[np.ndarray, "h w c"]:
-    """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`unirender.icc`)."""
+    """The same of a picture of colours and not of data: in sRGB, whatever its ICC profile says (`icc`)."""
     return display_values(in_srgb(image, name), name)
 
 
